@@ -1,0 +1,51 @@
+"""hks_jax: differentiable spectral geometry of symmetric positive definite tensor fields.
+
+From tensors to matrices to eigenpairs to signatures to pictures:
+
+    grid = Grid(shape=(nx, ny), spacing=(hx, hy))
+    field = TensorField(grid, tensors)
+    pairs = eigenpairs(field, k=200)
+    signature = hks(pairs, default_times(pairs, 8))
+"""
+
+import importlib
+from typing import Any
+
+from hks_jax.accuracy import AccuracyWarning as AccuracyWarning
+from hks_jax.domain.grid import Grid as Grid
+from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
+from hks_jax.domain.tensor_field import TensorField as TensorField
+from hks_jax.eigen.dense import Dense as Dense
+from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
+from hks_jax.eigen.shift_invert import ShiftInvert as ShiftInvert
+from hks_jax.eigen.solve import eigenpairs as eigenpairs
+from hks_jax.eigen.solver import Eigensolver as Eigensolver
+from hks_jax.fem.assembly import assemble as assemble
+from hks_jax.fem.boundary import crop as crop
+from hks_jax.fem.boundary import reflect as reflect
+from hks_jax.fem.pencil import MirrorPencil as MirrorPencil
+from hks_jax.fem.pencil import Pencil as Pencil
+from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance
+from hks_jax.signatures.distances import diffusion_distance as diffusion_distance
+from hks_jax.signatures.distances import global_point_signature as global_point_signature
+from hks_jax.signatures.distances import shape_dna as shape_dna
+from hks_jax.signatures.heat import heat_kernel as heat_kernel
+from hks_jax.signatures.heat import heat_trace as heat_trace
+from hks_jax.signatures.heat import hks as hks
+from hks_jax.signatures.heat import scale_invariant_hks as scale_invariant_hks
+from hks_jax.signatures.times import default_energies as default_energies
+from hks_jax.signatures.times import default_times as default_times
+from hks_jax.signatures.truncation import Truncation as Truncation
+from hks_jax.signatures.truncation import truncation as truncation
+from hks_jax.signatures.wave import wks as wks
+
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    # The outside world (files, pictures) is imported when first asked for: it is slow to import and often not needed.
+    if name in ("io", "plot"):
+        return importlib.import_module(f"hks_jax.{name}")
+    if name == "examples":
+        return importlib.import_module("hks_jax.domain.examples")
+    raise AttributeError(f"module 'hks_jax' has no attribute {name!r}")

@@ -1,0 +1,1 @@
+"""What we compute on: grids, tensor fields, surface meshes."""

@@ -1,0 +1,158 @@
+"""A regular grid in 2D or 3D, with an optional mask."""
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hks_jax.domain.components import active_elements, label_nodes
+from hks_jax.domain.static_array import StaticArray
+
+
+@jax.tree_util.register_static
+class Grid:
+    """A regular grid of nodes; array axis a is coordinate a.
+
+    Static and hashable: it passes through `jax.jit`, `jax.grad` and `jax.vmap` as structure, with no arrays in it.
+
+    Args:
+        shape: number of nodes per axis, 2 or 3 axes, at least 2 nodes each.
+        spacing: distance between nodes per axis (one number serves all axes), in coordinate units.
+        origin: coordinates of node (0, …, 0).
+        mask: bool array of `shape`, True inside. The domain is the union of the elements all of whose nodes are
+            inside; results are NaN at every other node. None: the whole grid.
+        components: what to do with a mask of several connected components: ``"raise"`` (default) says how many
+            there are, ``"largest"`` keeps the one with the most nodes, ``"all"`` keeps them all.
+
+    Raises:
+        ValueError: bad shape, spacing, origin or mask; an empty mask; a disconnected one under ``"raise"``.
+    """
+
+    shape: tuple[int, ...]
+    spacing: tuple[float, ...]
+    origin: tuple[float, ...]
+
+    def __init__(
+        self,
+        shape: Sequence[int],
+        spacing: float | Sequence[float] = 1.0,
+        origin: float | Sequence[float] = 0.0,
+        mask: Any = None,
+        components: Literal["raise", "largest", "all"] = "raise",
+    ) -> None:
+        self.shape = tuple(int(n) for n in shape)
+        if len(self.shape) not in (2, 3) or min(self.shape) < 2:
+            raise ValueError(f"shape: got {tuple(shape)}; expected 2 or 3 axes with at least 2 nodes each")
+        self.spacing = _per_axis("spacing", spacing, self.dimension)
+        self.origin = _per_axis("origin", origin, self.dimension)
+        if min(self.spacing) <= 0:
+            raise ValueError(f"spacing: got {self.spacing}; expected positive numbers")
+        if components not in ("raise", "largest", "all"):
+            raise ValueError(f'components: got {components!r}; expected "raise", "largest" or "all"')
+        self._mask = None if mask is None else StaticArray(_checked_mask(mask, self.shape, components))
+
+    @classmethod
+    def from_bounds(
+        cls,
+        lower: float | Sequence[float],
+        upper: float | Sequence[float],
+        shape: Sequence[int],
+        **kwargs: Any,
+    ) -> "Grid":
+        """Return the grid whose first node is at `lower` and whose last node is at `upper`."""
+        low, high = _per_axis("lower", lower, len(shape)), _per_axis("upper", upper, len(shape))
+        if any(b <= a for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"upper: got {high}; expected more than lower = {low} on every axis")
+        spacing = [(b - a) / max(n - 1, 1) for a, b, n in zip(low, high, shape, strict=True)]
+        return cls(shape, spacing, low, **kwargs)
+
+    @property
+    def dimension(self) -> int:
+        """The number of axes d, 2 or 3."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """The number of nodes."""
+        return math.prod(self.shape)
+
+    @property
+    def mask(self) -> np.ndarray | None:
+        """The mask, bool (*shape), or None."""
+        return None if self._mask is None else self._mask.value
+
+    @property
+    def inside(self) -> np.ndarray:
+        """The mask, or True everywhere: bool (*shape)."""
+        return np.ones(self.shape, dtype=bool) if self._mask is None else self._mask.value
+
+    @property
+    def axes(self) -> tuple[np.ndarray, ...]:
+        """The coordinates along each axis."""
+        return tuple(o + h * np.arange(n) for n, h, o in zip(self.shape, self.spacing, self.origin, strict=True))
+
+    @property
+    def nodes(self) -> Float[np.ndarray, "*shape d"]:
+        """The coordinates of the nodes."""
+        return np.stack(np.meshgrid(*self.axes, indexing="ij"), axis=-1)
+
+    @property
+    def extent(self) -> tuple[float, ...]:
+        """(x_min, x_max, y_min, y_max, …): the outermost nodes, in the order that `imshow` takes."""
+        return tuple(float(end) for axis in self.axes for end in (axis[0], axis[-1]))
+
+    @cached_property
+    def _key(self) -> tuple:
+        return (self.shape, self.spacing, self.origin, self._mask)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Grid) and self._key == other._key)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __repr__(self) -> str:
+        masked = "" if self.mask is None else f", mask={int(self.mask.sum())} of {self.size} nodes"
+        return f"Grid(shape={self.shape}, spacing={self.spacing}, origin={self.origin}{masked})"
+
+
+def _per_axis(name: str, value: float | Sequence[float], dimension: int) -> tuple[float, ...]:
+    values = np.asarray(value, dtype=np.float64)
+    if values.ndim == 0:
+        values = np.full(dimension, values)
+    if values.shape != (dimension,) or not np.isfinite(values).all():
+        raise ValueError(f"{name}: got {value}; expected {dimension} finite numbers, one per axis of shape")
+    return tuple(values.tolist())
+
+
+def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndarray:
+    array = np.asarray(mask)
+    if array.shape != shape:
+        raise ValueError(f"mask: got shape {array.shape}; expected the grid's shape {shape}")
+    if array.dtype != bool:
+        if not np.isin(array, (0, 1)).all():
+            raise ValueError(f"mask: got dtype {array.dtype} with values other than 0 and 1; expected booleans")
+        array = array.astype(bool)
+    if not array.any():
+        raise ValueError("mask: no node is inside (the mask is empty); expected True at the nodes of the domain")
+    wrapped = (True,) * array.ndim
+    if not active_elements(array, wrapped).any():
+        raise ValueError(
+            f"mask: {int(array.sum())} nodes are inside but no element has all its {2**array.ndim} nodes inside; "
+            "the mask is too thin for this grid: use a thicker mask or a finer grid"
+        )
+    labels, count = label_nodes(array, (False,) * array.ndim)
+    if count > 1 and components != "all":
+        sizes = np.bincount(labels.ravel())[1:]
+        if components == "raise":
+            largest = ", ".join(str(n) for n in np.sort(sizes)[::-1][:5]) + (", …" if count > 5 else "")
+            raise ValueError(
+                f"mask: {count} connected components ({largest} nodes); expected one. "
+                'Pass components="largest" to keep the largest, or components="all" to keep them all'
+            )
+        array = labels == 1 + int(np.argmax(sizes))
+    return array

@@ -1,0 +1,93 @@
+"""Eigenpairs of the Laplace–Beltrami operator, and what is known of their quality."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.space import FunctionSpace
+
+
+class Eigenpairs(eqx.Module):
+    """The k lowest eigenpairs of Kφ = λMφ; a pytree.
+
+    Attributes:
+        eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for the constant of each natural component.
+        vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the reflected domain under "mirror").
+        residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁).
+        converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
+        next_eigenvalue: the first eigenvalue not among the k; infinite if there is none.
+        multiplet_tolerance: the relative gap below which neighbouring eigenvalues count as one multiple eigenvalue.
+        pencil: the matrices.
+        solver_name: the method that found them.
+    """
+
+    eigenvalues: Float[Array, " k"]
+    vectors: Float[Array, "k n_dof"]
+    residuals: Float[Array, " k"]
+    converged: Bool[Array, " k"]
+    next_eigenvalue: Float[Array, ""]
+    multiplet_tolerance: Float[Array, ""]
+    pencil: Pencil | MirrorPencil
+    solver_name: str = eqx.field(static=True)
+
+    @property
+    def eigenfunctions(self) -> Float[Array, "k *shape"]:
+        """The eigenfunctions at the nodes: NaN outside the mask, zero at Dirichlet nodes."""
+        return self.space.extend(self.vectors)
+
+    @property
+    def space(self) -> FunctionSpace:
+        """The function space of the eigenfunctions."""
+        return self.pencil.space
+
+    @property
+    def k(self) -> int:
+        """The number of pairs."""
+        return self.eigenvalues.shape[-1]
+
+    @property
+    def n_null(self) -> int:
+        """The number of zero eigenvalues among the k."""
+        return min(self.k, sum(part.space.n_null for part in self.pencil.parts))
+
+    @property
+    def cut_multiplet(self) -> Array:
+        """How many of the last pairs belong to a multiple eigenvalue that k cuts; 0 if k cuts none."""
+        last = self.eigenvalues[-1]
+        tolerance = self.multiplet_tolerance * jnp.maximum(last, jnp.finfo(last.dtype).tiny)
+        together = jnp.sum(self.eigenvalues >= last - tolerance)
+        return jnp.where(self.next_eigenvalue - last <= tolerance, together, 0)
+
+    def messages(self) -> list[str]:
+        """Say in sentences what limits these pairs; empty if nothing does. Needs concrete values."""
+        found = []
+        bad = ~np.asarray(self.converged)
+        if bad.any():
+            missing = int(np.isnan(np.asarray(self.eigenvalues)).sum())
+            worst = np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
+            found.append(
+                f"{int(bad.sum())} of {self.k} eigenpairs did not converge ({missing} of them not found, worst "
+                f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
+                "Ask for fewer pairs, allow more restarts, or use float64"
+            )
+        cut = int(self.cut_multiplet)
+        if cut:
+            found.append(
+                f"k = {self.k} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = "
+                f"{float(self.eigenvalues[-1]):.6g}, have equals beyond k, and which of them are here is arbitrary. "
+                f"Take k = {self.k - cut}" + " or a larger one"
+            )
+        return found
+
+    def summary(self) -> str:
+        """Describe size, method, range and quality in a few lines. Needs concrete values."""
+        values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
+        following = float(self.next_eigenvalue)
+        lines = [
+            f"{self.k} eigenpairs of {sum(p.space.n_dof for p in self.pencil.parts)} by {self.solver_name}",
+            f"eigenvalues {values[0]:.6g} … {values[-1]:.6g} ({self.n_null} zero; the next is {following:.6g})",
+            f"worst relative residual {np.max(residuals):.1e}; {int(np.sum(self.converged))} of {self.k} converged",
+        ]
+        return "\n".join(lines + self.messages())

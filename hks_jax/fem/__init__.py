@@ -1,0 +1,1 @@
+"""From domains to matrices: elements, boundaries, assembly, operators."""

@@ -1,0 +1,165 @@
+"""From a tensor field or a surface to its stiffness and mass: one element's integrals, mapped over all elements."""
+
+from functools import lru_cache, partial
+from itertools import product
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.domain.static_array import StaticArray
+from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.fem.boundary import BoundarySpec, mirror_problems, normalise_boundary
+from hks_jax.fem.elements import at_quadrature, element_matrices, tensor_product_element, triangle_element
+from hks_jax.fem.operators import DiagonalOperator, Operator, SparseOperator, StencilOperator
+from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
+
+MassKind = Literal["consistent", "lumped"]
+
+
+def assemble(
+    domain: TensorField | SurfaceMesh, boundary: BoundarySpec = "neumann", mass: MassKind = "consistent"
+) -> Pencil | MirrorPencil:
+    """Assemble the generalized eigenproblem Kφ = λMφ of the Laplace–Beltrami operator.
+
+    K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus and Hotz, section 3), with Q1 elements and 2^d
+    Gauss points on grids, T interpolated multilinearly; with P1 elements on surface meshes.
+
+    Args:
+        domain: a tensor field or a surface mesh.
+        boundary: ``"neumann"`` (natural), ``"dirichlet"`` (φ = 0: these nodes are eliminated), ``"periodic"`` (node n
+            is node 0: an axis of n nodes has the period n·h) or ``"mirror"`` (the domain reflected on every side); one
+            name for all axes or one per axis, where a pair (low, high) of the first two tells the sides apart. They
+            act on the sides of the grid; the rim of a mask is always natural. A surface mesh takes ``"neumann"`` or
+            ``"dirichlet"``, which act on its rim.
+        mass: ``"consistent"`` or ``"lumped"`` (row sums; diagonal).
+
+    Returns:
+        The pencil (stiffness, mass); with ``"mirror"`` the `MirrorPencil` of the mixed problems that make it up.
+
+    Raises:
+        ValueError: an unknown boundary or mass, a domain without elements or free nodes.
+    """
+    if mass not in ("consistent", "lumped"):
+        raise ValueError(f'mass: got {mass!r}; expected "consistent" or "lumped"')
+    if isinstance(domain, SurfaceMesh):
+        if boundary not in ("neumann", "dirichlet"):
+            raise ValueError(f'boundary: got {boundary!r}; a surface mesh takes "neumann" or "dirichlet"')
+        return _assemble_mesh(domain, mesh_space(domain.triangulation, boundary), mass)
+    if not isinstance(domain, TensorField):
+        raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField or a SurfaceMesh")
+    problems = mirror_problems(normalise_boundary(boundary, domain.grid.dimension))
+    pencils = [_assemble_grid(domain, grid_space(domain.grid, sides), mass) for sides in problems]
+    return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))
+
+
+@partial(jax.jit, static_argnames=("space", "mass"))
+def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Pencil:
+    element = tensor_product_element(space.grid.spacing)
+    tensors = field.domain_tensors
+
+    def integrals(corner_tensors: Float[Array, "n d d"]) -> tuple[Array, Array]:
+        return element_matrices(at_quadrature(corner_tensors, element), element)
+
+    stiffness, consistent = jax.vmap(integrals)(_corner_tensors(tensors, space))
+    squared = jnp.asarray(np.square(space.grid.spacing), tensors.dtype)
+    width = jnp.sqrt(jnp.max(jnp.diagonal(tensors, axis1=-2, axis2=-1) * squared, axis=-1))
+    return _pencil(
+        StencilOperator(coefficients=_stencil(stiffness, space), space=space),
+        StencilOperator(coefficients=_stencil(consistent, space), space=space),
+        space.restrict(width),
+        jnp.sum(consistent, where=space.elements.reshape(-1, 1, 1)),
+        mass,
+    )
+
+
+def _pencil(stiffness: Operator, consistent: Operator, width: Array, volume: Array, mass: MassKind) -> Pencil:
+    if mass == "consistent":
+        return Pencil(stiffness, consistent, width, volume)
+    data, (rows, _) = consistent.triplets()
+    lumped = DiagonalOperator(entries=jax.ops.segment_sum(data, rows, width.size), space=stiffness.space)
+    return Pencil(stiffness, lumped, width, volume)
+
+
+def _corner_tensors(tensors: Float[Array, "*shape d d"], space: GridSpace) -> Float[Array, "E n d d"]:
+    """Gather the tensors at the corners of every element."""
+    d = space.dimension
+    nodes = jnp.pad(tensors, [*[(0, int(wraps)) for wraps in space.periodic], (0, 0), (0, 0)], mode="wrap")
+    corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
+    return jnp.stack(corners, axis=d).reshape(-1, 2**d, d, d)
+
+
+def _stencil(matrices: Float[Array, "E n n"], space: GridSpace) -> Float[Array, "offsets *shape"]:
+    """Add up element matrices into 3^d coefficients a node; couplings to nodes that are not free are dropped.
+
+    Local pair (a, b) of corners couples the element's node at corner a to the node at offset b − a.
+    """
+    elements, d = space.elements.shape, space.dimension
+    matrices = matrices.reshape(*elements, *matrices.shape[1:])
+    matrices = jnp.where(space.elements[..., None, None], matrices, 0)
+    total = jnp.zeros((3,) * d + tuple(n + 1 for n in elements), matrices.dtype)
+    corners = list(product((0, 1), repeat=d))
+    for (a, node), (b, other) in product(enumerate(corners), enumerate(corners)):
+        offset = tuple(1 + j - i for i, j in zip(node, other, strict=True))
+        place = tuple(slice(i, i + n) for i, n in zip(node, elements, strict=True))
+        total = total.at[offset + place].add(matrices[..., a, b])
+    for axis, wraps in enumerate(space.periodic):
+        if wraps:
+            first, last = [(slice(None),) * (d + axis) + (i,) for i in (0, -1)]
+            total = total.at[first].add(total[last])[(slice(None),) * (d + axis) + (slice(None, -1),)]
+    return jnp.where(_free_couplings(space), total.reshape(-1, *space.node_shape), 0)
+
+
+@lru_cache(maxsize=16)
+def _free_couplings(space: GridSpace) -> np.ndarray:
+    """Tell for which offsets and nodes both ends are free, bool (3^d, *shape)."""
+    free, d = space.free, space.dimension
+    for axis, wraps in enumerate(space.periodic):
+        widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
+        free = np.pad(free, widths, mode="wrap" if wraps else "constant")
+    starts = product((0, 1, 2), repeat=d)
+    shape = space.node_shape
+    return np.stack(
+        [space.free & free[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))] for start in starts]
+    )
+
+
+@partial(jax.jit, static_argnames=("space", "mass"))
+def _assemble_mesh(mesh: SurfaceMesh, space: MeshSpace, mass: MassKind) -> Pencil:
+    element = triangle_element()
+    corners = mesh.vertices[mesh.faces]
+    edges = jnp.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
+    metric = jnp.einsum("fxa,fxb->fab", edges, edges, precision="highest")
+    points = element.weights.size
+
+    def integrals(triangle_metric: Float[Array, "2 2"]) -> tuple[Array, Array]:
+        return element_matrices(jnp.broadcast_to(triangle_metric, (points, 2, 2)), element)
+
+    stiffness, consistent = jax.vmap(integrals)(metric)
+    where, slots, rows, cols = _mesh_pattern(space)
+
+    def gather(matrices: Float[Array, "F 3 3"]) -> SparseOperator:
+        data = jax.ops.segment_sum(matrices.reshape(-1)[where.value], slots.value, rows.value.size)
+        return SparseOperator(data=data, space=space, rows=rows, cols=cols)
+
+    # A vertex is as coarse as its longest edge.
+    longest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(metric, axis1=1, axis2=2), axis=1), 0))
+    width = jax.ops.segment_max(jnp.repeat(longest, 3), mesh.faces.ravel(), mesh.vertices.shape[0])
+    return _pencil(gather(stiffness), gather(consistent), space.restrict(width), jnp.sum(consistent), mass)
+
+
+@lru_cache(maxsize=16)
+def _mesh_pattern(space: MeshSpace) -> tuple[StaticArray, StaticArray, StaticArray, StaticArray]:
+    """Which local entries count (both ends free), the matrix entry that each adds to, and the entries' positions."""
+    n = space.n_dof
+    number = np.full(space.free.size, -1)
+    number[space.free] = np.arange(n)
+    faces = number[space.triangulation.faces]
+    rows, cols = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, (1, 3)).ravel()
+    where = np.flatnonzero((rows >= 0) & (cols >= 0))
+    keys, slots = np.unique(rows[where] * n + cols[where], return_inverse=True)
+    return StaticArray(where), StaticArray(slots), StaticArray(keys // n), StaticArray(keys % n)

@@ -1,0 +1,78 @@
+"""The element: shape functions at quadrature points, and the integrals of one element."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.domain import spd
+
+
+@dataclass(frozen=True, eq=False)
+class Element:
+    """Shape functions tabulated at the quadrature points of a reference element.
+
+    `values` (q, n), `gradients` (q, n, d), `weights` (q,): q points, n nodes, d coordinates. The weights include the
+    element's volume in coordinate units.
+    """
+
+    values: Float[np.ndarray, "q n"]
+    gradients: Float[np.ndarray, "q n d"]
+    weights: Float[np.ndarray, " q"]
+
+
+def element_matrices(
+    metric: Float[Array, "q d d"], element: Element
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """Integrate one element: stiffness ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and mass ∫ √|T| hᵢhⱼ.
+
+    Args:
+        metric: T at the quadrature points.
+        element: the shape functions there.
+
+    Returns:
+        stiffness (n, n) and mass (n, n).
+    """
+    h, dh = jnp.asarray(element.values, metric.dtype), jnp.asarray(element.gradients, metric.dtype)
+    volume = jnp.asarray(element.weights, metric.dtype) * jnp.sqrt(spd.determinant(metric))
+    flux = jnp.einsum("qab,qjb->qja", spd.inverse(metric), dh, precision="highest")
+    stiffness = jnp.einsum("q,qia,qja->ij", volume, dh, flux, precision="highest")
+    mass = jnp.einsum("q,qi,qj->ij", volume, h, h, precision="highest")
+    return stiffness, mass
+
+
+def at_quadrature(nodal: Float[Array, "n d d"], element: Element) -> Float[Array, "q d d"]:
+    """Interpolate nodal tensors to the quadrature points with the element's own shape functions."""
+    return jnp.einsum("qn,nab->qab", jnp.asarray(element.values, nodal.dtype), nodal, precision="highest")
+
+
+@lru_cache(maxsize=64)
+def tensor_product_element(spacing: tuple[float, ...]) -> Element:
+    """Return the Q1 element (bilinear, trilinear) with 2^d Gauss points on a box with the given sides.
+
+    Nodes and points are in the order of ``itertools.product((0, 1), repeat=d)``.
+    """
+    gauss = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
+    h = np.stack([1 - gauss, gauss], axis=1)  # (point, node) of the unit interval
+    dh = np.array([[-1.0, 1.0], [-1.0, 1.0]])
+    corners = list(product((0, 1), repeat=len(spacing)))
+    n, d = len(corners), len(spacing)
+    values, gradients = np.ones((n, n)), np.ones((n, n, d))
+    for (q, point), (i, node) in product(enumerate(corners), enumerate(corners)):
+        for a in range(d):
+            values[q, i] *= h[point[a], node[a]]
+            for b in range(d):
+                factor = dh[point[a], node[a]] / spacing[a] if a == b else h[point[a], node[a]]
+                gradients[q, i, b] *= factor
+    return Element(values, gradients, np.full(n, np.prod(spacing) / n))
+
+
+@lru_cache(maxsize=1)
+def triangle_element() -> Element:
+    """Return the P1 element on the unit triangle with the three-point rule that is exact for the mass."""
+    values = np.full((3, 3), 1 / 6) + np.eye(3) / 2
+    gradients = np.broadcast_to(np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]), (3, 3, 2))
+    return Element(values, np.array(gradients), np.full(3, 1 / 6))

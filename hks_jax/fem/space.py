@@ -1,0 +1,139 @@
+"""Finite element spaces: which nodes carry a degree of freedom, and what constants the stiffness cannot see."""
+
+from functools import cached_property, lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.domain.components import active_elements, element_nodes, label_nodes
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.surface_mesh import Triangulation
+from hks_jax.fem.boundary import Sides
+
+
+class FunctionSpace:
+    """The nodes of a domain and those among them that are free. Static and hashable.
+
+    Attributes:
+        node_shape: shape of a nodal array: the grid's shape, or (V,).
+        dimension: the dimension of the manifold.
+        domain: nodes of the domain, bool (*node_shape). Results are NaN elsewhere.
+        free: nodes that carry a degree of freedom, bool (*node_shape). Dirichlet nodes are in the domain, not free.
+        boundary: the conditions per axis; ``(("neumann", "neumann"),)`` or its like for a mesh.
+        n_components: the number of connected components of the domain.
+    """
+
+    node_shape: tuple[int, ...]
+    dimension: int
+    domain: Bool[np.ndarray, "*node_shape"]
+    free: Bool[np.ndarray, "*node_shape"]
+    boundary: tuple[Sides, ...]
+    n_components: int
+    _labels: Int[np.ndarray, "*node_shape"]
+    _key: tuple
+
+    @property
+    def n_dof(self) -> int:
+        """The number of degrees of freedom."""
+        return self._free_indices.size
+
+    @cached_property
+    def _free_indices(self) -> np.ndarray:
+        return np.flatnonzero(self.free)
+
+    @property
+    def _all_free(self) -> bool:
+        return self.n_dof == self.free.size
+
+    @cached_property
+    def null_labels(self) -> Int[np.ndarray, " n_dof"]:
+        """For each degree of freedom the number 0 … n_null − 1 of its constant null vector, or −1.
+
+        The stiffness annihilates the constant on each connected component that no Dirichlet node touches.
+        """
+        pinned = np.unique(self._labels[self.domain & ~self.free])
+        labels = self._labels.ravel()[self._free_indices]
+        kept = np.setdiff1d(np.unique(labels), pinned)
+        return np.where(np.isin(labels, kept), np.searchsorted(kept, labels), -1)
+
+    @property
+    def n_null(self) -> int:
+        """The number of zero eigenvalues: natural components."""
+        return int(self.null_labels.max(initial=-1)) + 1
+
+    def restrict(self, nodal: Float[Array, "*leading_and_node_shape"]) -> Float[Array, "... n_dof"]:
+        """Take the values at the free nodes."""
+        flat = jnp.reshape(nodal, (*nodal.shape[: nodal.ndim - len(self.node_shape)], self.free.size))
+        return flat if self._all_free else flat[..., self._free_indices]
+
+    def extend(
+        self, values: Float[Array, "... n_dof"], outside: float = float("nan")
+    ) -> Float[Array, "*leading_and_node_shape"]:
+        """Put values at the free nodes, zero at Dirichlet nodes, and ``outside`` at nodes outside the domain."""
+        shape = (*values.shape[:-1], *self.node_shape)
+        if self._all_free:
+            return values.reshape(shape)
+        fill = jnp.asarray(np.where(self.domain.ravel(), 0.0, outside), values.dtype)
+        full = jnp.broadcast_to(fill, (*values.shape[:-1], fill.size))
+        return full.at[..., self._free_indices].set(values).reshape(shape)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, FunctionSpace) and self._key == other._key)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@jax.tree_util.register_static
+class GridSpace(FunctionSpace):
+    """The Q1 space on a grid with given boundary conditions.
+
+    Attributes:
+        grid: the grid.
+        periodic: per axis, whether node n is node 0 again.
+        elements: the elements that exist, bool; n − 1 per axis, n where periodic.
+    """
+
+    def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
+        self.grid, self.boundary = grid, boundary
+        self.node_shape, self.dimension = grid.shape, grid.dimension
+        self.periodic = tuple(sides == ("periodic", "periodic") for sides in boundary)
+        if any(wraps and n < 3 for wraps, n in zip(self.periodic, grid.shape, strict=True)):
+            raise ValueError(f"boundary: a periodic axis needs at least 3 nodes; the grid has shape {grid.shape}")
+        self.elements = active_elements(grid.inside, self.periodic)
+        self.domain = element_nodes(self.elements, self.periodic)
+        if not self.domain.any():
+            raise ValueError("mask: no element has all its nodes inside; use a thicker mask or a finer grid")
+        self.free = self.domain.copy()
+        for axis, sides in enumerate(boundary):
+            for end, condition in zip((0, -1), sides, strict=True):
+                if condition == "dirichlet":
+                    self.free[(slice(None),) * axis + (end,)] = False
+        if not self.free.any():
+            raise ValueError(
+                f"boundary: every node of the domain is on a Dirichlet side (grid shape {grid.shape}); use a finer grid"
+            )
+        self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
+        self._key = (grid, boundary)
+
+
+@jax.tree_util.register_static
+class MeshSpace(FunctionSpace):
+    """The P1 space on a triangulation."""
+
+    def __init__(self, triangulation: Triangulation, condition: str) -> None:
+        self.triangulation = triangulation
+        self.boundary = ((condition, condition),)
+        self.node_shape, self.dimension = (triangulation.n_vertices,), 2
+        self.domain = np.ones(self.node_shape, dtype=bool)
+        self.free = ~triangulation.boundary_vertices if condition == "dirichlet" else self.domain
+        if not self.free.any():
+            raise ValueError("boundary: every vertex is on the mesh's rim, so that Dirichlet leaves none free")
+        self._labels, self.n_components = triangulation.labels
+        self._key = (triangulation, condition)
+
+
+grid_space = lru_cache(maxsize=32)(GridSpace)
+mesh_space = lru_cache(maxsize=32)(MeshSpace)

@@ -1,0 +1,59 @@
+"""Times and energies: checks, and the defaults of Sun et al. and of Aubry et al."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.eigen.eigenpairs import Eigenpairs
+
+
+def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
+    """Return times as an array (n,); raise ValueError unless they are 1-D, positive and finite."""
+    array = jnp.asarray(times, dtype)
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"{name}: got shape {array.shape}; expected a non-empty 1-D array; wrap one time as [t]")
+    if not isinstance(array, jax.core.Tracer):
+        values = np.asarray(array)
+        bad = ~(np.isfinite(values) & (values > 0))
+        if bad.any():
+            raise ValueError(f"{name}: got {values[bad][0]}; expected positive finite times")
+    return array
+
+
+def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
+    """Return the first positive and the last eigenvalue.
+
+    Raises:
+        ValueError: if all k eigenvalues belong to constants.
+    """
+    if pairs.n_null >= pairs.k:
+        raise ValueError(
+            f"pairs: all k = {pairs.k} eigenvalues are zero (one per natural component); compute more eigenpairs"
+        )
+    return pairs.eigenvalues[pairs.n_null], pairs.eigenvalues[-1]
+
+
+def default_times(pairs: Eigenpairs, n: int = 16) -> Float[Array, " n"]:
+    """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
+
+    At the first the last mode has decayed by 1e-4; at the last all but the constant have.
+    """
+    if n < 1:
+        raise ValueError(f"n: got {n}; expected at least 1")
+    first, last = positive_range(pairs)
+    return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, first, n)
+
+
+def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """Return n energies and the width σ of the wave kernel signature (Aubry, Schlickewei and Cremers 2011).
+
+    σ = 7 (log λ_last − log λ₁)/n, and the energies run from log λ₁ + 2σ to log λ_last − 2σ.
+    """
+    if n < 29:
+        raise ValueError(f"n: got {n}; expected at least 29, so that 2σ fits between the ends twice")
+    first, last = (jnp.log(value) for value in positive_range(pairs))
+    sigma = 7 * (last - first) / n
+    return jnp.linspace(first + 2 * sigma, last - 2 * sigma, n), sigma

@@ -1,0 +1,45 @@
+"""The wave kernel signature."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.signatures.spectral import spectral_diagonal
+from hks_jax.signatures.times import default_energies, positive_range
+
+
+def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Array, "n_energies *shape"]:
+    """Compute the wave kernel signature (Aubry, Schlickewei and Cremers 2011, eq. 9).
+
+    WKS(e, x) = Σᵢ φᵢ(x)² exp(−(e − log λᵢ)²/2σ²) / Σᵢ exp(−(e − log λᵢ)²/2σ²) over the positive λᵢ.
+
+    Args:
+        pairs: from `eigenpairs`.
+        energies: (n,) values of log λ; default: `default_energies`, 100 of them.
+        sigma: the width σ > 0 in log λ; default: the one that belongs to the default energies.
+
+    Returns:
+        (n_energies, *shape) in 1/(metric length)^d; NaN outside the mask.
+
+    Raises:
+        ValueError: only one of energies and sigma given, wrong shape, sigma ≤ 0, no positive eigenvalue.
+    """
+    if (energies is None) != (sigma is None):
+        raise ValueError("energies, sigma: give both or neither; `default_energies(pairs, n)` returns a pair of them")
+    positive_range(pairs)
+    if energies is None:
+        energies, sigma = default_energies(pairs)
+    energies = jnp.asarray(energies, pairs.eigenvalues.dtype)
+    if energies.ndim != 1 or energies.size == 0:
+        raise ValueError(f"energies: got shape {energies.shape}; expected a non-empty 1-D array")
+    if isinstance(sigma, int | float) and not sigma > 0:
+        raise ValueError(f"sigma: got {sigma}; expected a positive width in log λ")
+    positive = jnp.arange(pairs.k) >= pairs.n_null
+    logs = jnp.log(jnp.where(positive, pairs.eigenvalues, 1))
+    exponent = -jnp.square((energies[:, None] - logs) / sigma) / 2
+    # Softmax: the sum in the denominator, safe from underflow far outside the spectrum.
+    exponent = jnp.where(positive, exponent, -jnp.inf)
+    weights = jnp.exp(exponent - jnp.max(exponent, axis=1, keepdims=True))
+    return spectral_diagonal(pairs, weights / jnp.sum(weights, axis=1, keepdims=True))

@@ -1,0 +1,172 @@
+"""Stiffness and mass against scikit-fem's own assembly of the same weak form, and against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import skfem
+from fields import flat, random_spd
+from scipy.sparse import csc_matrix
+
+import hks_jax as hj
+
+
+def skfem_matrices(grid: hj.Grid, tensors: np.ndarray) -> tuple[csc_matrix, csc_matrix]:
+    """Assemble the weak form with scikit-fem, nodes numbered like the grid's."""
+    d = grid.dimension
+    mesh = (skfem.MeshQuad if d == 2 else skfem.MeshHex).init_tensor(*grid.axes)
+    basis = skfem.Basis(mesh, skfem.ElementQuad1() if d == 2 else skfem.ElementHex1(), intorder=3)
+    index = np.rint((mesh.p.T - grid.origin) / grid.spacing).astype(int)
+    to_grid = np.ravel_multi_index(tuple(index.T), grid.shape)
+    nodal = tensors.reshape(-1, d, d)[to_grid]
+    parts = {f"t{a}{b}": basis.interpolate(nodal[:, a, b]) for a in range(d) for b in range(d)}
+
+    def metric(w):
+        return np.stack([np.stack([np.asarray(w[f"t{a}{b}"]) for b in range(d)], -1) for a in range(d)], -2)
+
+    @skfem.BilinearForm
+    def stiffness(u, v, w):
+        T = metric(w)
+        weight = np.sqrt(np.linalg.det(T))[..., None, None] * np.linalg.inv(T)
+        return np.einsum("a...,...ab,b...->...", u.grad, weight, v.grad)
+
+    @skfem.BilinearForm
+    def mass(u, v, w):
+        return np.sqrt(np.linalg.det(metric(w))) * u * v
+
+    order = np.argsort(to_grid)
+    return tuple(csc_matrix(form.assemble(basis))[order][:, order] for form in (stiffness, mass))
+
+
+@pytest.mark.parametrize("shape", [(6, 8), (4, 5, 6)])
+def test_agrees_with_scikit_fem(rng, shape):
+    grid = hj.Grid(shape, (0.3, 0.7, 0.5)[: len(shape)], (1.0, -2.0, 0.5)[: len(shape)])
+    tensors = random_spd(rng, shape)
+    pencil = hj.assemble(hj.TensorField(grid, tensors))
+    for ours, theirs in zip((pencil.stiffness, pencil.mass), skfem_matrices(grid, tensors), strict=True):
+        assert abs(ours.to_scipy() - theirs).max() <= 1e-12 * abs(theirs).max()
+
+
+def test_mesh_agrees_with_scikit_fem_in_the_plane_and_with_cotangents_in_space(rng):
+    planar = skfem.MeshTri().refined(3)
+    mesh = hj.SurfaceMesh(np.pad(planar.p.T, [(0, 0), (0, 1)]), planar.t.T)
+    basis = skfem.Basis(planar, skfem.ElementTriP1())
+    pencil = hj.assemble(mesh)
+    from skfem.models.poisson import laplace, mass
+
+    assert abs(pencil.stiffness.to_scipy() - laplace.assemble(basis)).max() <= 1e-12
+    assert abs(pencil.mass.to_scipy() - mass.assemble(basis)).max() <= 1e-14
+
+    vertices = np.array(mesh.vertices) + 0.1 * rng.standard_normal(mesh.vertices.shape)
+    expected = np.zeros((len(vertices),) * 2)
+    for face in mesh.faces:
+        for i in range(3):
+            o, p, q = face[i], face[i - 2], face[i - 1]
+            u, v = vertices[p] - vertices[o], vertices[q] - vertices[o]
+            weight = 0.5 * (u @ v) / np.linalg.norm(np.cross(u, v))
+            expected[[p, q], [q, p]] -= weight
+            expected[[p, q], [p, q]] += weight
+    got = hj.assemble(hj.SurfaceMesh(vertices, mesh.faces)).stiffness.to_dense()
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "boundary", ["neumann", "dirichlet", "periodic", ("periodic", "neumann"), (("neumann", "dirichlet"), "periodic")]
+)
+@pytest.mark.parametrize("masked", [False, True])
+def test_products_dense_and_scipy_forms_agree(rng, boundary, masked):
+    shape = (7, 8)
+    mask = None
+    if masked:
+        mask = np.ones(shape, dtype=bool)
+        mask[:2, :3] = mask[6, 7] = False
+    pencil = hj.assemble(hj.TensorField(hj.Grid(shape, mask=mask), random_spd(rng, shape)), boundary)
+    x = jnp.asarray(rng.standard_normal((pencil.space.n_dof, 3)))
+    for operator in (pencil.stiffness, pencil.mass):
+        dense = operator.to_dense()
+        np.testing.assert_allclose(dense, dense.T, atol=1e-14)
+        np.testing.assert_allclose(operator @ x, dense @ x, atol=1e-12)
+        np.testing.assert_allclose(operator @ x[:, 0], dense @ x[:, 0], atol=1e-12)
+        np.testing.assert_allclose(operator.to_scipy().toarray(), dense, atol=1e-15)
+        np.testing.assert_allclose(operator.diagonal(), np.diag(dense), atol=1e-15)
+    nothing = pencil.stiffness @ jnp.asarray((pencil.space.null_labels >= 0).astype(float))
+    np.testing.assert_allclose(nothing, 0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"@: got an array of shape \(3,\)"):
+        pencil.mass @ jnp.ones(3)
+
+
+def test_periodic_assembly_is_the_folded_one(rng):
+    """Unrolling one period with its end repeated and identifying the ends gives the periodic matrices."""
+    shape, tensors = (5, 6), random_spd(rng, (5, 6))
+    periodic = hj.assemble(hj.TensorField(hj.Grid(shape), tensors), "periodic")
+    unrolled = hj.assemble(hj.TensorField(hj.Grid((6, 7)), np.pad(tensors, [(0, 1), (0, 1), (0, 0), (0, 0)], "wrap")))
+    fold = np.zeros((42, 30))
+    for i in range(6):
+        for j in range(7):
+            fold[i * 7 + j, (i % 5) * 6 + j % 6] = 1
+    for name in ("stiffness", "mass"):
+        big, small = getattr(unrolled, name).to_dense(), getattr(periodic, name).to_dense()
+        np.testing.assert_allclose(fold.T @ big @ fold, small, atol=1e-13)
+
+
+def test_volume_counts_eliminated_nodes_and_lumping_keeps_it(rng):
+    field = flat((9, 5), (2.0, 3.0))
+    for boundary in ("neumann", "dirichlet"):
+        assert hj.assemble(field, boundary).volume == pytest.approx(6.0)
+    lumped = hj.assemble(field, mass="lumped")
+    assert jnp.sum(lumped.mass.diagonal()) == pytest.approx(6.0)
+    np.testing.assert_allclose(lumped.mass @ jnp.ones(45), hj.assemble(field).mass @ jnp.ones(45), atol=1e-15)
+
+
+def test_nodes_outside_the_mask_have_no_influence_and_no_gradient(rng):
+    shape = (6, 7)
+    mask = np.ones(shape, dtype=bool)
+    mask[:3, :3] = False
+    grid, tensors = hj.Grid(shape, mask=mask), jnp.asarray(random_spd(rng, shape))
+
+    def energy(T):
+        pencil = hj.assemble(hj.TensorField(grid, T))
+        x = jnp.cos(jnp.arange(pencil.space.n_dof))
+        return x @ (pencil.stiffness @ x) + x @ (pencil.mass @ x)
+
+    poisoned = tensors.at[:3, :3].set(jnp.nan)
+    assert energy(poisoned) == energy(tensors)
+    gradient = jax.grad(energy)(poisoned)
+    assert np.isfinite(gradient).all()
+    np.testing.assert_array_equal(gradient[:3, :3], 0)
+    assert (np.abs(gradient[mask]).max(axis=(-2, -1)) > 0).all()
+
+
+def test_assembly_batches_like_a_loop(rng):
+    grid = hj.Grid((5, 6))
+    batch = jnp.asarray(np.stack([random_spd(rng, (5, 6)) for _ in range(3)]))
+
+    def stiffness(T):
+        return hj.assemble(hj.TensorField(grid, T), "dirichlet").stiffness.coefficients
+
+    looped = jnp.stack([stiffness(T) for T in batch])
+    np.testing.assert_allclose(jax.vmap(stiffness)(batch), looped, atol=1e-14)
+    assert looped.shape == (3, 9, 5, 6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"boundary": "robin"}, "boundary: got 'robin'; expected one of 'neumann', 'dirichlet', 'periodic', 'mirror'"),
+        ({"boundary": ("neumann",) * 3}, "boundary: got 3 entries"),
+        ({"boundary": (("neumann", "periodic"), "neumann")}, "bind both sides"),
+        ({"mass": "full"}, 'mass: got \'full\'; expected "consistent" or "lumped"'),
+    ],
+)
+def test_unknown_settings_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        hj.assemble(flat((4, 4), (1, 1)), **arguments)
+
+
+def test_impossible_boundaries_are_explained():
+    with pytest.raises(ValueError, match="every node of the domain is on a Dirichlet side"):
+        hj.assemble(flat((2, 5), (1, 1)), "dirichlet")
+    with pytest.raises(ValueError, match="periodic axis needs at least 3 nodes"):
+        hj.assemble(flat((2, 5), (1, 1)), "periodic")
+    with pytest.raises(TypeError, match="domain: got ndarray; expected a TensorField or a SurfaceMesh"):
+        hj.assemble(np.eye(3))

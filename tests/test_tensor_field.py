@@ -1,0 +1,104 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fields import random_spd
+
+import hks_jax as hj
+from hks_jax.domain import spd
+
+
+@pytest.mark.parametrize("shape", [(4, 5), (3, 4, 5)])
+def test_closed_forms_agree_with_lapack(rng, shape):
+    t = random_spd(rng, shape)
+    np.testing.assert_allclose(spd.determinant(jnp.asarray(t)), np.linalg.det(t), rtol=1e-13)
+    np.testing.assert_allclose(spd.inverse(jnp.asarray(t)), np.linalg.inv(t), rtol=1e-12, atol=1e-13)
+    adjugate = np.linalg.det(t)[..., None, None] * np.linalg.inv(t)
+    np.testing.assert_allclose(spd.adjugate(jnp.asarray(t)), adjugate, rtol=1e-12, atol=1e-13)
+
+
+def test_field_is_a_pytree_through_jit_grad_vmap(rng):
+    grid = hj.Grid((4, 5))
+    tensors = jnp.asarray(random_spd(rng, (4, 5)))
+    field = hj.TensorField(grid, tensors)
+
+    def volume(field):
+        return jnp.sum(jnp.sqrt(spd.determinant(field.tensors)))
+
+    assert jax.jit(volume)(field) == pytest.approx(float(volume(field)), rel=1e-14)
+    gradient = jax.grad(volume)(field).tensors
+    # d√|T| = ½ √|T| T⁻¹ : dT
+    expected = 0.5 * np.sqrt(np.linalg.det(tensors))[..., None, None] * np.linalg.inv(tensors)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-11)
+    batch = jax.vmap(lambda T: volume(hj.TensorField(grid, T)))(jnp.stack([tensors, 4 * tensors]))
+    np.testing.assert_allclose(batch, [volume(field), 4 * volume(field)], rtol=1e-13)
+
+
+def test_from_function_keeps_the_function_and_traces_its_parameters():
+    grid = hj.Grid.from_bounds(-1, 1, (5, 6))
+
+    def metric(scale, x):
+        return scale * jnp.diag(jnp.stack([1 + x[0] ** 2, jnp.ones(())]))
+
+    field = hj.TensorField.from_function(jax.tree_util.Partial(metric, jnp.asarray(2.0)), grid)
+    np.testing.assert_allclose(field.tensors[..., 0, 0], 2 * (1 + grid.nodes[..., 0] ** 2))
+    doubled = jax.tree.map(lambda leaf: 2 * leaf, field)
+    np.testing.assert_allclose(doubled.tensors, 2 * field.tensors)
+    assert jax.grad(lambda f: f.tensors[0, 0, 1, 1])(field).function.args[0] == 1.0
+
+
+def test_three_metrics_of_a_diffusion_tensor(rng):
+    grid, D = hj.Grid((3, 4, 5)), random_spd(rng, (3, 4, 5))
+    np.testing.assert_allclose(hj.TensorField.from_diffusion(grid, D, metric="tensor").tensors, D)
+    inverse = hj.TensorField.from_diffusion(grid, D, metric="inverse").tensors
+    np.testing.assert_allclose(inverse @ D, np.broadcast_to(np.eye(3), D.shape), atol=1e-12)
+    adjugate = hj.TensorField.from_diffusion(grid, D, metric="adjugate").tensors
+    np.testing.assert_allclose(np.linalg.det(adjugate), np.linalg.det(D) ** 2, rtol=1e-11)
+    with pytest.raises(ValueError, match='metric: got None; expected "inverse".*"tensor".*"adjugate".*no default'):
+        hj.TensorField.from_diffusion(grid, D)
+
+
+def test_values_outside_the_mask_do_not_matter(rng):
+    mask = np.ones((5, 5), dtype=bool)
+    mask[0] = False
+    D = random_spd(rng, (5, 5))
+    D[0] = np.nan
+    D[0, 0] = 0
+    field = hj.TensorField.from_diffusion(hj.Grid((5, 5), mask=mask), D, metric="inverse")
+    assert np.isfinite(field.domain_tensors).all()
+
+
+def corrupted(rng, node, value) -> np.ndarray:
+    tensors = random_spd(rng, (4, 5))
+    tensors[node] = value
+    return tensors
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.nan, r"tensors: 1 of 20 tensors are NaN or infinite \(the first at node \(2, 3\)\).*mask"),
+        ([[1, 2], [2, 1]], r"1 of 20 tensors are not positive definite, worst eigenvalue -1 .*node \(2, 3\).*mask"),
+        (0, "not positive definite, worst eigenvalue 0"),
+        ([[-1, 0], [0, -1]], "worst eigenvalue -1"),
+        ([[1, 0.5], [0, 1]], "1 of 20 tensors are unsymmetric.*component order"),
+    ],
+)
+def test_bad_tensors_are_counted_and_located(rng, value, message):
+    with pytest.raises(ValueError, match=message):
+        hj.TensorField(hj.Grid((4, 5)), corrupted(rng, (2, 3), value))
+
+
+def test_wrong_shapes_and_types_are_named(rng):
+    with pytest.raises(ValueError, match=r"tensors: got shape \(5, 4, 2, 2\); expected .* = \(4, 5, 2, 2\)"):
+        hj.TensorField(hj.Grid((4, 5)), random_spd(rng, (5, 4)))
+    with pytest.raises(TypeError, match=r"grid: got tuple; expected hks_jax\.Grid"):
+        hj.TensorField((4, 5), random_spd(rng, (4, 5)))
+    with pytest.raises(ValueError, match="fn: 12 of 12 tensors are not positive definite"):
+        hj.TensorField.from_function(lambda x: -jnp.eye(2), hj.Grid((3, 4)))
+    with pytest.raises(ValueError, match="D: 20 of 20 tensors are not positive definite"):
+        hj.TensorField.from_diffusion(hj.Grid((4, 5)), np.zeros((4, 5, 2, 2)), metric="inverse")
+
+
+def test_integer_tensors_become_floating(rng):
+    assert hj.TensorField(hj.Grid((2, 2)), np.broadcast_to(np.eye(2, dtype=int), (2, 2, 2, 2))).tensors.dtype == float
