@@ -7,6 +7,7 @@ import pytest
 import skfem
 from fields import flat, random_spd
 from scipy.sparse import csc_matrix
+from skfem.models.poisson import laplace, mass
 
 import hks_jax as hj
 
@@ -31,11 +32,11 @@ def skfem_matrices(grid: hj.Grid, tensors: np.ndarray) -> tuple[csc_matrix, csc_
         return np.einsum("a...,...ab,b...->...", u.grad, weight, v.grad)
 
     @skfem.BilinearForm
-    def mass(u, v, w):
+    def inertia(u, v, w):
         return np.sqrt(np.linalg.det(metric(w))) * u * v
 
     order = np.argsort(to_grid)
-    return tuple(csc_matrix(form.assemble(basis))[order][:, order] for form in (stiffness, mass))
+    return tuple(csc_matrix(form.assemble(basis, **parts))[order][:, order] for form in (stiffness, inertia))
 
 
 @pytest.mark.parametrize("shape", [(6, 8), (4, 5, 6)])
@@ -52,8 +53,6 @@ def test_mesh_agrees_with_scikit_fem_in_the_plane_and_with_cotangents_in_space(r
     mesh = hj.SurfaceMesh(np.pad(planar.p.T, [(0, 0), (0, 1)]), planar.t.T)
     basis = skfem.Basis(planar, skfem.ElementTriP1())
     pencil = hj.assemble(mesh)
-    from skfem.models.poisson import laplace, mass
-
     assert abs(pencil.stiffness.to_scipy() - laplace.assemble(basis)).max() <= 1e-12
     assert abs(pencil.mass.to_scipy() - mass.assemble(basis)).max() <= 1e-14
 

@@ -24,7 +24,7 @@ def test_a_mesh_is_a_pytree_whose_leaf_is_the_vertices():
 def test_components_and_rim():
     two = hj.SurfaceMesh(np.concatenate([TETRAHEDRON, TETRAHEDRON + 9]), np.concatenate([FACES, FACES + 4]))
     assert two.triangulation.labels[1] == 2
-    np.testing.assert_array_equal(hj.eigenpairs(two, 3).eigenvalues[:2], [0, 0])
+    np.testing.assert_array_equal(hj.eigenpairs(two, 2).eigenvalues, [0, 0])
     opened = hj.SurfaceMesh(TETRAHEDRON, FACES[:3])
     np.testing.assert_array_equal(opened.triangulation.boundary_vertices, [False, True, True, True])
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
 
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.pencil import Pencil
@@ -20,13 +21,13 @@ class Dense(Eigensolver):
 
     def lowest(self, pencil: Pencil, k: int) -> RawPairs:
         """Return the k lowest eigenpairs."""
-        return _dense(pencil, k)
+        return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
 
 
 @partial(jax.jit, static_argnames="k")
-def _dense(pencil: Pencil, k: int) -> RawPairs:
-    factor = jnp.linalg.cholesky(pencil.mass.to_dense())
-    half = solve_triangular(factor, pencil.stiffness.to_dense(), lower=True)
+def _dense(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"], k: int) -> RawPairs:
+    factor = jnp.linalg.cholesky(mass)
+    half = solve_triangular(factor, stiffness, lower=True)
     reduced = solve_triangular(factor, half.T, lower=True)
     values, vectors = jnp.linalg.eigh(reduced)
     vectors = solve_triangular(factor, vectors[:, :k], trans="T", lower=True)

@@ -24,12 +24,14 @@ class ShiftInvert(Eigensolver):
     Attributes:
         tolerance: relative residual that counts as converged; ARPACK itself runs to machine precision.
         max_restarts: implicit restarts before giving up.
+        basis: size of the Lanczos basis, more than k; None takes 2k + 20.
         progress: called with short texts such as ``"150 solves"`` while it runs; None is silent.
     """
 
     name: ClassVar[str] = "shift-invert"
     tolerance: float = eqx.field(default=1e-8, static=True)
     max_restarts: int = eqx.field(default=300, static=True)
+    basis: int | None = eqx.field(default=None, static=True)
     progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
 
     def max_pairs(self, n_dof: int) -> int:
@@ -77,7 +79,7 @@ class ShiftInvert(Eigensolver):
         start = np.random.default_rng(0).standard_normal(n)
         try:
             values, vectors = eigsh(
-                K, k, M, -shift, OPinv=inverse, v0=start, ncv=min(n, 2 * k + 20), maxiter=self.max_restarts
+                K, k, M, -shift, OPinv=inverse, v0=start, ncv=min(n, self.basis or 2 * k + 20), maxiter=self.max_restarts
             )
         except ArpackNoConvergence as stopped:
             values, vectors = stopped.eigenvalues, stopped.eigenvectors

@@ -7,7 +7,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.domain.static_array import StaticArray
 from hks_jax.domain.surface_mesh import SurfaceMesh
@@ -57,24 +57,43 @@ def assemble(
     return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))
 
 
-@partial(jax.jit, static_argnames=("space", "mass"))
 def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Pencil:
-    element = tensor_product_element(space.grid.spacing)
-    tensors = field.domain_tensors
+    # The masks go in as arrays, so that problems that differ only in them share one compilation.
+    stiffness, consistent, width, volume = _grid_integrals(
+        field.domain_tensors, space.elements, _free_couplings(space), space.periodic, space.grid.spacing
+    )
+    return _pencil(
+        StencilOperator(coefficients=stiffness, space=space),
+        StencilOperator(coefficients=consistent, space=space),
+        space.restrict(width),
+        volume,
+        mass,
+    )
+
+
+@partial(jax.jit, static_argnames=("periodic", "spacing"))
+def _grid_integrals(
+    tensors: Float[Array, "*shape d d"],
+    elements: Bool[Array, "*elements"],
+    couplings: Bool[Array, "offsets *shape"],
+    periodic: tuple[bool, ...],
+    spacing: tuple[float, ...],
+) -> tuple[Array, Array, Array, Array]:
+    """Return stiffness and mass as stencils, the nodes' mesh width, and the volume."""
+    element = tensor_product_element(spacing)
 
     def integrals(corner_tensors: Float[Array, "n d d"]) -> tuple[Array, Array]:
         return element_matrices(at_quadrature(corner_tensors, element), element)
 
-    stiffness, consistent = jax.vmap(integrals)(_corner_tensors(tensors, space))
-    squared = jnp.asarray(np.square(space.grid.spacing), tensors.dtype)
+    def stencil(matrices: Float[Array, "E n n"]) -> Float[Array, "offsets *shape"]:
+        kept = jnp.where(elements[..., None, None], matrices.reshape(*elements.shape, *matrices.shape[1:]), 0)
+        return jnp.where(couplings, _stencil(kept, periodic), 0)
+
+    stiffness, mass = jax.vmap(integrals)(_corner_tensors(tensors, periodic))
+    squared = jnp.asarray(np.square(spacing), tensors.dtype)
     width = jnp.sqrt(jnp.max(jnp.diagonal(tensors, axis1=-2, axis2=-1) * squared, axis=-1))
-    return _pencil(
-        StencilOperator(coefficients=_stencil(stiffness, space), space=space),
-        StencilOperator(coefficients=_stencil(consistent, space), space=space),
-        space.restrict(width),
-        jnp.sum(consistent, where=space.elements.reshape(-1, 1, 1)),
-        mass,
-    )
+    volume = jnp.sum(mass, where=elements.reshape(-1, 1, 1))
+    return stencil(stiffness), stencil(mass), width, volume
 
 
 def _pencil(stiffness: Operator, consistent: Operator, width: Array, volume: Array, mass: MassKind) -> Pencil:
@@ -85,33 +104,32 @@ def _pencil(stiffness: Operator, consistent: Operator, width: Array, volume: Arr
     return Pencil(stiffness, lumped, width, volume)
 
 
-def _corner_tensors(tensors: Float[Array, "*shape d d"], space: GridSpace) -> Float[Array, "E n d d"]:
+def _corner_tensors(tensors: Float[Array, "*shape d d"], periodic: tuple[bool, ...]) -> Float[Array, "E n d d"]:
     """Gather the tensors at the corners of every element."""
-    d = space.dimension
-    nodes = jnp.pad(tensors, [*[(0, int(wraps)) for wraps in space.periodic], (0, 0), (0, 0)], mode="wrap")
+    d = len(periodic)
+    nodes = jnp.pad(tensors, [*[(0, int(wraps)) for wraps in periodic], (0, 0), (0, 0)], mode="wrap")
     corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
     return jnp.stack(corners, axis=d).reshape(-1, 2**d, d, d)
 
 
-def _stencil(matrices: Float[Array, "E n n"], space: GridSpace) -> Float[Array, "offsets *shape"]:
-    """Add up element matrices into 3^d coefficients a node; couplings to nodes that are not free are dropped.
+def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
+    """Add up element matrices into 3^d coefficients a node.
 
     Local pair (a, b) of corners couples the element's node at corner a to the node at offset b − a.
     """
-    elements, d = space.elements.shape, space.dimension
-    matrices = matrices.reshape(*elements, *matrices.shape[1:])
-    matrices = jnp.where(space.elements[..., None, None], matrices, 0)
-    total = jnp.zeros((3,) * d + tuple(n + 1 for n in elements), matrices.dtype)
+    d = len(periodic)
     corners = list(product((0, 1), repeat=d))
+    sums: dict[tuple[int, ...], Array] = {}
     for (a, node), (b, other) in product(enumerate(corners), enumerate(corners)):
-        offset = tuple(1 + j - i for i, j in zip(node, other, strict=True))
-        place = tuple(slice(i, i + n) for i, n in zip(node, elements, strict=True))
-        total = total.at[offset + place].add(matrices[..., a, b])
-    for axis, wraps in enumerate(space.periodic):
-        if wraps:
-            first, last = [(slice(None),) * (d + axis) + (i,) for i in (0, -1)]
-            total = total.at[first].add(total[last])[(slice(None),) * (d + axis) + (slice(None, -1),)]
-    return jnp.where(_free_couplings(space), total.reshape(-1, *space.node_shape), 0)
+        offset = tuple(j - i for i, j in zip(node, other, strict=True))
+        placed = jnp.pad(matrices[..., a, b], [(i, 1 - i) for i in node])
+        sums[offset] = sums[offset] + placed if offset in sums else placed
+    total = jnp.stack([sums[offset] for offset in product((-1, 0, 1), repeat=d)])
+    for axis, wraps in enumerate(periodic, start=1):
+        if wraps:  # the last node is the first again
+            inner, last = jax.lax.slice_in_dim(total, 0, -1, axis=axis), jax.lax.slice_in_dim(total, -1, None, axis=axis)
+            total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
+    return total
 
 
 @lru_cache(maxsize=16)

@@ -96,6 +96,11 @@ class StencilOperator(Operator):
         return self.coefficients.reshape(-1)[where], pattern
 
 
+    def diagonal(self) -> Float[Array, " n_dof"]:
+        """Return the main diagonal."""
+        return self.space.restrict(self.coefficients[self.coefficients.shape[0] // 2])
+
+
 @lru_cache(maxsize=16)
 def _stencil_pattern(space: GridSpace) -> tuple[np.ndarray, Pattern]:
     """Where in the coefficients each entry lies, and its (row, column), for the couplings between free nodes."""

@@ -1,0 +1,5 @@
+"""Curvature of a metric, the Laplace–Beltrami operator of a function, and the short-time expansion they give."""
+
+from hks_jax.curvature.expansion import hks_expansion as hks_expansion
+from hks_jax.curvature.gaussian import gaussian_curvature as gaussian_curvature
+from hks_jax.curvature.laplace_beltrami import laplace_beltrami as laplace_beltrami

@@ -1,0 +1,70 @@
+"""The whole path in float32, JAX's default, in a process of its own, and the accuracy to expect of it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fields import random_spd
+
+import hks_jax as hj
+
+SHAPE, K, TIMES = (16, 17), 40, [0.3, 1.0]
+CASES = [(b, s) for b in ("neumann", "dirichlet", "mirror") for s in ("dense", "shift-invert")]
+
+SCRIPT = """
+import sys, warnings
+import jax, jax.numpy as jnp, numpy as np
+import hks_jax as hj
+given, K, TIMES, CASES = np.load(sys.argv[1]), {K}, {TIMES}, {CASES}
+warnings.simplefilter("error")
+field, out = hj.TensorField(hj.Grid({SHAPE}, 0.1), given["tensors"]), {{}}
+for boundary, solver in CASES:
+    pairs = hj.eigenpairs(field, K, boundary, solver)
+    name = f"{{boundary}} {{solver}} "
+    assert {{leaf.dtype for leaf in jax.tree.leaves(pairs)}} == {{jnp.dtype("float32"), jnp.dtype("bool")}}
+    times = jnp.array([3.0, 9.0])
+    others = [hj.default_times(pairs, 4), hj.wks(pairs), hj.scale_invariant_hks(pairs), hj.heat_trace(pairs, times),
+              hj.truncation(pairs, times).tail, hj.shape_dna(pairs), hj.global_point_signature(pairs)]
+    if boundary == "neumann":
+        others += [hj.biharmonic_distance(pairs, (4, 4)), hj.diffusion_distance(pairs, times, (4, 4))]
+    assert all(x.dtype == jnp.float32 for x in others)
+    assert all(np.isfinite(x[..., 1:-1, 1:-1] if x.ndim > 2 else x).all() for x in others)
+    out |= {{name + "values": pairs.eigenvalues, name + "converged": pairs.converged, name + "hks": hj.hks(pairs, TIMES),
+            name + "gram": pairs.vectors @ pairs.pencil.parts[0].mass.apply(pairs.vectors).T}}
+np.savez(sys.argv[2], **out)
+"""
+
+
+@pytest.fixture(scope="module")
+def tensors() -> np.ndarray:
+    return random_spd(np.random.default_rng(32), SHAPE, 0.5)
+
+
+@pytest.fixture(scope="module")
+def single(tensors, tmp_path_factory) -> dict[str, np.ndarray]:
+    """What a float32 process computes."""
+    folder: Path = tmp_path_factory.mktemp("float32")
+    np.savez(folder / "in.npz", tensors=tensors)
+    script = SCRIPT.format(K=K, TIMES=TIMES, CASES=CASES, SHAPE=SHAPE)
+    command = [sys.executable, "-c", script, folder / "in.npz", folder / "out.npz"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return dict(np.load(folder / "out.npz"))
+
+
+@pytest.mark.parametrize(("boundary", "solver"), CASES)
+def test_float32_agrees_with_float64(tensors, single, boundary, solver):
+    got = {key: single[f"{boundary} {solver} {key}"] for key in ("values", "converged", "hks", "gram")}
+    pairs = hj.eigenpairs(hj.TensorField(hj.Grid(SHAPE, 0.1), tensors), K, boundary, "dense")
+    assert got["converged"].all()
+    assert (got["values"] >= 0).all()
+    assert (got["values"][0] == 0) == (boundary != "dirichlet")
+    # eps·λ_max = 6e-8 · 1e4 limits the dense solver's eigenvalues; the sparse one works in float64 on the host.
+    atol = 2e-3 if solver == "dense" else 2e-4
+    np.testing.assert_allclose(got["values"], pairs.eigenvalues, rtol=1e-5, atol=atol)
+    assert got["hks"].dtype == np.float32
+    np.testing.assert_allclose(got["hks"], hj.hks(pairs, TIMES), rtol=1e-3, atol=1e-4)
+    if boundary == "neumann":
+        np.testing.assert_allclose(got["gram"], np.eye(K), atol=1e-4)

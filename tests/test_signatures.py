@@ -1,0 +1,204 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fields import flat, random_spd
+from scipy.linalg import expm
+
+import hks_jax as hj
+
+
+@pytest.fixture(scope="module")
+def field() -> hj.TensorField:
+    rng = np.random.default_rng(7)
+    mask = np.ones((8, 9), dtype=bool)
+    mask[:3, 5:] = False
+    return hj.TensorField(hj.Grid((8, 9), 0.2, mask=mask), random_spd(rng, (8, 9)))
+
+
+@pytest.fixture(scope="module")
+def pairs(field) -> hj.Eigenpairs:
+    return hj.eigenpairs(field, hj.assemble(field).space.n_dof)
+
+
+TIMES = [0.1, 0.5, 2.0]
+
+
+def kernel_by_matrix_exponential(pairs, t) -> np.ndarray:
+    """exp(−t M⁻¹K) M⁻¹, without eigenpairs."""
+    M = np.asarray(pairs.pencil.mass.to_dense())
+    return expm(-t * np.linalg.solve(M, np.asarray(pairs.pencil.stiffness.to_dense()))) @ np.linalg.inv(M)
+
+
+def test_hks_and_kernel_against_the_matrix_exponential(pairs):
+    inside, rtol = pairs.space.domain, 1e-9
+    kernel = hj.heat_kernel(pairs, TIMES, np.argwhere(inside))[..., inside]
+    for t, ours, diagonal in zip(TIMES, kernel, hj.hks(pairs, TIMES), strict=True):
+        expected = kernel_by_matrix_exponential(pairs, t)
+        np.testing.assert_allclose(ours, expected, rtol=rtol, atol=1e-10)
+        np.testing.assert_allclose(diagonal[inside], np.diag(expected), rtol=rtol)
+    assert np.isnan(hj.hks(pairs, TIMES)[:, ~inside]).all()
+
+
+def test_heat_trace_is_the_trace_and_the_integral_of_the_kernel(pairs):
+    for t, trace in zip(TIMES, hj.heat_trace(pairs, TIMES), strict=True):
+        kernel = kernel_by_matrix_exponential(pairs, t)
+        assert np.trace(kernel @ pairs.pencil.mass.to_dense()) == pytest.approx(float(trace))
+    lumped, times = hj.eigenpairs(flat((8, 9), (1.0, 1.0)), 72, mass="lumped"), TIMES[1:]
+    integral = hj.hks(lumped, times).reshape(2, -1) @ lumped.pencil.mass.diagonal()
+    np.testing.assert_allclose(integral, hj.heat_trace(lumped, times), rtol=1e-12)
+
+
+def test_normalisations_by_name(pairs):
+    raw, times = hj.hks(pairs, TIMES), np.array(TIMES)[:, None, None]
+    np.testing.assert_allclose(hj.hks(pairs, TIMES, "flat"), 4 * np.pi * times * raw)
+    np.testing.assert_allclose(hj.hks(pairs, TIMES, "volume"), pairs.pencil.volume * raw)
+    trace = hj.heat_trace(pairs, TIMES)[:, None, None]
+    np.testing.assert_allclose(hj.hks(pairs, TIMES, "heat-trace"), raw / trace)
+    late = hj.hks(pairs, [1e5], "volume")
+    np.testing.assert_allclose(late[0, pairs.space.domain], 1, rtol=1e-9)
+    with pytest.raises(
+        ValueError, match='normalisation: got \'area\'; expected "raw", "heat-trace", "volume" or "flat"'
+    ):
+        hj.hks(pairs, TIMES, "area")
+
+
+def test_wks_is_a_weighted_mean_of_squares(pairs):
+    energies, sigma = hj.default_energies(pairs, 40)
+    got = hj.wks(pairs, energies, sigma)
+    positive, functions = pairs.eigenvalues[1:], np.asarray(pairs.eigenfunctions[1:])
+    weights = np.exp(-((energies[:, None] - np.log(positive)) ** 2) / (2 * sigma**2))
+    expected = np.einsum("ei,i...->e...", weights / weights.sum(1, keepdims=True), functions**2)
+    np.testing.assert_allclose(got, expected, rtol=1e-10)
+    assert hj.wks(pairs).shape == (100, 8, 9)
+    # Far outside the spectrum the nearest mode takes over; nothing underflows to 0/0.
+    far = hj.wks(pairs, [-1e3], 0.1)[0]
+    np.testing.assert_allclose(far, functions[0] ** 2, rtol=1e-9)
+
+
+def test_scale_invariance(field, pairs):
+    scaled = hj.eigenpairs(hj.TensorField(field.grid, 9.0 * field.tensors), pairs.k)
+    np.testing.assert_allclose(hj.scale_invariant_hks(scaled), hj.scale_invariant_hks(pairs), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(hj.shape_dna(scaled), hj.shape_dna(pairs), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(hj.wks(scaled) * 9, hj.wks(pairs), rtol=1e-8)
+    np.testing.assert_allclose(hj.hks(scaled, 9 * np.array(TIMES)) * 9, hj.hks(pairs, TIMES), rtol=1e-8)
+    np.testing.assert_allclose(hj.default_times(scaled, 5), 9 * hj.default_times(pairs, 5), rtol=1e-9)
+
+
+def test_distances_are_metrics_with_their_definitions(pairs):
+    inside = pairs.space.domain
+    nodes, phi = np.argwhere(inside), np.asarray(pairs.vectors)
+    gaps = phi[:, :, None] - phi[:, None, :]
+    diffusion = hj.diffusion_distance(pairs, [0.3], nodes)[0][:, inside]
+    expected = np.sqrt(np.einsum("i,ixy->xy", np.exp(-0.6 * pairs.eigenvalues), gaps**2))
+    # √ of a rounding error of 1e-15
+    np.testing.assert_allclose(diffusion, expected, atol=3e-7)
+    biharmonic = hj.biharmonic_distance(pairs, nodes)[:, inside]
+    expected = np.sqrt(np.einsum("i,ixy->xy", np.asarray(pairs.eigenvalues)[1:] ** -2.0, gaps[1:] ** 2))
+    np.testing.assert_allclose(biharmonic, expected, atol=3e-7)
+    embedding = hj.global_point_signature(pairs)[:, inside]
+    np.testing.assert_allclose(embedding * np.sqrt(pairs.eigenvalues[1:, None]), phi[1:], rtol=1e-12)
+    # The root at distance zero has a derivative, and it is zero.
+    slope = jax.grad(lambda t: hj.diffusion_distance(pairs, t, nodes[0])[0, 0, *nodes[0]])(jnp.array([0.3]))
+    assert np.isfinite(slope).all()
+
+
+def test_default_times_span_the_spectrum(pairs):
+    times = hj.default_times(pairs, 7)
+    assert times[0] * pairs.eigenvalues[-1] == pytest.approx(4 * np.log(10))
+    assert times[-1] * pairs.eigenvalues[1] == pytest.approx(4 * np.log(10))
+    np.testing.assert_allclose(np.diff(np.log(times)), np.log(times[-1] / times[0]) / 6)
+
+
+def test_tail_estimate_is_of_the_right_size():
+    field = flat((41, 41), (1.0, 1.0))
+    few, many = hj.eigenpairs(field, 119), hj.eigenpairs(field, 1680)
+    for t in (0.005, 0.01):
+        true_tail = 1 - hj.heat_trace(few, [t])[0] / hj.heat_trace(many, [t])[0]
+        assert 0.5 < hj.truncation(few, [t]).tail[0] / true_tail < 2
+    assert hj.truncation(hj.eigenpairs(flat((5, 5), (1, 1)), 25), [1e-3]).tail[0] == 0
+
+
+def test_resolution_bias_bounds_the_discretisation_error():
+    # The exact HKS of a flat torus is 1/4πt times a theta function which is 1 to 1e-10 here.
+    for mass in ("consistent", "lumped"):
+        field = flat((24, 24), (1.0, 1.0), (True, True))
+        pairs = hj.eigenpairs(field, 576, "periodic", mass=mass)
+        report = hj.truncation(pairs, jnp.array([0.01]))
+        error = abs(hj.hks(pairs, [0.01], "flat")[0, 0, 0] - 1)
+        assert 0.3 * report.resolution_bias[0] < error < 1.1 * report.resolution_bias[0]
+        assert not report.messages()
+
+
+def test_too_small_times_are_reported():
+    pairs = hj.eigenpairs(flat((30, 31), (1.0, 1.0)), 60)
+    with pytest.warns(hj.AccuracyWarning, match=r"1 of 2 times are too small for k: an estimated .*% of the signature"):
+        hj.hks(pairs, [0.004, 0.5])
+    whole = hj.eigenpairs(flat((8, 9), (1.0, 1.0)), 72)
+    with pytest.warns(hj.AccuracyWarning, match="too small for the grid: .* Use times from about .* or a finer grid"):
+        hj.hks(whole, [0.004])
+    smallest = hj.truncation(pairs, [0.5]).smallest_time
+    assert hj.truncation(pairs, smallest[None]).tail[0] < 0.011
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([0.1, 0.0], "times: got 0.0; expected positive finite"),
+        ([-1.0], "times: got -1.0"),
+        ([np.nan], "times: got nan"),
+        (0.1, r"times: got shape \(\); expected a non-empty 1-D array; wrap one time as \[t\]"),
+        ([], "times: got shape"),
+    ],
+)
+def test_bad_times(pairs, times, message):
+    for function in (hj.hks, hj.heat_trace, hj.truncation):
+        with pytest.raises(ValueError, match=message):
+            function(pairs, times)
+
+
+@pytest.mark.parametrize(
+    ("sources", "message"),
+    [
+        ((0, 8), r"sources: 1 of 1 are outside the mask \(the first is \(0, 8\)\)"),
+        ((0, 9), "sources: got indices 0 … 9; expected nodes of shape"),
+        ((0.0, 1.0), "expected integer node indices"),
+        ([1, 2, 3], r"sources: got shape \(3,\); expected \(s, 2\) node indices"),
+    ],
+)
+def test_bad_sources(pairs, sources, message):
+    with pytest.raises(ValueError, match=message):
+        hj.heat_kernel(pairs, [0.5], sources)
+
+
+def test_other_bad_arguments(pairs):
+    with pytest.raises(ValueError, match="energies, sigma: give both or neither"):
+        hj.wks(pairs, [1.0])
+    with pytest.raises(ValueError, match="sigma: got 0"):
+        hj.wks(pairs, [1.0], 0)
+    with pytest.raises(ValueError, match="n_frequencies: got 200; 256 times have 1 … 129"):
+        hj.scale_invariant_hks(pairs, 200)
+    with pytest.raises(ValueError, match="n: got 0"):
+        hj.default_times(pairs, 0)
+    alone = hj.eigenpairs(flat((5, 6), (1.0, 1.2)), 1)
+    with pytest.raises(ValueError, match="all k = 1 eigenvalues are zero"):
+        hj.default_times(alone)
+
+
+def test_everything_runs_under_jit(field):
+    @jax.jit
+    def everything(field, times):
+        pairs = hj.eigenpairs(field, 12, solver="dense")
+        return (
+            hj.hks(pairs, times), hj.wks(pairs), hj.scale_invariant_hks(pairs), hj.heat_trace(pairs, times),
+            hj.heat_kernel(pairs, times, (4, 4)), hj.diffusion_distance(pairs, times, (4, 4)),
+            hj.biharmonic_distance(pairs, (4, 4)), hj.default_times(pairs), hj.truncation(pairs, times).tail,
+            hj.shape_dna(pairs), hj.global_point_signature(pairs),
+        )  # fmt: skip
+
+    times = jnp.array([1.0, 2.0])
+    pairs = hj.eigenpairs(field, 12, solver="dense")
+    traced = everything(field, times)
+    np.testing.assert_allclose(traced[0], hj.hks(pairs, times), rtol=1e-10)
+    np.testing.assert_allclose(traced[6], hj.biharmonic_distance(pairs, (4, 4)), rtol=1e-8, atol=1e-7)
+    assert [np.isfinite(leaf).any() for leaf in traced] == [True] * 11
