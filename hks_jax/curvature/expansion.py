@@ -25,6 +25,7 @@ from hks_jax.curvature.jet import (
 from hks_jax.curvature.laplace_beltrami import laplacian
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.signatures.times import checked_times
 
 Invariants: TypeAlias = tuple[Array, ...]
 
@@ -60,7 +61,9 @@ def hks_expansion(
     require_surface(field)
     if order not in (0, 1, 2, 3):
         raise ValueError(f"order: got {order!r}; expected 0, 1, 2 or 3")
-    return _hks_expansion(field, _checked_times(times), int(order), wraps_per_axis(periodic, 2))
+    return _hks_expansion(
+        field, checked_times("times", times, field.tensors.dtype), int(order), wraps_per_axis(periodic, 2)
+    )
 
 
 @partial(jax.jit, static_argnums=(2, 3))
@@ -75,9 +78,7 @@ def _hks_expansion(
     return nan_outside(series / (4 * jnp.pi * t), known)
 
 
-def _coefficients(
-    K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0
-) -> list[Array]:
+def _coefficients(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0) -> list[Array]:
     """Return 1, u₁, u₂, u₃; right as far as their ingredients are given."""
     return [
         jnp.ones_like(K),
@@ -87,9 +88,7 @@ def _coefficients(
     ]
 
 
-def _exact(
-    field: TensorField, order: int, wraps: tuple[bool, ...]
-) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
+def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
     """Return K, then as far as the order needs ∇²K, |∇K|² and ∇⁴K, as nested derivatives of the metric's function."""
     metric = metric_function(field)
 
@@ -108,9 +107,7 @@ def _exact(
     return at_nodes((curvature, curvature, second, third)[order], field.grid, inside), inside
 
 
-def _nodal(
-    field: TensorField, order: int, wraps: tuple[bool, ...]
-) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
+def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
     """Return the same by differences of differences, and the nodes where all are known."""
     g, known = metric_jet(field, wraps)
     invariants: Invariants = (brioschi(g),)
@@ -126,16 +123,3 @@ def _nodal(
 def _part(jets: Jet, index: int) -> Jet:
     """Return the jet of one component of a function with several."""
     return Jet(*(part[index] for part in jets))
-
-
-def _checked_times(times: Any) -> Float[Array, " n_times"]:
-    array = jnp.asarray(times)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
-    if array.ndim != 1 or array.size == 0:
-        raise ValueError(f"times: got shape {array.shape}; expected a vector (n_times,), for one time [t]")
-    if not isinstance(array, jax.core.Tracer):
-        bad = np.asarray(~(jnp.isfinite(array) & (array > 0)))
-        if bad.any():
-            raise ValueError(f"times: got {np.asarray(array)[bad][0]}; expected positive, finite numbers")
-    return array

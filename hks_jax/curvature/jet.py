@@ -59,10 +59,7 @@ def nodal_jet(
         return differentiate(values, inside, axis, order, grid.spacing[axis], wraps[axis])
 
     first = [along(values, inside, a, 1) for a in range(d)]
-    second = [
-        [along(*first[a], b, 1) if a < b else along(values, inside, a, 2) for b in range(a, d)]
-        for a in range(d)
-    ]
+    second = [[along(*first[a], b, 1) if a < b else along(values, inside, a, 2) for b in range(a, d)] for a in range(d)]
     known = np.logical_and.reduce([valid for row in [first, *second] for _, valid in row])
     hessian = [[second[min(a, b)][abs(b - a)][0] for b in range(d)] for a in range(d)]
     return Jet(
@@ -78,9 +75,7 @@ def christoffel(metric: Jet) -> Float[Array, "... d d d"]:
     return (slope + jnp.swapaxes(slope, -1, -2) - jnp.moveaxis(slope, -1, -3)) / 2
 
 
-def inner(
-    inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[Array, "... d"]
-) -> Float[Array, "..."]:
+def inner(inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[Array, "... d"]) -> Float[Array, "..."]:
     """Return ⟨p, q⟩ = gᵃᵇ pₐ qᵦ of two covectors."""
     # Sums of products fuse, where XLA would make calls of as many tiny matrix products.
     return jnp.sum(inverse * p[..., :, None] * q[..., None, :], axis=(-2, -1))
@@ -118,9 +113,7 @@ def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*
     n_batches = -(-grid.size // _BATCH)
     batches = np.resize(flat, (n_batches, -(-grid.size // n_batches), grid.dimension))
     values = jax.lax.map(jax.vmap(fn), jnp.asarray(batches, jnp.result_type(float)))
-    return jax.tree.map(
-        lambda a: a.reshape(-1, *a.shape[2:])[: grid.size].reshape(*grid.shape, *a.shape[2:]), values
-    )
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[: grid.size].reshape(*grid.shape, *a.shape[2:]), values)
 
 
 def nan_outside(
@@ -138,7 +131,5 @@ def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[boo
     """
     wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(periodic)
     if len(wraps) != dimension or not all(isinstance(wrap, bool | np.bool_) for wrap in wraps):
-        raise ValueError(
-            f"periodic: got {periodic!r}; expected True, False, or {dimension} of them, one per axis"
-        )
+        raise ValueError(f"periodic: got {periodic!r}; expected True, False, or {dimension} of them, one per axis")
     return tuple(bool(wrap) for wrap in wraps)

@@ -50,18 +50,14 @@ def laplace_beltrami(
     else:
         f = jnp.asarray(f)
         if f.shape != field.grid.shape:
-            raise ValueError(
-                f"f: got shape {f.shape}; expected the grid's shape {field.grid.shape}, or a function"
-            )
+            raise ValueError(f"f: got shape {f.shape}; expected the grid's shape {field.grid.shape}, or a function")
         if not jnp.issubdtype(f.dtype, jnp.floating):
             f = f.astype(jnp.result_type(float))
     return _laplace_beltrami(field, f, wraps_per_axis(periodic, field.grid.dimension))
 
 
 @partial(jax.jit, static_argnums=2)
-def _laplace_beltrami(
-    field: TensorField, f: Array | jtu.Partial, wraps: tuple[bool, ...]
-) -> Float[Array, "*shape"]:
+def _laplace_beltrami(field: TensorField, f: Array | jtu.Partial, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
     metric, metric_known = metric_jet(field, wraps)
     scalar, scalar_known = _scalar_jet(f, field, wraps)
     return nan_outside(laplacian(metric, scalar), metric_known & scalar_known)
@@ -72,9 +68,7 @@ def _scalar_jet(
 ) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
     inside = domain_nodes(field.grid, wraps)
     if callable(f):
-        return at_nodes(
-            lambda x: function_jet(lambda y: jnp.asarray(f(y), y.dtype), x), field.grid, inside
-        ), inside
+        return at_nodes(lambda x: function_jet(lambda y: jnp.asarray(f(y), y.dtype), x), field.grid, inside), inside
     return nodal_jet(jnp.where(inside, f, 0), field.grid, inside, wraps)
 
 

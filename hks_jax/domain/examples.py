@@ -1,0 +1,170 @@
+"""The paper's fields, and charts of surfaces whose geometry is known in closed form.
+
+All come from functions, so that their curvature is exact. Angles are in radians.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import pi
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.tensor_field import TensorField
+
+Point = Float[Array, " d"]
+Metric = Callable[[Point], Float[Array, "d d"]]
+
+
+def pullback(parametrisation: Callable[[Point], Float[Array, " m"]]) -> Metric:
+    """Return the metric x ↦ JᵀJ that a map of coordinates (d,) into space (m,) pulls back, J its Jacobian."""
+
+    def metric(x: Point) -> Float[Array, "d d"]:
+        jacobian = jax.jacfwd(parametrisation)(x)
+        return jnp.matmul(jacobian.T, jacobian, precision="highest")
+
+    return metric
+
+
+def torus(x: Float[Array, " 2"], major: float | Array, minor: float | Array) -> Float[Array, " 3"]:
+    """Return the point of a torus of revolution; x₁ turns about the axis, x₂ about the tube."""
+    ring = major + minor * jnp.cos(x[1])
+    return jnp.stack([ring * jnp.cos(x[0]), ring * jnp.sin(x[0]), minor * jnp.sin(x[1])])
+
+
+def bumpy_torus(x: Float[Array, " 2"]) -> Float[Array, " 3"]:
+    """Return the point of the paper's bumpy torus (Table 1): radii 3 + ½cos 10x₁ and 1 + ⅕cos 8x₂."""
+    return torus(x, 3 + jnp.cos(10 * x[0]) / 2, 1 + jnp.cos(8 * x[1]) / 5)
+
+
+def torus_field(shape: Sequence[int], major: float = 2.0, minor: float = 1.0) -> TensorField:
+    """Return the metric of a torus of revolution on its periodic chart (0, 2π)²; both axes are ``"periodic"``.
+
+    Its Gaussian curvature is cos x₂ / (minor (major + minor cos x₂)).
+    """
+    return TensorField.from_function(pullback(partial(torus, major=major, minor=minor)), _periodic_grid(shape))
+
+
+def bumpy_torus_field(n: int) -> TensorField:
+    """Return the metric of the bumpy torus on n × n nodes; both axes are ``"periodic"``."""
+    return TensorField.from_function(pullback(bumpy_torus), _periodic_grid((n, n)))
+
+
+def bumpy_torus_mesh(n: int) -> SurfaceMesh:
+    """Return the bumpy torus as a surface of 2n² triangles; vertex i·n + j is node (i, j) of `bumpy_torus_field`."""
+    nodes = jnp.asarray(_periodic_grid((n, n)).nodes).reshape(-1, 2)
+    return SurfaceMesh(jax.vmap(bumpy_torus)(nodes), _periodic_triangles(n))
+
+
+def _periodic_grid(shape: Sequence[int]) -> Grid:
+    return Grid(shape, [2 * pi / n for n in shape])
+
+
+def _periodic_triangles(n: int) -> np.ndarray:
+    i, j = (axis.ravel() for axis in np.indices((n, n)))
+    a, b, c, d = (((i + p) % n) * n + (j + q) % n for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def _stereographic(x: Float[Array, " 2"], sign: float) -> Float[Array, "2 2"]:
+    return 4 / (1 + sign * x @ x) ** 2 * jnp.eye(2)
+
+
+def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
+    """Return the unit sphere (K = 1) in its stereographic chart, n × n nodes on (−half_width, half_width)².
+
+    The sides are 2 arctan(half_width) from the centre; what the chart leaves out is around the other pole.
+    """
+    grid = Grid.from_bounds(-half_width, half_width, (n, n))
+    return TensorField.from_function(partial(_stereographic, sign=1.0), grid)
+
+
+def hyperbolic_field(n: int, half_width: float = 0.6) -> TensorField:
+    """Return the hyperbolic plane (K = −1) in the Poincaré disk, n × n nodes on (−half_width, half_width)²."""
+    if not 0 < half_width < 0.5**0.5:
+        raise ValueError(f"half_width: got {half_width}; the square fits into the disk below 1/√2")
+    grid = Grid.from_bounds(-half_width, half_width, (n, n))
+    return TensorField.from_function(partial(_stereographic, sign=-1.0), grid)
+
+
+def _bump(squared: Array) -> Array:
+    return 1 + 10 * jnp.exp(-squared)
+
+
+def figure3_fields(n: int) -> dict[str, TensorField]:
+    """Return T¹ … T⁴ of the paper's Fig. 3 on n × n nodes of (−5, 5)²; f(x) = 1 + 10 exp(−x²).
+
+    T¹ = diag(f(u₁), 1), which is flat; T² = diag(f(u₂), 1); T³ = diag(f(u₂), f(u₁)); T⁴ = f(|u|)·I.
+    """
+
+    def diagonal(entries: Callable[[Array, Array], Sequence[Array]]) -> Metric:
+        return lambda u: jnp.diag(jnp.stack(entries(*jnp.square(u))))
+
+    grid = Grid.from_bounds(-5, 5, (n, n))
+    metrics = {
+        "T¹": diagonal(lambda a, b: (_bump(a), jnp.ones_like(a))),
+        "T²": diagonal(lambda a, b: (_bump(b), jnp.ones_like(a))),
+        "T³": diagonal(lambda a, b: (_bump(b), _bump(a))),
+        "T⁴": diagonal(lambda a, b: (_bump(a + b), _bump(a + b))),
+    }
+    return {name: TensorField.from_function(metric, grid) for name, metric in metrics.items()}
+
+
+def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metric:
+    """Return the metric with constant eigenvalues whose major eigenvector is at the given angle to axis 0."""
+
+    def metric(u: Point) -> Float[Array, "2 2"]:
+        c, s = jnp.cos(2 * angle(u)), jnp.sin(2 * angle(u))
+        mean, half = (major + minor) / 2, (major - minor) / 2
+        return mean * jnp.eye(2) + half * jnp.stack([jnp.stack([c, s]), jnp.stack([s, -c])])
+
+    return metric
+
+
+def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, TensorField]:
+    """Return fields of constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
+
+    All of them have the same trace, determinant and anisotropy everywhere; only the directions differ. The spirals and
+    circles turn about (−0.3, −0.3), outside of the square.
+    """
+
+    def polar(u: Point) -> Array:
+        return jnp.arctan2(u[1] + 0.3, u[0] + 0.3)
+
+    angles: dict[str, Callable[[Point], Array]] = {
+        "straight": lambda u: jnp.full_like(u[0], pi / 6),
+        "circles": lambda u: polar(u) + pi / 2,
+        "spirals": lambda u: polar(u) + pi / 4,
+        "waves": lambda u: jnp.arctan(jnp.cos(2 * pi * u[0])),
+        "cells": lambda u: pi / 4 * jnp.sin(2 * pi * u[0]) * jnp.sin(2 * pi * u[1]),
+    }
+    grid = Grid.from_bounds(0, 1, (n, n))
+    return {name: TensorField.from_function(rotated(angle, major, minor), grid) for name, angle in angles.items()}
+
+
+def degenerate_point_field(index: float, n: int) -> TensorField:
+    """Return a field with a degenerate point of the given index in the middle of n × n nodes of (−1, 1)² (Fig. 5).
+
+    The eigenvalues are 10 ± 3|u|, and the major eigenvector is at ``index`` (a multiple of ½) times the polar angle θ:
+    T = 10·I + 3|u| [[c, s], [s, −c]], c = cos(2·index·θ), s = sin(2·index·θ). With m = |2·index| and z = u₁ ± iu₂, the
+    sign that of the index, |u| (c + is) = zᵐ |z|^(1−m), which needs no angle.
+    """
+    m = round(abs(2 * index))
+    if m == 0 or abs(m - abs(2 * index)) > 1e-12:
+        raise ValueError(f"index: got {index}; expected a non-zero multiple of 1/2")
+
+    def metric(u: Point) -> Float[Array, "2 2"]:
+        squared = u @ u
+        safe = jnp.where(squared > 0, squared, 1)  # the field is continuous at the centre, not differentiable
+        x, y = u[0], u[1] if index > 0 else -u[1]
+        c, s = x, y
+        for _ in range(m - 1):
+            c, s = x * c - y * s, x * s + y * c
+        scale = 3 * jnp.where(squared > 0, safe ** ((1 - m) / 2), 0)
+        return 10 * jnp.eye(2) + scale * jnp.stack([jnp.stack([c, s]), jnp.stack([s, -c])])
+
+    return TensorField.from_function(metric, Grid.from_bounds(-1, 1, (n, n)))

@@ -1,0 +1,208 @@
+"""Curvature and expansion against closed forms; the paper's slips, each with the check that shows it."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_torus import torus_hks
+
+import hks_jax as hj
+from hks_jax.domain import examples
+
+R, r = 2.0, 1.0
+
+
+def nodal(field: hj.TensorField) -> hj.TensorField:
+    """The same field without its function."""
+    return hj.TensorField(field.grid, field.tensors)
+
+
+def torus_curvature(v):
+    return jnp.cos(v) / (r * (R + r * jnp.cos(v)))
+
+
+def torus_laplacian(f, v):
+    """∇²f of f(v) on the torus of revolution: (w f')'/(r² w)."""
+    w = lambda v: R + r * jnp.cos(v)  # noqa: E731
+    flux = lambda v: w(v) * jax.grad(f)(v)  # noqa: E731
+    return jax.grad(flux)(v) / (r**2 * w(v))
+
+
+def skewed(x):
+    """A chart of the torus whose coordinate lines are neither orthogonal nor lines of curvature."""
+    return jnp.stack([x[0] + 0.3 * jnp.sin(x[1]), x[1] + 0.2 * jnp.cos(x[0] + x[1])])
+
+
+def skewed_torus(shape):
+    position = partial(examples.torus, major=R, minor=r)
+    grid = hj.Grid(shape, [2 * np.pi / n for n in shape])
+    field = hj.TensorField.from_function(examples.pullback(lambda x: position(skewed(x))), grid)
+    return field, jax.vmap(jax.vmap(skewed))(jnp.asarray(grid.nodes))[..., 1]
+
+
+def test_curvature_from_a_function_is_exact():
+    np.testing.assert_allclose(hj.gaussian_curvature(examples.sphere_field(9)), 1, atol=1e-12)
+    np.testing.assert_allclose(hj.gaussian_curvature(examples.hyperbolic_field(9)), -1, atol=1e-12)
+    field = examples.torus_field((5, 12), R, r)
+    v = field.grid.nodes[..., 1]
+    np.testing.assert_allclose(hj.gaussian_curvature(field), torus_curvature(v), atol=1e-13)
+    field, v = skewed_torus((6, 7))
+    assert np.abs(field.tensors[..., 0, 1]).max() > 0.5
+    np.testing.assert_allclose(hj.gaussian_curvature(field), torus_curvature(v), atol=1e-12)
+
+
+@pytest.mark.parametrize("periodic", [True, False])
+def test_nodal_curvature_converges_at_high_order(periodic):
+    errors = []
+    for n in (40, 80):
+        field, v = skewed_torus((n, n))
+        error = hj.gaussian_curvature(nodal(field), periodic=periodic) - torus_curvature(v)
+        errors.append(np.abs(error).max())
+    assert np.log2(errors[0] / errors[1]) > 4.8
+    assert errors[1] < 1e-3
+
+
+def test_laplace_beltrami_of_known_functions():
+    # A coordinate function of the unit sphere: ∇²f = −2f. Stereographic: z = (1 − |x|²)/(1 + |x|²).
+    field = examples.sphere_field(41, 1.0)
+
+    def height(x):
+        return (1 - x @ x) / (1 + x @ x)
+
+    values = jax.vmap(jax.vmap(height))(jnp.asarray(field.grid.nodes))
+    np.testing.assert_allclose(hj.laplace_beltrami(field, height), -2 * values, atol=1e-12)
+    np.testing.assert_allclose(hj.laplace_beltrami(nodal(field), values), -2 * values, atol=2e-4)
+    # The 3-sphere: ∇²f = −3f.
+    grid = hj.Grid.from_bounds(-0.5, 0.5, (12, 12, 12))
+    ball = hj.TensorField.from_function(lambda x: 4 / (1 + x @ x) ** 2 * jnp.eye(3), grid)
+    values = jax.vmap(jax.vmap(jax.vmap(height)))(jnp.asarray(grid.nodes))
+    np.testing.assert_allclose(hj.laplace_beltrami(ball, height), -3 * values, atol=1e-12)
+    np.testing.assert_allclose(hj.laplace_beltrami(nodal(ball), values), -3 * values, atol=2e-3)
+    field, v = skewed_torus((48, 48))
+    expected = jax.vmap(jax.vmap(partial(torus_laplacian, torus_curvature)))(v)
+    np.testing.assert_allclose(hj.laplace_beltrami(field, torus_curvature(v), periodic=True), expected, atol=5e-3)
+
+
+def test_mask_leaves_nan_where_no_stencil_fits_and_nothing_else_changes():
+    field = nodal(examples.sphere_field(31, 1.0))
+    mask = np.ones((31, 31), dtype=bool)
+    mask[:12, :9] = False
+    tensors = np.where(mask[..., None, None], field.tensors, np.nan)
+    got = hj.gaussian_curvature(hj.TensorField(hj.Grid((31, 31), field.grid.spacing, field.grid.origin, mask), tensors))
+    assert np.isnan(got[~mask]).all()
+    np.testing.assert_allclose(got[mask], 1, atol=5e-3)
+    narrow = np.zeros((31, 31), dtype=bool)
+    narrow[10:15] = narrow[:, 10:20] = True  # the arms are five nodes wide: too narrow for a stencil across
+    masked = hj.TensorField(hj.Grid((31, 31), field.grid.spacing, field.grid.origin, narrow), field.tensors)
+    got = np.asarray(hj.gaussian_curvature(masked))
+    assert np.isnan(got[12, 2])
+    assert got[2, 14] == pytest.approx(1, abs=5e-3)
+
+
+def test_curvature_is_differentiable_and_traceable():
+    field = nodal(examples.sphere_field(10, 1.0))
+
+    def mean(T):
+        return jnp.mean(hj.gaussian_curvature(hj.TensorField(field.grid, T)))
+
+    # K(c·g) = K(g)/c, so the derivative along g itself is −K.
+    slope = jax.jit(jax.grad(mean))(field.tensors)
+    assert jnp.sum(slope * field.tensors) == pytest.approx(-float(mean(field.tensors)), rel=1e-10)
+    both = jax.vmap(mean)(jnp.stack([field.tensors, 2 * field.tensors]))
+    assert both[0] == pytest.approx(2 * float(both[1]))
+
+
+def test_sphere_expansion_has_the_textbook_coefficients():
+    # 4πt·k = 1 + t/3 + t²/15 + 4t³/315 + …
+    t = np.array([0.1, 0.3])
+    expected = 1 + t / 3 + t**2 / 15 + 4 * t**3 / 315
+    got = hj.hks_expansion(examples.sphere_field(5), t)
+    np.testing.assert_allclose(got, np.broadcast_to((expected / (4 * np.pi * t))[:, None, None], got.shape), rtol=1e-9)
+
+
+def expansion_errors(coefficients) -> np.ndarray:
+    """Observed orders in t of (exact heat kernel − expansion) on the torus of revolution, relative to 1/4πt."""
+    times = np.array([0.05, 0.1])
+    v, exact = torus_hks(times, R, r)
+    series = sum(np.asarray(u)[None] * times[:, None] ** i for i, u in enumerate(coefficients(v)))
+    errors = np.abs(4 * np.pi * times[:, None] * exact - series).max(axis=1)
+    return np.log2(errors[1] / errors[0])
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+@pytest.mark.parametrize("source", ["function", "nodal"])
+def test_expansion_against_the_exact_kernel_of_a_torus(order, source):
+    """K varies, so that all terms of u₂ and u₃ count."""
+    times = np.array([0.05, 0.1])
+    n = 81
+    field = examples.torus_field((8, n), R, r)
+    got = hj.hks_expansion(field if source == "function" else nodal(field), times, order, periodic=True)
+    _, exact = torus_hks(times, R, r, n)
+    errors = np.abs(4 * np.pi * times * (got[:, 0] - exact).T).max(axis=0)
+    assert np.log2(errors[1] / errors[0]) == pytest.approx(order + 1, abs=0.35)
+
+
+def test_slip_u2_as_printed_leaves_an_error_of_order_two():
+    def right(v):
+        K = torus_curvature(v)
+        return np.ones_like(v), K / 3, K**2 / 15 + jax.vmap(partial(torus_laplacian, torus_curvature))(v) / 15
+
+    def printed(v):  # (4K² − 3ΔK)/45, with Δ = −∇²
+        K = torus_curvature(v)
+        return np.ones_like(v), K / 3, (4 * K**2 + 3 * jax.vmap(partial(torus_laplacian, torus_curvature))(v)) / 45
+
+    assert expansion_errors(right) == pytest.approx(3, abs=0.2)
+    assert expansion_errors(printed) == pytest.approx(2, abs=0.3)
+
+
+def test_slip_curvature_of_a_diagonal_metric_needs_a_plus():
+    """K = −1/(2√EG) (∂₁(∂₁G/√EG) ± ∂₂(∂₂E/√EG)): with plus it is 1 on the sphere, with minus it is not."""
+
+    def curvature(sign, x):
+        def root(x):
+            return jnp.sqrt(E(x) * G(x))
+
+        E = G = lambda x: 4 / (1 + x @ x) ** 2  # noqa: E731
+        first = jax.grad(lambda x: jax.grad(G)(x)[0] / root(x))(x)[0]
+        second = jax.grad(lambda x: jax.grad(E)(x)[1] / root(x))(x)[1]
+        return -(first + sign * second) / (2 * root(x))
+
+    x = jnp.array([0.4, 0.1])
+    assert curvature(1, x) == pytest.approx(1)
+    assert abs(curvature(-1, x) - 1) > 0.5
+
+
+def test_slip_varadhan_is_a_limit_of_small_times():
+    """−4t log k_t(x, y) → d²(x, y) as t → 0; as t → ∞ it grows without bound, like 4t log(area)."""
+    n = 33
+    field = hj.TensorField(hj.Grid((n, n), 1 / (n - 1)), np.broadcast_to(np.diag([1.0, 4.0]), (n, n, 2, 2)))
+    pairs = hj.eigenpairs(field, n * n)
+    i, j = (8, 16), (24, 16)  # half the width apart along axis 0, far from the sides along axis 1
+    times = np.array([0.04, 0.02, 0.01])
+    estimate = -4 * times * np.log(hj.heat_kernel(pairs, times, i)[:, 0, *j] * 4 * np.pi * times)
+    np.testing.assert_allclose(estimate, 0.25, rtol=0.06)
+    raw = -4 * times * np.log(hj.heat_kernel(pairs, times, i)[:, 0, *j])
+    assert (np.diff(np.abs(raw - 0.25)) < 0).all()
+    late = -4 * 50.0 * np.log(hj.heat_kernel(pairs, [50.0], i)[0, 0, *j])
+    assert late == pytest.approx(4 * 50 * np.log(2))  # the area is 2
+    # The series of the expansion begins at i = 0 with u₀ = 1.
+    inside = hj.hks(pairs, [0.01], "flat")[0, 16, 16]
+    assert inside == pytest.approx(1, abs=0.02)
+
+
+def test_bad_arguments():
+    cube = hj.TensorField(hj.Grid((9, 9, 9)), np.broadcast_to(np.eye(3), (9, 9, 9, 3, 3)))
+    flat = hj.TensorField(hj.Grid((9, 9)), np.broadcast_to(np.eye(2), (9, 9, 2, 2)))
+    small = hj.TensorField(hj.Grid((5, 9)), np.broadcast_to(np.eye(2), (5, 9, 2, 2)))
+    with pytest.raises(ValueError, match="field: got a grid of shape .* two dimensions"):
+        hj.gaussian_curvature(cube)
+    with pytest.raises(ValueError, match="8"):
+        hj.gaussian_curvature(small)
+    with pytest.raises(ValueError, match="order: got 4; expected 0, 1, 2 or 3"):
+        hj.hks_expansion(flat, [0.1], 4)
+    with pytest.raises(ValueError, match="times: got -0.1; expected positive finite"):
+        hj.hks_expansion(flat, [-0.1])
+    with pytest.raises(ValueError, match="periodic"):
+        hj.gaussian_curvature(flat, periodic=(True,) * 3)
