@@ -79,7 +79,7 @@ def test_laplace_beltrami_of_known_functions():
     ball = hj.TensorField.from_function(lambda x: 4 / (1 + x @ x) ** 2 * jnp.eye(3), grid)
     values = jax.vmap(jax.vmap(jax.vmap(height)))(jnp.asarray(grid.nodes))
     np.testing.assert_allclose(hj.laplace_beltrami(ball, height), -3 * values, atol=1e-12)
-    np.testing.assert_allclose(hj.laplace_beltrami(nodal(ball), values), -3 * values, atol=2e-3)
+    np.testing.assert_allclose(hj.laplace_beltrami(nodal(ball), values), -3 * values, atol=5e-3)
     field, v = skewed_torus((48, 48))
     expected = jax.vmap(jax.vmap(partial(torus_laplacian, torus_curvature)))(v)
     np.testing.assert_allclose(hj.laplace_beltrami(field, torus_curvature(v), periodic=True), expected, atol=5e-3)

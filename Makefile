@@ -1,0 +1,63 @@
+# Everything runs in an environment of its own: a fresh machine needs Python 3.11 or newer and make.
+#
+#   make demo        the heat kernel signature of a real brain slice: pictures in demo/
+#   make test        the tests
+#   make test-slow   the tests that take minutes
+#   make lint        lint, format and type checks
+#   make notebooks   run every notebook
+#   make clean       remove what the above made
+
+PYTHON ?= python3
+VENV ?= .venv
+# Test processes. Each compiles for itself, so more than there are cores do not pay.
+JOBS ?= auto
+
+BIN := $(VENV)/bin
+# A stamp is newer than pyproject.toml as long as what it names is installed: nothing is installed twice.
+STAMPS := $(VENV)/.stamps
+BRAIN := mdt==1.2.7
+
+.PHONY: demo test test-slow lint notebooks clean
+.DELETE_ON_ERROR:
+
+demo: $(STAMPS)/dti $(STAMPS)/brain
+	$(BIN)/python -m hks_jax demo -o demo
+
+test: $(STAMPS)/test
+	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+
+test-slow: $(STAMPS)/test
+	$(BIN)/python -m pytest -n $(JOBS) -m slow
+
+lint: $(STAMPS)/lint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+notebooks: $(STAMPS)/dti
+	@set -e; for notebook in notebooks/*.py; do \
+	    test -e "$$notebook" || { echo "no notebooks"; break; }; \
+	    echo "$$notebook"; MPLBACKEND=Agg $(BIN)/python "$$notebook"; \
+	done
+
+clean:
+	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(STAMPS)/venv:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "error: $(PYTHON) is missing or older than 3.11; choose another: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' || \
+	    { echo "error: $(PYTHON) lacks venv or ensurepip; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@mkdir -p $(STAMPS) && touch $@
+
+# One extra of pyproject.toml each: dti, test, lint.
+$(STAMPS)/dti $(STAMPS)/test $(STAMPS)/lint: $(STAMPS)/%: pyproject.toml $(STAMPS)/venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$*]"
+	@touch $@
+
+# A brain to show, and no dependency: the demo runs on a phantom where it cannot be had. It is tried again next time.
+$(STAMPS)/brain: $(STAMPS)/venv
+	@if $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 1 --no-deps "$(BRAIN)"; then touch $@; \
+	else echo "note: $(BRAIN), which carries the example brain, could not be installed; the demo uses a phantom" >&2; fi

@@ -1,0 +1,76 @@
+"""The command line, ``hks-jax``: errors become one line on stderr and an exit code."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+import numpy as np
+
+from hks_jax import __version__
+from hks_jax.cli import demo, hks, paper
+
+SUBCOMMANDS = (hks, demo, paper)
+
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+
+# What users can put right: wrong values, missing files, missing extras. All else is a failure of the computation.
+INPUT_ERRORS = (
+    ValueError,
+    FileNotFoundError,
+    IsADirectoryError,
+    NotADirectoryError,
+    PermissionError,
+    ImportError,
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error, and leave with the exit code for bad input."""
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all subcommands."""
+    parser = Parser(prog="hks-jax", description="Heat kernel signatures of tensor fields.")
+    parser.add_argument("--version", action="version", version=f"hks-jax {__version__}")
+    subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for subcommand in SUBCOMMANDS:
+        sub = subcommand.add_parser(subparsers)
+        sub.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        sub.set_defaults(run=subcommand.run, prog=sub.prog)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    0: done; 1: the computation failed; 2: bad input; 130: interrupted. Output files appear whole
+    and, but for `paper`, all at the end: unless it is 0, there are none.
+    """
+    try:
+        args = build_parser().parse_args(argv)
+    except SystemExit as stop:  # argparse has printed its message
+        return int(stop.code or 0)
+    try:
+        args.run(args)
+    except KeyboardInterrupt:
+        return _fail(args, "interrupted", INTERRUPTED)
+    except np.linalg.LinAlgError as error:
+        return _fail(args, str(error), FAILED, error)
+    except INPUT_ERRORS as error:
+        return _fail(args, str(error), BAD_INPUT, error)
+    except Exception as error:
+        return _fail(args, f"{type(error).__name__}: {error}", FAILED, error)
+    return 0
+
+
+def _fail(args: argparse.Namespace, message: str, code: int, error: Exception | None = None) -> int:
+    if args.debug and error is not None:
+        raise error
+    print(f"{args.prog}: error: {' '.join(message.split())}", file=sys.stderr)
+    return code

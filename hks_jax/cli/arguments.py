@@ -1,0 +1,58 @@
+"""How the command line writes slices, boundaries and times."""
+
+from argparse import ArgumentTypeError
+from typing import NamedTuple
+
+from hks_jax.fem.boundary import BoundarySpec
+
+
+class Times(NamedTuple):
+    """Explicit times, or the number of automatic ones."""
+
+    explicit: tuple[float, ...]
+    automatic: int
+
+
+DEFAULT_TIMES = Times((), 6)
+
+
+def parse_slice(text: str) -> tuple[str, int]:
+    """Read ``z=14``."""
+    axis, _, index = text.partition("=")
+    if axis not in ("x", "y", "z") or not index.isdecimal():
+        raise ArgumentTypeError(f"got {text!r}; expected an axis and an index from 0, such as z=14")
+    return axis, int(index)
+
+
+def parse_boundary(text: str) -> BoundarySpec:
+    """Read ``neumann``; ``neumann,periodic`` (one per axis); ``neumann:dirichlet,periodic`` (low side, high side)."""
+    entries = []
+    for entry in text.split(","):
+        low, colon, high = entry.partition(":")
+        entries.append((low, high) if colon else low)
+    return entries[0] if len(entries) == 1 and isinstance(entries[0], str) else tuple(entries)
+
+
+def parse_times(words: list[str] | None) -> Times:
+    """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``.
+
+    Raises:
+        ValueError: anything else.
+    """
+    if words is None:
+        return DEFAULT_TIMES
+    pieces = [piece for word in words for piece in word.split(",") if piece]
+    if len(pieces) == 1 and pieces[0].split(":")[0] == "auto":
+        _, colon, count = pieces[0].partition(":")
+        if not colon:
+            return DEFAULT_TIMES
+        if count.isdecimal() and int(count) >= 1:
+            return Times((), int(count))
+        pieces = [pieces[0]]
+    try:
+        times = tuple(float(piece) for piece in pieces)
+    except ValueError:
+        times = ()
+    if not times or not all(0 < t < float("inf") for t in times):
+        raise ValueError(f"--times: got {' '.join(words)!r}; expected positive numbers, or auto, or auto:N")
+    return Times(tuple(sorted(times)), 0)

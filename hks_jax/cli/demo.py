@@ -1,0 +1,110 @@
+"""``hks-jax demo``: the heat kernel signature of a brain slice, or of a phantom where no brain is installed."""
+
+import argparse
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hks_jax.cli.progress import Progress
+from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
+
+B_MAX = 1000.0
+"""s/mm²; a single tensor describes the signal well up to there."""
+RIM = 2
+"""Voxels taken off the mask: at the rim, tissue mixes with what surrounds it and fits fail."""
+SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
+"""How far the heat has spread, √(Dt), at the times drawn: in voxels, from what they resolve to the brain's size."""
+N_PAIRS = 300
+"""Enough for the first of these times."""
+PHANTOM_SHAPE = (72, 80)
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand's parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "demo",
+        help="compute and draw the signature of a brain slice",
+        description="Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The brain "
+        'comes with the PyPI wheel mdt==1.2.7 (install it with --no-deps), the fit needs "hks-jax[dti]"; without '
+        "them, or with --phantom, an analytic phantom takes the brain's place.",
+    )
+    add = parser.add_argument
+    add("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="folder for the results (demo)")
+    add("--phantom", action="store_true", help="use the phantom in any case")
+    return parser
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the subcommand."""
+    from hks_jax.cli.arguments import Times
+    from hks_jax.cli.job import Settings, compute
+    from hks_jax.cli.outputs import check_folder, write_outputs
+    from hks_jax.cli.picture import draw
+    from hks_jax.plot import number_text
+
+    check_folder(args.output)
+    progress = Progress(args.quiet)
+    with progress.catching_warnings():
+        brain = None if args.phantom else _installed_brain(progress)
+        volume = phantom_volume() if brain is None else _brain_slice(brain, progress)
+        mean = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
+        lengths = min(volume.spacing) * SPREADS
+        times = lengths**2 / np.median(mean[volume.mask])
+        settings = Settings(metric="inverse", components="largest", k=N_PAIRS, times=Times(tuple(times.tolist()), 0))
+        result = compute(volume, settings, progress)
+        time_unit, length_unit = ("", "") if brain is None else (" s", " mm")
+        titles = [
+            rf"$t$ = {number_text(t)}{time_unit}  ($\sqrt{{Dt}}$ ≈ {length:.2g}{length_unit})"
+            for t, length in zip(times, lengths, strict=True)
+        ]
+        files = write_outputs(
+            args.output,
+            result,
+            progress,
+            draw=lambda path: draw(
+                result,
+                path,
+                titles=titles,
+                first=(f"mean diffusivity{'' if brain is None else ', mm²/s'}", mean),
+                title=f"Heat kernel signature of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹",
+            ),
+            nifti=brain is not None,
+            command=sys.argv,
+        )
+    if not args.quiet:
+        print(f"The picture is {next(file for file in files if file.suffix == '.png')}")
+
+
+def phantom_volume() -> TensorVolume:
+    """Return the phantom as a slice."""
+    from hks_jax.domain.phantom import phantom
+
+    tensors, mask, spacing = phantom(PHANTOM_SHAPE)
+    return TensorVolume(
+        np.asarray(tensors),
+        tuple(np.broadcast_to(np.asarray(spacing, float), (2,)).tolist()),
+        (0.0, 0.0),
+        np.asarray(mask, bool),
+        source="phantom",
+    )
+
+
+def _installed_brain(progress: Progress) -> ExampleBrain | None:
+    brain = find_example_brain()
+    if brain is None:
+        progress.note("no example brain: the wheel mdt==1.2.7 is not installed; using the phantom")
+    elif importlib.util.find_spec("dipy") is None:
+        progress.note('no tensor fit: DIPY is not installed (pip install "hks-jax[dti]"); using the phantom')
+        brain = None
+    return brain
+
+
+def _brain_slice(brain: ExampleBrain, progress: Progress) -> TensorVolume:
+    with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
+        volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX)
+        plane = volume.slice("z", 0)
+        assert plane.mask is not None
+        return plane.with_mask(erode(plane.mask, RIM))

@@ -1,0 +1,158 @@
+"""The main job: from a tensor volume to its heat kernel signature, and what is known about it."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from hks_jax.cli.arguments import DEFAULT_TIMES, Times
+from hks_jax.cli.progress import Progress
+from hks_jax.domain.tensor_field import MetricChoice, TensorField
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.shift_invert import ShiftInvert
+from hks_jax.eigen.solve import _choose as choose_solver
+from hks_jax.eigen.solve import eigenpairs
+from hks_jax.eigen.solver import Eigensolver
+from hks_jax.fem.assembly import assemble
+from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
+from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.io.volume import TensorVolume
+from hks_jax.signatures.heat import Normalisation, hks
+from hks_jax.signatures.times import default_times
+from hks_jax.signatures.truncation import truncation
+
+DEFAULT_K = 200
+
+
+class ComputationError(RuntimeError):
+    """The computation did not give what was asked for."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to compute; see ``hks-jax hks --help``."""
+
+    metric: MetricChoice
+    k: int | None = None
+    boundary: BoundarySpec = "neumann"
+    times: Times = DEFAULT_TIMES
+    components: Literal["raise", "largest", "all"] = "raise"
+    solver: str = "auto"
+    normalisation: Normalisation = "raw"
+    dtype: Literal["float32", "float64"] = "float64"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The signature on the volume whose mask is the domain, and what the report says of it."""
+
+    volume: TensorVolume
+    times: np.ndarray
+    values: np.ndarray
+    eigenvalues: np.ndarray
+    report: dict[str, Any]
+
+
+def use_dtype(dtype: str) -> None:
+    """Let JAX compute in float64 if asked to: the application's choice, made before any array is."""
+    if dtype == "float64":
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+
+
+def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Result:
+    """Compute the signature of a volume or slice.
+
+    Raises:
+        ValueError: tensors, mask or settings that cannot be computed with.
+        ComputationError: eigenpairs that did not converge.
+    """
+    use_dtype(settings.dtype)
+    tensors = volume.tensors.astype(settings.dtype)
+    grid = volume.grid(settings.components)
+    with progress.stage("assembly", f"{int(grid.inside.sum())} of {grid.size} nodes"):
+        for message in unreached_sides(grid.inside, settings.boundary):
+            progress.warn(message)
+        field = TensorField.from_diffusion(grid, tensors, settings.metric, name="tensors")
+        pencil = assemble(field, settings.boundary)
+    unknowns = sum(part.space.n_dof for part in pencil.parts)
+    k = min(DEFAULT_K, max(1, unknowns // 4)) if settings.k is None else settings.k
+    solver = _reporting(settings.solver, pencil, k, progress.update)
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
+        pairs = eigenpairs(pencil, k, solver=solver)
+        eigenvalues = np.asarray(pairs.eigenvalues)
+    if not np.asarray(pairs.converged).all():
+        raise ComputationError(pairs.messages()[0])
+    with progress.stage("signature"):
+        times = settings.times.explicit or tuple(default_times(pairs, settings.times.automatic).tolist())
+        values = np.asarray(hks(pairs, times, settings.normalisation))
+    return Result(
+        volume.with_mask(grid.mask),
+        np.asarray(times),
+        values,
+        eigenvalues,
+        _report(volume, grid.mask, settings, pairs, times),
+    )
+
+
+def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
+    """Say which conditions have no effect, because the mask does not reach the side of the grid that they are for."""
+    found = []
+    for axis, (name, conditions) in enumerate(zip("xyz", normalise_boundary(boundary, inside.ndim), strict=False)):
+        for index, condition in zip((0, -1), conditions, strict=True):
+            if condition != "neumann" and not np.take(inside, index, axis).any():
+                found.append(
+                    f'boundary: "{condition}" has no effect at the {"low" if index == 0 else "high"} side of {name}, '
+                    "which the mask does not reach; the mask's own rim is always natural (Neumann)"
+                )
+    return found
+
+
+def _reporting(solver: str, pencil: Pencil | MirrorPencil, k: int, callback: Callable[[str], None]) -> Eigensolver:
+    """Return the solver, with progress if it has any to show."""
+    chosen = choose_solver(solver, pencil.parts[0], k)
+    return ShiftInvert(progress=callback) if isinstance(chosen, ShiftInvert) else chosen
+
+
+def _report(
+    volume: TensorVolume, mask: np.ndarray | None, settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]
+) -> dict[str, Any]:
+    estimate = truncation(pairs, jnp.asarray(times))
+    values = np.asarray(pairs.eigenvalues)
+    chosen = replace(settings, times=Times(times, settings.times.automatic), k=pairs.k)
+    return {
+        "input": {
+            "source": volume.source,
+            "shape": volume.shape,
+            "spacing": volume.spacing,
+            "order": volume.order,
+            "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),
+            "notes": list(volume.notes),
+        },
+        "settings": {**asdict(chosen), "times": "automatic" if settings.times.automatic else "explicit"},
+        "eigenpairs": {
+            "k": pairs.k,
+            "unknowns": sum(part.space.n_dof for part in pairs.pencil.parts),
+            "solver": pairs.solver_name,
+            "zero": pairs.n_null,
+            "first_positive": float(values[min(pairs.n_null, pairs.k - 1)]),
+            "last": float(values[-1]),
+            "next": float(pairs.next_eigenvalue),
+            "worst_residual": float(np.max(np.asarray(pairs.residuals))),
+            "converged": int(np.sum(np.asarray(pairs.converged))),
+            "cut_multiplet": int(pairs.cut_multiplet),
+        },
+        "times": [
+            {"t": float(t), "truncation": float(tail), "resolution_bias": float(bias), "coarse_fraction": float(coarse)}
+            for t, tail, bias, coarse in zip(
+                times,
+                np.asarray(estimate.tail),
+                np.asarray(estimate.resolution_bias),
+                np.asarray(estimate.coarse_fraction),
+                strict=True,
+            )
+        ],
+    }

@@ -1,0 +1,79 @@
+"""What a job leaves in its folder: all of it or nothing."""
+
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hks_jax.cli.job import Result
+from hks_jax.cli.progress import Progress
+from hks_jax.io.atomic import atomic_folder
+from hks_jax.io.save import save
+
+
+def check_folder(path: Path) -> None:
+    """Raise before a long computation if its results could not be written.
+
+    Raises:
+        NotADirectoryError: `path` is a file.
+        PermissionError: it may not be written.
+    """
+    nearest = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not nearest.is_dir():
+        raise NotADirectoryError(f"--output: {nearest} is a file; expected a folder, or a name that is free")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise PermissionError(f"--output: {nearest} may not be written; choose another folder")
+
+
+def write_outputs(
+    folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], nifti: bool, command: list[str]
+) -> list[Path]:
+    """Write hks.npz, hks.nii.gz (if `nifti`), hks.png (by `draw`) and report.json; return their paths."""
+    with progress.stage("writing", str(folder)), atomic_folder(folder) as temporary:
+        extra = {"times": result.times, "eigenvalues": result.eigenvalues}
+        save(temporary / "hks.npz", result.values, result.volume, name="hks", extra=extra)
+        if nifti:
+            save(temporary / "hks.nii.gz", result.values, result.volume, name="hks")
+        draw(temporary / "hks.png")
+        report = {
+            "command": command,
+            **result.report,
+            "warnings": progress.warnings,
+            "versions": versions(),
+            "seconds": {stage: round(seconds, 3) for stage, seconds in progress.timings.items()},
+        }
+        (temporary / "report.json").write_text(json.dumps(_plain(report), indent=2, ensure_ascii=False) + "\n")
+        names = sorted(file.name for file in temporary.iterdir())
+    return [folder / name for name in names]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what took part, and the device."""
+    import jax
+
+    found = {"python": platform.python_version(), "system": platform.platform(), "device": jax.devices()[0].device_kind}
+    for package in ("hks-jax", "jax", "jaxlib", "numpy", "scipy", "matplotlib", "nibabel", "dipy"):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON can hold: no NaN or infinity, no tuples or NumPy scalars."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,124 @@
+"""Diffusion tensors from diffusion-weighted images, by DIPY, and where a brain to try them on may be installed."""
+
+import importlib.metadata
+import os
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hks_jax.io import nifti
+from hks_jax.io.masks import as_mask, read_mask
+from hks_jax.io.tensor_order import to_voxel_axes
+from hks_jax.io.volume import TensorVolume
+
+
+class ExampleBrain(NamedTuple):
+    """The files of a diffusion-weighted brain."""
+
+    images: Path
+    bval: Path
+    bvec: Path
+    mask: Path
+
+
+def find_example_brain() -> ExampleBrain | None:
+    """Locate the brain that the PyPI wheel ``mdt`` carries (104 × 104 × 2 voxels of 2 mm), or return None.
+
+    The wheel (1.2.7, LGPL-3.0-or-later; install it with ``--no-deps``) is looked up by its metadata and not imported.
+    Its images have 13 directions at b = 0, 30 at b = 1000 and 60 at b = 2000 s/mm².
+    """
+    stem = "b1k_b2k_example_slices_24_38"
+    names = (f"{stem}.nii.gz", "b1k_b2k.bval", "b1k_b2k.bvec", f"{stem}_mask.nii.gz")
+    try:
+        files = importlib.metadata.files("mdt") or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    found = {file.name: Path(str(file.locate())) for file in files if file.name in names}
+    if any(name not in found or not found[name].is_file() for name in names):
+        return None
+    return ExampleBrain(*(found[name] for name in names))
+
+
+def fit_dwi(
+    path: str | os.PathLike[str],
+    bval: str | os.PathLike[str],
+    bvec: str | os.PathLike[str],
+    mask: str | os.PathLike[str] | Bool[np.ndarray, "*shape"],
+    b_max: float | None = None,
+) -> TensorVolume:
+    """Fit diffusion tensors to diffusion-weighted images: weighted least squares on log signals (DIPY's TensorModel).
+
+    Args:
+        path: NIfTI (nx, ny, nz, n).
+        bval: text file of the n b-values, in s/mm².
+        bvec: text file of the n directions, 3 × n or n × 3, in FSL's convention: voxel axes, the first reversed
+            where the affine's determinant is positive.
+        mask: a file (see `read_mask`) or a bool array (nx, ny, nz): fit inside only; outside, tensors are zero.
+        b_max: leave out images with larger b; None: use all. A tensor describes b ≲ 1000–1500 s/mm² only.
+
+    Returns:
+        Tensors along the voxel axes, in mm²/s. DIPY replaces eigenvalues that are not positive by about 1e-9 mm²/s; a
+        note says how many voxels have one (mostly at the rim: erode the mask).
+
+    Raises:
+        ImportError: DIPY or nibabel is missing.
+        FileNotFoundError: no such file.
+        ValueError: numbers of images, b-values and directions that disagree; a mask of another shape; too few images.
+    """
+    dti, gradients = _dipy()
+    image = nifti.load(path)
+    affine = np.asarray(image.affine, np.float64)
+    b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec))
+    if directions.shape[-1] != 3 or directions.shape == (3, 3) != (b.size, 3):
+        directions = directions.T
+    if len(image.shape) != 4 or b.shape != (image.shape[-1],) or directions.shape != (b.size, 3):
+        raise ValueError(
+            f"path, bval, bvec: got an image of shape {image.shape}, {b.size} b-values and directions of shape "
+            f"{directions.shape}; expected (nx, ny, nz, n), n and (n, 3)"
+        )
+    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
+    if inside.shape != image.shape[:3]:
+        raise ValueError(f"mask: got shape {inside.shape}; expected the images' shape {image.shape[:3]}")
+    used = np.full(b.size, True) if b_max is None else b <= b_max
+    threshold = max(50.0, float(b.min()))
+    weighted = int((used & (b > threshold)).sum())
+    if weighted < 6 or weighted == used.sum():
+        raise ValueError(
+            f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
+            "at least 6 and 1"
+        )
+    table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
+    fit = dti.TensorModel(table).fit(nifti.voxels(image)[..., used], mask=inside)
+    tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fsl", affine)
+    clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
+    notes = [f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)"]
+    if clipped:
+        notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
+    return TensorVolume(
+        tensors,
+        tuple(np.linalg.norm(affine[:3, :3], axis=0).tolist()),
+        (0.0, 0.0, 0.0),
+        inside,
+        affine,
+        notes=tuple(notes),
+        source=os.fspath(path),
+    )
+
+
+def _dipy() -> tuple[ModuleType, ModuleType]:
+    try:
+        from dipy.core import gradients
+        from dipy.reconst import dti
+    except ImportError as error:
+        raise ImportError('fitting tensors needs DIPY, which is not installed: pip install "hks-jax[dti]"') from error
+    return dti, gradients
+
+
+def _numbers(path: str | os.PathLike[str]) -> Float[np.ndarray, "..."]:
+    try:
+        return np.loadtxt(nifti.existing(path), dtype=np.float64)
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: expected a table of numbers ({error})") from error

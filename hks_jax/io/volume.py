@@ -1,0 +1,130 @@
+"""A field of diffusion tensors as it came from a file: NumPy arrays and where they lie in space."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hks_jax.domain.grid import Grid
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class TensorVolume:
+    """Tensors on a regular grid of voxels, along the voxel axes.
+
+    Attributes:
+        tensors: (*shape, d, d); values outside the mask mean nothing.
+        spacing: distance between voxels per axis.
+        origin: coordinates of voxel (0, …, 0) on the grid (the affine places it in space).
+        mask: bool (*shape), or None for all voxels.
+        affine: (4, 4) voxel indices to world coordinates, or None; for a slice, those of a volume one voxel thick.
+        slice_axis: for a slice, the axis of the volume that it cuts; None for a volume.
+        order: the order of components in the file, ``"matrix"`` if they were whole matrices.
+        notes: what the reader decided, in sentences.
+        source: the file.
+
+    Raises:
+        ValueError: shapes that do not agree.
+    """
+
+    tensors: Float[np.ndarray, "*shape d d"]
+    spacing: tuple[float, ...]
+    origin: tuple[float, ...]
+    mask: Bool[np.ndarray, "*shape"] | None = None
+    affine: Float[np.ndarray, "4 4"] | None = None
+    slice_axis: int | None = None
+    order: str = "matrix"
+    notes: tuple[str, ...] = ()
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        shape, d = self.tensors.shape[:-2], self.tensors.shape[-1]
+        if self.tensors.ndim not in (4, 5) or self.tensors.shape[-2:] != (len(shape),) * 2:
+            raise ValueError(f"tensors: got shape {self.tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)")
+        for name, value in (("spacing", self.spacing), ("origin", self.origin)):
+            if len(value) != d or not np.isfinite(value).all():
+                raise ValueError(f"{name}: got {value}; expected {d} finite numbers, one per axis")
+        if self.mask is not None and (self.mask.shape != shape or self.mask.dtype != bool):
+            raise ValueError(
+                f"mask: got shape {self.mask.shape}, dtype {self.mask.dtype}; expected booleans of shape {shape}"
+            )
+        if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
+            raise ValueError(f"affine: got shape {self.affine.shape}; expected (4, 4), finite")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of voxels per axis."""
+        return self.tensors.shape[:-2]
+
+    @property
+    def dimension(self) -> int:
+        """The number of axes d: 3 for a volume, 2 for a slice."""
+        return len(self.shape)
+
+    def grid(self, components: Literal["raise", "largest", "all"] = "raise") -> Grid:
+        """Return the grid of the voxel centres, with the mask. See `hks_jax.Grid` for `components`."""
+        return Grid(self.shape, self.spacing, self.origin, self.mask, components)
+
+    def with_mask(self, mask: Bool[np.ndarray, "*shape"] | None) -> "TensorVolume":
+        """Return the same volume with another mask."""
+        return replace(self, mask=mask)
+
+    def slice(self, axis: int | str, index: int) -> "TensorVolume":
+        """Return the slice at one index of an axis (0, 1, 2 or ``"x"``, ``"y"``, ``"z"``): a two-dimensional volume.
+
+        The slice carries the in-plane 2×2 block of each tensor. For diffusion tensors this means diffusion confined to
+        the slice, with the in-plane diffusivities that were measured, and the metric is chosen from that block:
+        g = (block of D)⁻¹. The other reading, the block of D⁻¹, is the metric that the slice inherits as a surface in
+        the volume; the two differ wherever a principal axis is oblique to the slice.
+
+        Raises:
+            ValueError: a volume that is a slice already; an axis or index out of range; a mask empty in this slice.
+        """
+        if self.dimension != 3:
+            raise ValueError("slice: this is a slice already (two axes); only volumes can be sliced")
+        a = AXES.find(axis) if isinstance(axis, str) and len(axis) == 1 else axis
+        if a not in (0, 1, 2):
+            raise ValueError(f'axis: got {axis!r}; expected 0, 1, 2 or "x", "y", "z"')
+        if not 0 <= index < self.shape[a]:
+            raise ValueError(f"index: got {AXES[a]} = {index}; expected 0 … {self.shape[a] - 1}")
+        mask = None
+        if self.mask is not None:
+            mask = np.take(self.mask, index, axis=a)
+            if not mask.any():
+                filled = np.flatnonzero(self.mask.any(axis=tuple(b for b in range(3) if b != a)))
+                where = f"{AXES[a]} = {filled[0]} … {filled[-1]}" if filled.size else "no slice at all"
+                raise ValueError(f"mask: empty in slice {AXES[a]} = {index}; it has voxels inside at {where}")
+        keep = [b for b in range(3) if b != a]
+        affine = None
+        if self.affine is not None:
+            affine = self.affine.copy()
+            affine[:3, 3] += index * affine[:3, a]
+        return replace(
+            self,
+            tensors=np.take(self.tensors, index, axis=a)[..., keep, :][..., keep],
+            spacing=tuple(self.spacing[b] for b in keep),
+            origin=tuple(self.origin[b] for b in keep),
+            mask=mask,
+            affine=affine,
+            slice_axis=a,
+            notes=(*self.notes, f"slice {AXES[a]} = {index}: the in-plane block of each tensor"),
+        )
+
+    @property
+    def volume_affine(self) -> Float[np.ndarray, "4 4"]:
+        """The affine, or where there is none the one that spacing and origin make."""
+        if self.affine is not None:
+            return self.affine
+        affine = np.eye(4)
+        axes = [b for b in range(3) if b != self.thin_axis] if self.dimension == 2 else [0, 1, 2]
+        affine[axes, axes] = self.spacing
+        affine[axes, 3] = self.origin
+        return affine
+
+    @property
+    def thin_axis(self) -> int:
+        """For a slice, the axis along which it is one voxel thick as a volume: z unless it was cut otherwise."""
+        return 2 if self.slice_axis is None else self.slice_axis

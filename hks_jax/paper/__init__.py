@@ -1,0 +1,7 @@
+"""The paper, reproduced: Table 1 and Figures 1 to 6.
+
+V. Zobel, J. Reininghaus, I. Hotz: “Visualization of Two-Dimensional Symmetric Positive Definite Tensor Fields Using the
+Heat Kernel Signature”, Topological Methods in Data Analysis and Visualization III, 2014.
+"""
+
+from hks_jax.paper.run import run as run

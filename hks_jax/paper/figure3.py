@@ -1,0 +1,35 @@
+"""Figure 3: four fields of diagonal tensors, and what the HKS sees of them."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from hks_jax import plot
+from hks_jax.domain.examples import figure3_fields
+from hks_jax.paper.signature import enough_pairs, signature
+
+TIME = 1.0
+QUICK, FULL = 61, 201
+TITLES = (
+    r"$T^1 = \mathrm{diag}(f(u_1), 1)$",
+    r"$T^2 = \mathrm{diag}(f(u_2), 1)$",
+    r"$T^3 = \mathrm{diag}(f(u_2), f(u_1))$",
+    r"$T^4 = f(|u|)\, I$",
+)
+
+
+def figure3(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
+    """Write ``figure3.png``."""
+    n = FULL if full else QUICK
+    fig = plot.new_figure(15, 7.2)
+    tops, bottoms = fig.subplots(2, 4, sharex=True, sharey=True)
+    for top, bottom, title, field in zip(tops, bottoms, TITLES, figure3_fields(n).values(), strict=True):
+        k = enough_pairs(field, TIME, "mirror")
+        echo(f"figure3: {n}² nodes, {k} eigenpairs")
+        (values,) = signature(field, [TIME], k, boundary="mirror", normalisation="flat")
+        plot.ellipses(top, field, colorbar=top is tops[-1])
+        plot.scalar_image(bottom, values, field.grid, least_range=0.1)
+        top.set_title(title)
+        bottom.set_xlabel("$u_1$")
+    tops[0].set_ylabel("unit circles of the metric\n$u_2$")
+    bottoms[0].set_ylabel(rf"$4\pi t\,\mathrm{{HKS}}(t)$ at $t$ = {TIME:g}" + "\n$u_2$")
+    return [plot.save_figure(fig, output / "figure3.png")]

@@ -1,0 +1,17 @@
+"""Pictures of tensor fields and their heat kernel signatures, on matplotlib's object-oriented interface.
+
+Every function draws on the axes that it is given, so that pictures compose: integral lines over an image of
+the HKS, ellipses beside a surface. No function touches pyplot, a backend or rcParams.
+"""
+
+from hks_jax.plot.curves import hks_curves as hks_curves
+from hks_jax.plot.ellipses import ellipses as ellipses
+from hks_jax.plot.figure import new_figure as new_figure
+from hks_jax.plot.figure import number_text as number_text
+from hks_jax.plot.figure import save_figure as save_figure
+from hks_jax.plot.images import hks_panels as hks_panels
+from hks_jax.plot.images import scalar_image as scalar_image
+from hks_jax.plot.lines import integral_lines as integral_lines
+from hks_jax.plot.surfaces import surface as surface
+from hks_jax.plot.tracing import evenly_spaced_lines as evenly_spaced_lines
+from hks_jax.plot.tracing import trace as trace

@@ -1,0 +1,120 @@
+"""Ellipses of a tensor field."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.plot.figure import colour_bar, frame, require_plane
+
+
+def ellipses(
+    ax: Axes,
+    field: TensorField,
+    every: int | Sequence[int] | None = None,
+    *,
+    kind: Literal["metric", "tensor"] = "metric",
+    sizes: Literal["common", "fit"] = "common",
+    color: str = "anisotropy",
+    cmap: str | None = None,
+    fill: float = 0.92,
+    colorbar: bool = True,
+    **kwargs: Any,
+) -> EllipseCollection:
+    """Draw the tensors of a 2D field as ellipses, subsampled and scaled so that no two overlap.
+
+    Args:
+        ax: the axes to draw on.
+        field: the field; nodes outside its mask are left out.
+        every: draw every such node (one number or one per axis); None: about 24 along the longer side.
+        kind: ``"metric"``: the unit circle of the metric, {v : vᵀTv = const}, half axes ∝ 1/√λ; ``"tensor"``:
+            the image of a circle under T^(1/2), half axes ∝ √λ, as is usual for diffusion tensors. (λ: the
+            eigenvalues of T.)
+        sizes: ``"common"``: one scale for all, so that sizes compare; ``"fit"``: each as large as its cell
+            allows.
+        color: ``"anisotropy"`` (λ₁ − λ₂)/(λ₁ + λ₂), ``"orientation"`` of the longer axis in degrees, or
+            the name of one colour.
+        cmap: colour map; None: viridis for anisotropy, the cyclic twilight for orientation.
+        fill: the part of its cell that the largest ellipse may fill, at most 1.
+        colorbar: whether to add a colour bar.
+        **kwargs: passed to `matplotlib.collections.EllipseCollection`.
+
+    Raises:
+        ValueError: a 3D field; options that do not exist; no node to draw.
+    """
+    grid = field.grid
+    require_plane("field", grid)
+    if kind not in ("metric", "tensor"):
+        raise ValueError(f'kind: got {kind!r}; expected "metric" or "tensor"')
+    if sizes not in ("common", "fit"):
+        raise ValueError(f'sizes: got {sizes!r}; expected "common" or "fit"')
+    if not 0 < fill <= 1:
+        raise ValueError(f"fill: got {fill}; expected a number in (0, 1]; ellipses overlap beyond 1")
+    steps = _steps(grid.shape, grid.spacing, every)
+    pick = tuple(_centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
+    inside = grid.inside[pick]
+    if not inside.any():
+        raise ValueError(f"every: got {every}; no node drawn lies inside the mask. Use a smaller step")
+    tensors = np.asarray(field.tensors, dtype=np.float64)[pick][inside]
+    centres = grid.nodes[pick][inside]
+
+    eigenvalues, vectors = np.linalg.eigh(tensors)
+    power = -0.5 if kind == "metric" else 0.5
+    half_axes = eigenvalues**power
+    longer = 0 if kind == "metric" else 1
+    axis = vectors[:, :, longer]
+    # The box of the ellipse around its centre has half sides √((T^±1)_aa).
+    box = np.sqrt(np.einsum("nai,ni->na", vectors**2, half_axes**2))
+    scale = 0.5 * fill / np.max(box / (np.array(steps) * grid.spacing), axis=1)
+    if sizes == "common":
+        scale[:] = scale.min()
+    half_axes *= scale[:, None]
+    angles = np.degrees(np.arctan2(axis[:, 1], axis[:, 0])) % 180.0
+
+    collection = EllipseCollection(
+        2 * half_axes[:, longer],
+        2 * half_axes[:, 1 - longer],
+        angles,
+        units="xy",
+        offsets=centres,
+        offset_transform=ax.transData,
+        **{"linewidths": 0.3, "edgecolors": "black", **kwargs},
+    )
+    frame(ax, grid)
+    if color == "anisotropy":
+        collection.set_array((eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues.sum(axis=1))
+        collection.set_cmap(cmap or "viridis")
+        collection.set_clim(0.0, 1.0)
+        label, ticks = "anisotropy", [0, 0.25, 0.5, 0.75, 1]
+    elif color == "orientation":
+        collection.set_array(angles)
+        collection.set_cmap(cmap or "twilight")
+        collection.set_clim(0.0, 180.0)
+        label, ticks = "orientation in degrees", [0, 45, 90, 135, 180]
+    else:
+        collection.set_facecolor(color)
+        colorbar = False
+    ax.add_collection(collection, autolim=False)
+    if colorbar:
+        colour_bar(ax, collection, label, ticks=ticks)
+    return collection
+
+
+def _centred(n: int, step: int) -> slice:
+    """Return every step-th of n nodes: as many as there is room for, in the middle."""
+    count = max(1, n // step)
+    first = (n - count * step) // 2 + step // 2
+    return slice(first, first + (count - 1) * step + 1, step)
+
+
+def _steps(shape: tuple[int, ...], spacing: tuple[float, ...], every: int | Sequence[int] | None) -> tuple[int, ...]:
+    if every is None:
+        cell = max(n * h for n, h in zip(shape, spacing, strict=True)) / 24
+        return tuple(max(1, round(cell / h)) for h in spacing)
+    steps = np.broadcast_to(np.asarray(every), (len(shape),))
+    if not np.issubdtype(steps.dtype, np.integer) or steps.min() < 1:
+        raise ValueError(f"every: got {every}; expected positive integers, one or {len(shape)}")
+    return tuple(int(s) for s in steps)

@@ -1,0 +1,106 @@
+"""Figures, axes of grids and colour bars: what all pictures share."""
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+from hks_jax.domain.grid import Grid
+
+SMALL = "small"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure (inches) that arranges its axes without overlaps."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) -> Path:
+    """Write a figure to `path` (its suffix names the format) in one step, and return the path.
+
+    The picture is written beside its place and then moved there: no reader ever sees half a file. Missing
+    parent directories are made.
+
+    Raises:
+        ValueError: a suffix that matplotlib cannot write.
+    """
+    target = Path(path)
+    formats = fig.canvas.get_supported_filetypes()
+    suffix = target.suffix.lstrip(".").lower()
+    if suffix not in formats:
+        raise ValueError(
+            f"path: got {str(target)!r}; expected a name that ends in a format matplotlib can write "
+            f"({', '.join(sorted(formats))})"
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
+    os.close(handle)
+    try:
+        fig.savefig(temporary, dpi=dpi, format=suffix)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)  # mkstemp's files are private; pictures are like any other file
+        os.replace(temporary, target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return target
+
+
+def require_plane(name: str, grid: Grid) -> None:
+    """Raise ValueError unless the grid is two-dimensional."""
+    if grid.dimension != 2:
+        raise ValueError(
+            f"{name}: got a grid of {grid.dimension} dimensions, shape {grid.shape}; expected 2. "
+            "Draw a slice: a Grid of two of the axes, with the values or tensors at one index of the third"
+        )
+
+
+def cell_extent(grid: Grid) -> tuple[float, float, float, float]:
+    """Return (x_min, x_max, y_min, y_max) of the nodes' cells: half a spacing beyond the outermost nodes."""
+    (x0, x1, y0, y1), (hx, hy) = grid.extent, grid.spacing
+    return x0 - hx / 2, x1 + hx / 2, y0 - hy / 2, y1 + hy / 2
+
+
+def frame(ax: Axes, grid: Grid) -> None:
+    """Show the grid in `ax`: equal aspect, array axis 0 horizontal, few ticks."""
+    x0, x1, y0, y1 = cell_extent(grid)
+    ax.set_aspect("equal")
+    ax.set_xlim(x0, x1)
+    ax.set_ylim(y0, y1)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+    ax.tick_params(labelsize=SMALL)
+
+
+def colour_bar(ax: Axes, mappable: ScalarMappable, label: str = "", **kwargs: Any) -> Colorbar:
+    """Add a colour bar to the right of `ax`, exactly as tall as its box."""
+    # An inset moves with its parent's box: the bar stays as tall as an image of equal aspect.
+    bar_axes = ax.inset_axes((1.03, 0.0, 0.045, 1.0))
+    bar = ax.get_figure().colorbar(mappable, cax=bar_axes, **kwargs)  # type: ignore[union-attr]
+    formatter = ScalarFormatter(useOffset=False, useMathText=True)
+    formatter.set_powerlimits((-3, 4))
+    if "format" not in kwargs and "ticks" not in kwargs:
+        bar.locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
+        bar.formatter = formatter
+        bar.update_ticks()
+    bar_axes.tick_params(labelsize=SMALL)
+    bar_axes.yaxis.get_offset_text().set_fontsize(SMALL)
+    bar.outline.set_linewidth(0.6)
+    if label:
+        bar.set_label(label, fontsize=SMALL)
+    return bar
+
+
+def number_text(value: float) -> str:
+    """Write a number with three significant digits for a title or a label, powers of ten as such."""
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        return f"{float(f'{value:.3g}'):g}"
+    mantissa, exponent = f"{value:.2e}".split("e")
+    return rf"${float(mantissa):g}\times 10^{{{int(exponent)}}}$"

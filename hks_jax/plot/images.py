@@ -1,0 +1,169 @@
+"""Images of scalars on grids, and panels of the HKS over time."""
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from hks_jax.domain.grid import Grid
+from hks_jax.plot.figure import cell_extent, colour_bar, frame, new_figure, number_text, require_plane, save_figure
+
+
+def scalar_image(
+    ax: Axes,
+    values: Float[ArrayLike, "nx ny"],
+    grid: Grid,
+    *,
+    cmap: str | Colormap = "viridis",
+    vmin: float | None = None,
+    vmax: float | None = None,
+    quantiles: tuple[float, float] = (0.0, 1.0),
+    least_range: float = 1e-6,
+    colorbar: bool = True,
+    label: str = "",
+    **kwargs: Any,
+) -> AxesImage:
+    """Draw node values as an image: array axis 0 horizontal, one cell per node, transparent outside the mask.
+
+    Args:
+        ax: the axes to draw on.
+        values: (*shape,), NaN where there is nothing to draw.
+        grid: the 2D grid of the values.
+        cmap: colour map; use a perceptually uniform one.
+        vmin: value of the first colour; None: from `quantiles`.
+        vmax: value of the last colour; None: from `quantiles`.
+        quantiles: the values' quantiles that take the first and the last colour where vmin and vmax do not
+            say. The colour bar has arrows where values lie beyond.
+        least_range: the least difference between the last colour's value and the first's, relative to the larger.
+            A constant then looks constant, whatever its rounding or discretisation errors are.
+        colorbar: whether to add a colour bar.
+        label: the colour bar's label.
+        **kwargs: passed to `Axes.imshow`.
+
+    Raises:
+        ValueError: a 3D grid, or values that are not of its shape or have nothing finite inside its mask.
+    """
+    require_plane("grid", grid)
+    array = _masked("values", values, grid)
+    low, high = _colour_range(array.compressed(), quantiles, least_range)
+    low, high = low if vmin is None else vmin, high if vmax is None else vmax
+    image = ax.imshow(
+        array.T,
+        origin="lower",
+        extent=cell_extent(grid),
+        cmap=cmap,
+        vmin=low,
+        vmax=high,
+        **{"interpolation": "nearest", **kwargs},
+    )
+    frame(ax, grid)
+    if colorbar:
+        beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+        colour_bar(ax, image, label, extend=beyond[bool(array.min() < low), bool(array.max() > high)])
+    return image
+
+
+def hks_panels(
+    values: Float[ArrayLike, "n_times nx ny"],
+    times: Sequence[float] | Float[ArrayLike, " n_times"],
+    grid: Grid,
+    *,
+    titles: Sequence[str] | None = None,
+    unit: str = "",
+    shared_range: bool = False,
+    path: str | os.PathLike[str] | None = None,
+    cmap: str | Colormap = "viridis",
+    quantiles: tuple[float, float] = (0.0, 1.0),
+    label: str = "",
+    suptitle: str = "",
+) -> Figure:
+    """Return a figure with one image of the HKS per time, each with its own colour map unless `shared_range`.
+
+    Args:
+        values: (n_times, *shape), as `hks_jax.hks` returns them.
+        times: (n_times,).
+        grid: the 2D grid of the values.
+        titles: one per time; None: “t = …”.
+        unit: the unit of t, written after it.
+        shared_range: whether all images use the colours of one range.
+        path: where to save the figure; None: nowhere.
+        cmap: colour map.
+        quantiles: as for `scalar_image`.
+        label: the colour bars' label.
+        suptitle: the figure's title.
+
+    Raises:
+        ValueError: shapes that do not agree; no time at all.
+    """
+    require_plane("grid", grid)
+    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    if np.shape(values) != (t.size, *grid.shape) or t.ndim != 1 or t.size == 0:
+        raise ValueError(
+            f"values: got shape {np.shape(values)} and times of shape {t.shape}; expected "
+            f"(n_times, *grid.shape) = {(t.size, *grid.shape)} and at least one time"
+        )
+    if titles is None:
+        titles = [f"$t$ = {number_text(s)}{' ' * bool(unit)}{unit}" for s in t]
+    elif len(titles) != t.size:
+        raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
+    images = [_masked("values", v, grid) for v in np.asarray(values)]
+    everything = np.concatenate([image.compressed() for image in images])
+    vmin, vmax = _colour_range(everything, quantiles) if shared_range else (None, None)
+
+    rows, columns = _layout(t.size)
+    fig = _panel_figure(grid, rows, columns, bool(suptitle))
+    panels = fig.subplots(rows, columns, squeeze=False)
+    for index, ax in enumerate(panels.flat):
+        if index >= t.size:
+            ax.remove()
+            continue
+        scalar_image(ax, images[index], grid, cmap=cmap, vmin=vmin, vmax=vmax, quantiles=quantiles, label=label)
+        ax.set_title(titles[index], fontsize="medium")
+        ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
+    if suptitle:
+        fig.suptitle(suptitle)
+    if path is not None:
+        save_figure(fig, path)
+    return fig
+
+
+def _masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
+    if isinstance(values, np.ma.MaskedArray):
+        return values
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != grid.shape:
+        raise ValueError(f"{name}: got shape {array.shape}; expected the grid's shape {grid.shape}")
+    masked = np.ma.array(array, mask=~(np.isfinite(array) & grid.inside))
+    if masked.count() == 0:
+        raise ValueError(f"{name}: no finite value inside the grid's mask; nothing to draw")
+    return masked
+
+
+def _colour_range(values: np.ndarray, quantiles: tuple[float, float], least_range: float = 1e-6) -> tuple[float, float]:
+    low, high = (float(q) for q in np.quantile(values, quantiles))
+    lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
+    return low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
+
+
+def _layout(n: int) -> tuple[int, int]:
+    """Return rows and columns for n panels: up to four in a row, rows evenly filled."""
+    if n <= 4:
+        return 1, n
+    columns = min(range(3, 6), key=lambda c: (-n % c, math.ceil(n / c)))
+    return math.ceil(n / columns), columns
+
+
+def _panel_figure(grid: Grid, rows: int, columns: int, has_title: bool) -> Figure:
+    x0, x1, y0, y1 = cell_extent(grid)
+    aspect = min(max((y1 - y0) / (x1 - x0), 0.2), 5.0)
+    width = 2.6 / max(1.0, aspect**0.5)
+    height = width * aspect
+    return new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * has_title)

@@ -1,0 +1,235 @@
+"""Integral lines of the eigenvector fields of a 2D tensor field.
+
+An eigenvector has no sign, so its field is one of directions. The tensor, which has no such ambiguity, is
+interpolated bilinearly from the nodes; the direction at a point comes from the interpolated tensor in closed
+form, and its sign from the direction that the line had.
+"""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.plot.figure import require_plane
+
+Which = Literal["major", "minor"]
+
+# A line ends where (λ₁ − λ₂)/(λ₁ + λ₂) falls below this, or where it would turn by over 60° within a step.
+DEGENERATE = 1e-3
+LEAST_COSINE = 0.5
+
+
+class DirectionField:
+    """The major or minor eigenvector direction of a field at any point, NaN where there is none.
+
+    Major belongs to the larger eigenvalue of the field's tensors, whatever they mean.
+    """
+
+    def __init__(self, field: TensorField, which: Which) -> None:
+        require_plane("field", field.grid)
+        if which not in ("major", "minor"):
+            raise ValueError(f'which: got {which!r}; expected "major" or "minor"')
+        grid = field.grid
+        tensors = np.asarray(field.domain_tensors, dtype=np.float64)
+        self.origin, self.spacing = np.array(grid.origin), np.array(grid.spacing)
+        self.shape = np.array(grid.shape)
+        self.which = which
+        # (a, b) = λ₁ − λ₂ times cosine and sine of twice the major angle; the trace makes it dimensionless.
+        difference = tensors[..., 0, 0] - tensors[..., 1, 1]
+        self.components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
+        self.components[~grid.inside] = np.nan
+
+    def __call__(
+        self, points: Float[np.ndarray, "n 2"], towards: Float[np.ndarray, "n 2"] | None = None
+    ) -> Float[np.ndarray, "n 2"]:
+        """Return unit vectors (n, 2), within 90° of `towards`; NaN outside and at degenerate points."""
+        position = (points - self.origin) / self.spacing
+        with np.errstate(invalid="ignore"):
+            cell = np.clip(np.nan_to_num(np.floor(position)), 0, self.shape - 2).astype(int)
+            w = position - cell
+            w[(w < -1e-9) | (w > 1 + 1e-9)] = np.nan
+        (i, j), (u, v) = cell.T, w.T
+        c = self.components
+        a, b, trace = (
+            ((1 - u) * (1 - v))[:, None] * c[i, j]
+            + (u * (1 - v))[:, None] * c[i + 1, j]
+            + ((1 - u) * v)[:, None] * c[i, j + 1]
+            + (u * v)[:, None] * c[i + 1, j + 1]
+        ).T
+        with np.errstate(invalid="ignore"):
+            angle = 0.5 * np.arctan2(b, a)
+            angle[~(np.hypot(a, b) > DEGENERATE * trace)] = np.nan
+        direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        if self.which == "minor":
+            direction = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+        if towards is not None:
+            direction[np.einsum("ni,ni->n", direction, towards) < 0] *= -1
+        return direction
+
+
+def trace(
+    field: TensorField,
+    seeds: Float[np.ndarray, "n 2"],
+    which: Which = "major",
+    *,
+    step: float | None = None,
+    max_length: float | None = None,
+) -> list[Float[np.ndarray, "m 2"]]:
+    """Return the integral lines through the seeds, each followed both ways.
+
+    All lines advance at once, by fixed steps of the classical Runge–Kutta method. A line ends at the side of
+    the grid or the mask's rim, near a degenerate point, or at half of `max_length` from its seed.
+
+    Args:
+        field: a 2D field.
+        seeds: (n, 2) coordinates.
+        which: ``"major"`` (larger eigenvalue) or ``"minor"``.
+        step: arc length of a step in coordinates; None: half the smaller grid spacing.
+        max_length: longest arc length; None: eight times the longer side of the grid.
+
+    Returns:
+        One (m, 2) array of points per seed, in order along the line; (0, 2) for a seed without a direction.
+    """
+    points = np.asarray(seeds, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"seeds: got shape {points.shape}; expected (n, 2)")
+    forward, backward = _both_ways(DirectionField(field, which), points, *_lengths(field, step, max_length))
+    return [np.concatenate([b[:0:-1], f]) if len(f) else f for f, b in zip(forward, backward, strict=True)]
+
+
+def evenly_spaced_lines(
+    field: TensorField,
+    which: Which = "major",
+    *,
+    separation: float,
+    step: float | None = None,
+    max_length: float | None = None,
+    least_length: float | None = None,
+) -> list[Float[np.ndarray, "m 2"]]:
+    """Return integral lines that cover the domain about `separation` (coordinates) apart.
+
+    After Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997): the next line
+    starts as near as allowed to the lines there are, and each ends where it comes closer than half the
+    separation to another, or to itself. Circles close.
+
+    Args:
+        field: a 2D field.
+        which: ``"major"`` or ``"minor"``.
+        separation: distance between neighbours where they start.
+        step: as for `trace`.
+        max_length: as for `trace`.
+        least_length: shorter lines are left out; None: twice the separation.
+    """
+    if not separation > 0:
+        raise ValueError(f"separation: got {separation}; expected a positive length in coordinates")
+    h, n_steps = _lengths(field, step, max_length)
+    h = min(h, separation / 4)
+    seeds = _candidates(field, separation / 2)
+    forward, backward = _both_ways(DirectionField(field, which), seeds, h, n_steps)
+    least = 2 * separation if least_length is None else least_length
+
+    lines: list[np.ndarray] = []
+    tree: cKDTree | None = None
+    centre = np.array([0.5 * (a[0] + a[-1]) for a in field.grid.axes])
+    # The distance from each candidate to the lines so far; before the first, from a point near the middle.
+    distance = separation + np.linalg.norm(seeds - centre - 0.3 * separation, axis=1)
+    free = np.array([len(f) > 0 for f in forward])
+    while True:
+        allowed = free & (distance >= separation)
+        if not allowed.any():
+            return lines
+        index = int(np.argmin(np.where(allowed, distance, np.inf)))
+        free[index] = False
+        line = _grow(forward[index], backward[index], tree, separation / 2, h)
+        if (len(line) - 1) * h < least:
+            continue
+        if not lines:
+            distance[:] = np.inf
+        lines.append(line)
+        tree = cKDTree(np.concatenate(lines))
+        distance = np.minimum(distance, cKDTree(line).query(seeds)[0])
+
+
+def _grow(forward: np.ndarray, backward: np.ndarray, others: cKDTree | None, gap: float, step: float) -> np.ndarray:
+    """Cut a line where it comes nearer than `gap` to the others or to itself; join its ends if they meet."""
+    if others is not None:
+        forward, backward = (half[: _first(others.query(half)[0] < gap)] for half in (forward, backward))
+    # Points this far apart along the line are not merely its neighbours.
+    lag = int(np.ceil(np.pi * gap / step)) + 1
+    end = _first_return(forward, lag, gap)
+    if end < len(forward):
+        ahead = forward[end : end + lag]
+        nearest = int(np.argmin(np.linalg.norm(ahead - forward[0], axis=1)))
+        if np.linalg.norm(ahead[nearest] - forward[0]) <= 0.75 * step:
+            return np.concatenate([forward[: end + nearest], forward[:1]])
+        forward = forward[:end]
+    line = np.concatenate([forward[::-1], backward[1:]])
+    return line[: _first_return(line, lag, gap)]
+
+
+def _first_return(line: np.ndarray, lag: int, gap: float) -> int:
+    """Return the first index whose point lies within `gap` of one at least `lag` before it, or the length."""
+    n = len(line)
+    if n <= lag:
+        return n
+    apart = np.linalg.norm(line[:, None] - line[None], axis=-1)
+    earlier = np.tril(np.ones((n, n), dtype=bool), -lag)
+    return _first(np.any(earlier & (apart < gap), axis=1))
+
+
+def _first(condition: np.ndarray) -> int:
+    return int(np.argmax(condition)) if condition.any() else len(condition)
+
+
+def _both_ways(
+    direction: DirectionField, seeds: np.ndarray, step: float, n_steps: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Trace from each seed forwards and backwards; both halves begin with the seed, if it has a direction."""
+    start = direction(seeds)
+    halves = _march(direction, np.concatenate([seeds, seeds]), np.concatenate([start, -start]), step, n_steps)
+    return halves[: len(seeds)], halves[len(seeds) :]
+
+
+def _march(
+    direction: DirectionField, points: np.ndarray, heading: np.ndarray, step: float, n_steps: int
+) -> list[np.ndarray]:
+    alive = np.flatnonzero(np.isfinite(heading[:, 0]))
+    track = np.full((n_steps + 1, *points.shape), np.nan)
+    x, d = points[alive], heading[alive]
+    track[0, alive] = x
+    for n in range(1, n_steps + 1):
+        k1 = direction(x, d)
+        k2 = direction(x + 0.5 * step * k1, k1)
+        k3 = direction(x + 0.5 * step * k2, k2)
+        k4 = direction(x + step * k3, k3)
+        x = x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        new = direction(x, k4)
+        goes_on = np.einsum("ni,ni->n", new, d) > LEAST_COSINE  # False for NaN too
+        alive, x, d = alive[goes_on], x[goes_on], new[goes_on]
+        if alive.size == 0:
+            break
+        track[n, alive] = x
+    lengths = np.isfinite(track[..., 0]).sum(axis=0)
+    return [track[:m, i] for i, m in enumerate(lengths)]
+
+
+def _lengths(field: TensorField, step: float | None, max_length: float | None) -> tuple[float, int]:
+    grid = field.grid
+    h = 0.5 * min(grid.spacing) if step is None else step
+    side = max((n - 1) * s for n, s in zip(grid.shape, grid.spacing, strict=True))
+    length = 8.0 * side if max_length is None else max_length
+    if not (h > 0 and length > 0):
+        raise ValueError(f"step, max_length: got {step}, {max_length}; expected positive lengths in coordinates")
+    return h, max(1, int(np.ceil(0.5 * length / h)))
+
+
+def _candidates(field: TensorField, spacing: float) -> np.ndarray:
+    """Return points on a slightly jittered grid of about the given spacing."""
+    axes = field.grid.axes
+    counts = [max(2, int(np.ceil((a[-1] - a[0]) / spacing))) for a in axes]
+    widths = [(a[-1] - a[0]) / n for a, n in zip(axes, counts, strict=True)]
+    mids = [a[0] + w * (np.arange(n) + 0.5) for a, w, n in zip(axes, widths, counts, strict=True)]
+    points = np.stack(np.meshgrid(*mids, indexing="ij"), axis=-1).reshape(-1, 2)
+    return points + np.random.default_rng(0).uniform(-0.2, 0.2, points.shape) * widths

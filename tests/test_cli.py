@@ -1,0 +1,377 @@
+"""The command line, end to end: files in, files out, one line and a code for what goes wrong."""
+
+import json
+import subprocess
+import sys
+
+import equinox as eqx
+import nibabel as nib
+import numpy as np
+import pytest
+
+import hks_jax as hj
+from hks_jax.cli import demo, main
+from hks_jax.cli import job as job_module
+from hks_jax.cli import outputs as outputs_module
+from hks_jax.cli.arguments import Times, parse_boundary, parse_times
+from hks_jax.cli.picture import away_from_rim, bounding_box
+from hks_jax.cli.progress import Progress
+from hks_jax.io import TensorVolume, save_tensors
+
+SHAPE = (14, 12)
+QUIET_FILES = ["hks.npz", "hks.png", "report.json"]
+
+
+def disc(shape=SHAPE):
+    i, j = np.indices(shape)
+    return ((i / (shape[0] - 1) - 0.5) ** 2 + (j / (shape[1] - 1) - 0.5) ** 2) < 0.24
+
+
+def metric(shape=SHAPE):
+    """A smooth metric that is nowhere isotropic."""
+    x, y = (a / 10 for a in np.indices(shape))
+    tensors = np.empty((*shape, 2, 2))
+    tensors[..., 0, 0], tensors[..., 1, 1] = 2 + np.cos(x), 1.5 + 0.5 * np.sin(y)
+    tensors[..., 0, 1] = tensors[..., 1, 0] = 0.3 * np.sin(x + y)
+    return tensors
+
+
+@pytest.fixture
+def npz(tmp_path):
+    np.savez(tmp_path / "field.npz", tensors=metric(), spacing=[0.5, 0.25], origin=[1.0, 2.0], mask=disc())
+    return tmp_path / "field.npz"
+
+
+@pytest.fixture
+def nifti(tmp_path):
+    """Diffusion tensors (14, 12, 5) in a disc, zero outside, with an affine that turns and flips."""
+    tensors = np.zeros((*SHAPE, 5, 3, 3))
+    tensors[..., :2, :2] = 1e-3 * metric()[:, :, None]
+    tensors[..., 2, 2] = 1e-3
+    tensors[~disc()] = 0
+    affine = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
+    volume = TensorVolume(tensors, (2.0, 2.0, 3.0), (0.0,) * 3, affine=affine)
+    mask = nib.Nifti1Image(np.broadcast_to(disc()[..., None], (*SHAPE, 5)).astype(np.uint8), affine)
+    nib.save(mask, tmp_path / "mask.nii.gz")
+    return save_tensors(tmp_path / "tensor.nii.gz", volume)
+
+
+def one_error(capsys, code, *words):
+    """Assert that stderr ends in one line that holds the words, without a traceback."""
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("[")]
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("hks-jax")
+    assert "error: " in lines[0]
+    for word in words:
+        assert word in lines[0]
+    return code
+
+
+# ---------------------------------------------------------------------------------------------------- end to end
+
+
+def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
+    out = tmp_path / "deep" / "out"
+    assert main(["hks", str(npz), "-o", str(out), "-k", "25", "--times", "0.5,2", "8"]) == 0
+    assert sorted(file.name for file in out.iterdir()) == QUIET_FILES
+    captured = capsys.readouterr()
+    assert captured.out.split() == [str(out / name) for name in QUIET_FILES]
+    for stage in ("reading", "assembly", "eigenpairs: 25 of", "signature", "writing"):
+        assert stage in captured.err
+
+    grid = hj.Grid(SHAPE, (0.5, 0.25), (1.0, 2.0), disc())
+    expected = hj.hks(hj.eigenpairs(hj.TensorField(grid, metric()), 25), [0.5, 2.0, 8.0])
+    with np.load(out / "hks.npz") as read:
+        np.testing.assert_allclose(read["hks"], expected, rtol=1e-9)
+        np.testing.assert_array_equal(read["times"], [0.5, 2, 8])
+        np.testing.assert_array_equal(read["mask"], disc())
+        assert read["eigenvalues"].shape == (25,)
+
+
+def test_report_says_what_was_done(npz, tmp_path):
+    out = tmp_path / "out"
+    # A time that 25 pairs do not resolve: the report carries the warning and a large truncation.
+    assert main(["hks", str(npz), "-o", str(out), "-q", "-k", "25", "--times", "0.01", "2"]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["settings"] == {
+        "metric": "tensor",
+        "k": 25,
+        "boundary": "neumann",
+        "times": "explicit",
+        "components": "raise",
+        "solver": "auto",
+        "normalisation": "raw",
+        "dtype": "float64",
+    }
+    assert report["input"]["shape"] == list(SHAPE)
+    assert report["input"]["voxels_inside"] == disc().sum()
+    pairs = report["eigenpairs"]
+    assert (pairs["k"], pairs["converged"], pairs["solver"], pairs["zero"]) == (25, 25, "dense", 1)
+    assert 0 < pairs["worst_residual"] < 1e-8
+    assert [entry["t"] for entry in report["times"]] == [0.01, 2]
+    assert report["times"][0]["truncation"] > 0.1 > report["times"][1]["truncation"]
+    assert any("too small for k" in warning for warning in report["warnings"])
+    assert {"python", "jax", "numpy", "scipy", "hks-jax", "device"} <= set(report["versions"])
+    assert {"reading", "assembly", "eigenpairs", "signature"} <= set(report["seconds"])
+
+
+def test_nifti_slice_end_to_end_keeps_the_affine(nifti, tmp_path):
+    out, mask = tmp_path / "out", tmp_path / "mask.nii.gz"
+    arguments = ["--slice", "z=3", "--mask", str(mask), "--metric", "inverse", "-k", "10", "--times", "1", "2"]
+    assert main(["hks", str(nifti), "-o", str(out), "-q", *arguments]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["hks.nii.gz", *QUIET_FILES]
+    image = nib.load(out / "hks.nii.gz")
+    assert image.shape == (*SHAPE, 1, 2)
+    affine = nib.load(nifti).affine
+    np.testing.assert_allclose(image.affine @ [1, 2, 0, 1], affine @ [1, 2, 3, 1], atol=1e-5)
+    data = image.get_fdata()[:, :, 0]
+    with np.load(out / "hks.npz") as read:
+        np.testing.assert_array_equal(data, np.moveaxis(read["hks"], 0, -1))
+    assert not np.isfinite(data[~disc()]).any()
+    assert (data[np.isfinite(data)] > 0).all()
+
+
+def test_small_volumes_work_in_three_dimensions(nifti, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["--metric", "tensor", "-k", "10", "--times", "auto:1", "--boundary", "neumann,neumann,periodic"]
+    assert main(["hks", str(nifti), "-o", str(out), "-q", *arguments]) == 0
+    assert nib.load(out / "hks.nii.gz").shape == (*SHAPE, 5, 1)
+    report = json.loads((out / "report.json").read_text())
+    assert report["settings"]["boundary"] == ["neumann", "neumann", "periodic"]
+    assert any("whose tensor is zero count as outside" in note for note in report["input"]["notes"])
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        ["--boundary", "dirichlet:neumann,neumann", "--solver", "dense"],
+        ["--solver", "shift-invert", "--normalisation", "heat-trace"],
+        ["--metric", "adjugate", "--erode", "1"],
+        ["--dtype", "float32", "--times", "auto:3"],
+    ],
+)
+def test_options_reach_the_computation(npz, tmp_path, extra):
+    out = tmp_path / "out"
+    assert main(["hks", str(npz), "-o", str(out), "-q", "-k", "10", "--times", "1", *extra]) == 0
+    report = json.loads((out / "report.json").read_text())
+    settings, pairs = report["settings"], report["eigenpairs"]
+    with np.load(out / "hks.npz") as read:
+        finite = np.isfinite(read["hks"][0])
+        dtype = read["hks"].dtype
+        trace = np.exp(-read["times"][:, None] * read["eigenvalues"]).sum(1)
+        assert trace.shape == (len(report["times"]),)
+    for option, value in zip(extra[::2], extra[1::2], strict=True):
+        if option == "--boundary":
+            assert settings["boundary"] == [["dirichlet", "neumann"], "neumann"]
+            assert any("no effect at the low side of x" in warning for warning in report["warnings"])
+        elif option == "--times":
+            assert len(report["times"]) == 3
+        elif option == "--erode":
+            assert finite.sum() < disc().sum() - 20
+        else:
+            assert settings[option.lstrip("-")] == value
+        if option == "--solver":
+            assert pairs["solver"] == value
+        if option == "--dtype":
+            assert dtype == np.float32
+
+
+def test_a_mask_of_the_slice_alone_and_the_largest_component(nifti, tmp_path):
+    mask = disc()
+    mask[7:9] = False  # two halves, one larger
+    np.save(tmp_path / "mask.npy", mask)
+    arguments = ["hks", str(nifti), "-o", str(tmp_path / "out"), "-q", "--metric", "inverse", "--slice", "z=0"]
+    arguments += ["--mask", str(tmp_path / "mask.npy"), "-k", "10", "--times", "1"]
+    assert main(arguments) == 2  # two components
+    assert main([*arguments, "--components", "largest"]) == 0
+    with np.load(tmp_path / "out" / "hks.npz") as read:
+        assert np.isfinite(read["hks"][0, :7]).any()
+        assert not np.isfinite(read["hks"][0, 7:]).any()
+
+
+def test_results_are_replaced_and_other_files_kept(npz, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    for t in ("1", "2"):
+        assert main(["hks", str(npz), "-o", str(out), "-q", "-k", "10", "--times", t]) == 0
+    assert json.loads((out / "report.json").read_text())["times"][0]["t"] == 2
+    assert (out / "notes.txt").read_text() == "mine"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["field.npz", "out"]
+
+
+def test_module_runs_in_a_process_of_its_own(npz, tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "hks_jax",
+        "hks",
+        str(npz),
+        "-o",
+        str(tmp_path / "out"),
+        "-k",
+        "10",
+        "--times",
+        "1",
+    ]
+    done = subprocess.run([*command, "--dtype", "float32"], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    with np.load(tmp_path / "out" / "hks.npz") as read:
+        assert read["hks"].dtype == np.float32  # with 64 bits off, not merely cast
+        assert read["eigenvalues"].dtype == np.float32
+
+
+# ---------------------------------------------------------------------------------------------------- demo
+
+
+def test_demo_without_data_does_the_phantom(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "find_example_brain", lambda: None)
+    monkeypatch.setattr(demo, "PHANTOM_SHAPE", (32, 32))
+    monkeypatch.setattr(demo, "N_PAIRS", 60)
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo"]) == 0
+    captured = capsys.readouterr()
+    assert "mdt==1.2.7 is not installed; using the phantom" in captured.err
+    assert captured.out == "The picture is demo/hks.png\n"
+    assert sorted(file.name for file in (tmp_path / "demo").iterdir()) == QUIET_FILES
+
+
+def test_demo_fits_and_draws_an_installed_brain(tmp_path, monkeypatch, capsys):
+    shape = (20, 22, 2)
+    directions = np.random.default_rng(0).normal(size=(13, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    b = np.array([0.0] + [1000.0] * 12)
+    directions[0] = 0
+    D = 1e-3 * np.diag([1.7, 0.6, 0.4])
+    signal = 1000 * np.exp(-b * np.einsum("na,ab,nb->n", directions, D, directions))
+    mask = np.repeat(disc(shape[:2])[..., None], 2, axis=2)
+    nib.save(nib.Nifti1Image(np.broadcast_to(signal, (*shape, 13)).copy(), np.diag([2.0, 2, 2, 1])), tmp_path / "d.nii")
+    nib.save(nib.Nifti1Image(mask.astype(np.uint8), np.diag([2.0, 2, 2, 1])), tmp_path / "m.nii")
+    np.savetxt(tmp_path / "b", b[None])
+    np.savetxt(tmp_path / "g", directions.T)
+    brain = hj.io.ExampleBrain(*(tmp_path / name for name in ("d.nii", "b", "g", "m.nii")))
+    monkeypatch.setattr(demo, "find_example_brain", lambda: brain)
+    monkeypatch.setattr(demo, "N_PAIRS", 60)
+    assert main(["demo", "-o", str(tmp_path / "out"), "-q"]) == 0
+    assert capsys.readouterr().out == ""
+    image = nib.load(tmp_path / "out" / "hks.nii.gz")
+    assert image.shape == (20, 22, 1, 7)
+    inside = np.isfinite(image.get_fdata()[:, :, 0, 0])
+    assert inside.sum() < mask[..., 0].sum() - 60  # the rim is gone
+
+
+# ---------------------------------------------------------------------------------------------------- what goes wrong
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-k", "0"], ["k: got 0", "expected an integer from 1"]),
+        (["-k", "5000"], ["k: got 5000", "number of degrees of freedom"]),
+        (["--times", "0", "1"], ["--times", "'0 1'", "expected positive numbers, or auto"]),
+        (["--times", "auto:no"], ["--times", "auto:N"]),
+        (["--slice", "14"], ["--slice", "such as z=14"]),
+        (["--slice", "z=1"], ["slice", "only volumes can be sliced"]),
+        (["--boundary", "robin"], ["boundary: got 'robin'", "'neumann'"]),
+        (["--boundary", "neumann,neumann,neumann"], ["boundary: got 3 entries"]),
+        (["--metric", "euclid"], ["--metric", "invalid choice", "inverse"]),
+        (["--order", "fsl"], ["order", "npz holds whole matrices"]),
+        (["--erode", "40"], ["leaves nothing"]),
+        (["--mask", "absent.npy"], ["absent.npy", "no such file"]),
+        (["--colour", "red"], ["unrecognized arguments: --colour"]),
+    ],
+)
+def test_bad_arguments_are_one_line_and_code_2(npz, tmp_path, capsys, arguments, words):
+    before = sorted(tmp_path.iterdir())
+    assert one_error(capsys, main(["hks", str(npz), "-o", str(tmp_path / "out"), *arguments]), *words) == 2
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_bad_files_are_one_line_and_code_2(npz, nifti, tmp_path, capsys):
+    out = ["-o", str(tmp_path / "out")]
+    assert one_error(capsys, main(["hks", "absent.npz", *out]), "absent.npz: no such file") == 2
+    assert one_error(capsys, main(["hks", str(nifti), *out]), "--metric: choose one", "D⁻¹") == 2
+    image = nib.load(nifti)
+    image.header["intent_code"] = 0
+    nib.save(image, tmp_path / "undeclared.nii")
+    code = main(["hks", str(tmp_path / "undeclared.nii"), *out, "--metric", "inverse"])
+    assert one_error(capsys, code, '"nifti"', '"fsl"', '"mrtrix"') == 2
+    np.savez(tmp_path / "bad.npz", tensors=-metric())
+    code = main(["hks", str(tmp_path / "bad.npz"), *out])
+    assert one_error(capsys, code, "168 of 168 tensors are not positive definite", "worst eigenvalue") == 2
+    assert one_error(capsys, main(["hks", str(npz), "-o", str(npz)]), "is a file; expected a folder") == 2
+    assert one_error(capsys, main(["hks", str(npz), "-o", str(npz / "out")]), "is a file; expected a folder") == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_command_and_help(capsys):
+    assert main([]) == 2
+    assert "COMMAND" in capsys.readouterr().err
+    for arguments in (["--help"], ["hks", "--help"], ["demo", "--help"], ["paper", "--help"], ["--version"]):
+        assert main(arguments) == 0
+    assert f"hks-jax {hj.__version__}" in capsys.readouterr().out
+
+
+def test_a_failed_computation_is_code_1(npz, tmp_path, capsys, monkeypatch):
+    before = sorted(tmp_path.iterdir())
+
+    def unconverged(*args, **kwargs):
+        pairs = hj.eigenpairs(*args, **kwargs)
+        return eqx.tree_at(lambda p: p.converged, pairs, np.zeros(pairs.k, bool))
+
+    monkeypatch.setattr(job_module, "eigenpairs", unconverged)
+    code = main(["hks", str(npz), "-o", str(tmp_path / "out"), "-k", "10"])
+    assert one_error(capsys, code, "10 of 10 eigenpairs did not converge") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (OSError("disk full"), 1)])
+def test_nothing_is_left_of_an_interrupted_or_failed_write(npz, tmp_path, capsys, monkeypatch, error, code):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(outputs_module, "versions", fail)  # the last step, when all but the report is written
+    before = sorted(tmp_path.iterdir())
+    arguments = ["hks", str(npz), "-o", str(tmp_path / "out"), "-k", "10", "--times", "2"]
+    assert one_error(capsys, main(arguments), "interrupted" if code == 130 else "disk full") == code
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_debug_shows_the_traceback():
+    with pytest.raises(FileNotFoundError):
+        main(["hks", "absent.npz", "-o", "out", "--debug"])
+
+
+# ---------------------------------------------------------------------------------------------------- the pieces
+
+
+def test_parsing():
+    assert parse_times(None) == parse_times(["auto"]) == Times((), 6)
+    assert parse_times(["auto:9"]) == Times((), 9)
+    assert parse_times(["3,1", "2"]) == Times((1.0, 2.0, 3.0), 0)
+    assert parse_boundary("mirror") == "mirror"
+    assert parse_boundary("neumann,periodic") == ("neumann", "periodic")
+    assert parse_boundary("neumann:dirichlet,periodic") == (("neumann", "dirichlet"), "periodic")
+    assert parse_boundary("neumann:dirichlet") == (("neumann", "dirichlet"),)
+
+
+def test_progress_is_silent_when_quiet_but_for_warnings(capsys):
+    progress = Progress(quiet=True)
+    with progress.stage("work"):
+        progress.update("half")
+        progress.note("by the way")
+        progress.warn("mind this")
+        progress.warn("mind this")
+    assert capsys.readouterr().err == "warning: mind this\n"
+    assert progress.warnings == ["mind this"]
+    assert progress.timings["work"] > 0
+
+
+def test_picture_helpers():
+    inside = np.zeros((40, 40), bool)
+    inside[5:35, 1:38] = True
+    assert bounding_box(inside) == (slice(3, 37), slice(0, 40))
+    assert not away_from_rim(inside)[5:10].any()
+    assert away_from_rim(inside)[10:30, 6:33].all()
+    np.testing.assert_array_equal(away_from_rim(inside[4:12]), inside[4:12])  # too thin: all of it

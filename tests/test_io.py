@@ -1,0 +1,456 @@
+"""Files: what is written is what is read, by this package and by nibabel."""
+
+import builtins
+import gzip
+import importlib.metadata
+import os
+import stat
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+import hks_jax as hj
+from hks_jax.io import ORDERS, TensorVolume, atomic_folder, atomic_path, erode, find_example_brain, read_mask
+from hks_jax.io import nifti as nifti_module
+from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
+
+SHAPE = (4, 5, 6)
+
+
+def rotated_affine():
+    """A rotation, a flip, anisotropic voxels and a translation: nothing that could be guessed."""
+    a, b = 0.3, -0.7
+    rz = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    rx = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+    affine = np.eye(4)
+    affine[:3, :3] = rz @ rx @ np.diag([-1.5, 2.0, 3.25])
+    affine[:3, 3] = 11.0, -7.0, 3.0
+    return affine
+
+
+@pytest.fixture
+def tensors():
+    root = np.random.default_rng(3).normal(size=(*SHAPE, 3, 3))
+    return 1e-3 * (root @ np.swapaxes(root, -1, -2) + np.eye(3))
+
+
+@pytest.fixture
+def volume(tensors):
+    mask = np.ones(SHAPE, bool)
+    mask[0] = False
+    affine = rotated_affine()
+    spacing = tuple(np.linalg.norm(affine[:3, :3], axis=0).tolist())
+    return TensorVolume(tensors, spacing, (0.0, 0.0, 0.0), mask, affine)
+
+
+def write_components(path, components, affine, intent=False):
+    image = nib.Nifti1Image(components, affine)
+    if intent:
+        image.header.set_intent("symmetric matrix", (3,))
+    nib.save(image, path)
+    return path
+
+
+# ---------------------------------------------------------------------------------------------------- tensors
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_symmetric_matrix_image_of_nibabel_is_read_in_its_order(tmp_path, tensors, suffix):
+    names = [("x", "x"), ("x", "y"), ("y", "y"), ("x", "z"), ("y", "z"), ("z", "z")]
+    components = np.stack([tensors[..., "xyz".index(a), "xyz".index(b)] for a, b in names], -1)
+    path = write_components(tmp_path / f"t{suffix}", components[..., None, :], rotated_affine(), intent=True)
+    read = hj.io.read_tensors(path)
+    np.testing.assert_array_equal(read.tensors, tensors)
+    assert read.order == "nifti"
+    np.testing.assert_allclose(read.spacing, [1.5, 2.0, 3.25], rtol=1e-6)
+    np.testing.assert_allclose(read.affine, rotated_affine(), rtol=1e-6)
+
+
+def test_written_tensors_are_what_nibabel_and_we_read(tmp_path, volume):
+    path = hj.io.save_tensors(tmp_path / "t.nii.gz", volume)
+    image = nib.load(path)
+    assert image.shape == (*SHAPE, 1, 6)
+    assert image.header.get_intent()[:2] == ("symmetric matrix", (3.0,))
+    np.testing.assert_allclose(image.affine, volume.affine, rtol=1e-6)
+    np.testing.assert_array_equal(image.get_fdata()[..., 0, 3], volume.tensors[..., 0, 2])
+    np.testing.assert_array_equal(hj.io.read_tensors(path).tensors, volume.tensors)
+
+
+@pytest.mark.parametrize("extra_axis", [False, True])
+def test_six_components_of_undeclared_order_are_refused_with_the_choices(tmp_path, tensors, extra_axis):
+    components = pack(tensors, "fsl")
+    path = write_components(tmp_path / "t.nii", components[..., None, :] if extra_axis else components, np.eye(4))
+    with pytest.raises(ValueError, match="does not declare their order") as caught:
+        hj.io.read_tensors(path)
+    for name, order in ORDERS.items():
+        assert f'"{name}" ({" ".join(order)})' in str(caught.value)
+
+
+@pytest.mark.parametrize("order", list(ORDERS))
+def test_every_order_unpacks_to_the_same_tensors(tmp_path, tensors, order):
+    np.testing.assert_array_equal(unpack(pack(tensors, order), order), tensors)
+    path = write_components(tmp_path / "t.nii", pack(tensors, order), rotated_affine())
+    read = hj.io.read_tensors(path, order=order, frame="voxel")
+    np.testing.assert_array_equal(read.tensors, tensors)
+
+
+def test_orders_are_those_of_their_programs():
+    assert " ".join(ORDERS["nifti"]) == "xx xy yy xz yz zz"
+    assert " ".join(ORDERS["fsl"]) == "xx xy xz yy yz zz"
+    assert " ".join(ORDERS["mrtrix"]) == "xx yy zz xy xz yz"
+
+
+def test_world_tensors_are_turned_to_the_voxel_axes(tmp_path):
+    affine = rotated_affine()
+    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
+    voxel = np.diag([3.0, 2.0, 1.0])  # along the voxel axes, whatever these are in the world
+    world = axes @ voxel @ axes.T
+    path = write_components(tmp_path / "t.nii", np.broadcast_to(pack(world, "mrtrix"), (*SHAPE, 6)).copy(), affine)
+    read = hj.io.read_tensors(path, order="mrtrix")
+    np.testing.assert_allclose(read.tensors, np.broadcast_to(voxel, (*SHAPE, 3, 3)), atol=1e-6)
+
+
+def test_fsl_frame_reverses_x_only_where_the_affine_keeps_orientation(tensors):
+    right_handed, left_handed = np.diag([2.0, 2, 2, 1]), np.diag([-2.0, 2, 2, 1])
+    flipped = to_voxel_axes(tensors, "fsl", right_handed)
+    np.testing.assert_array_equal(flipped[..., 0, 1], -tensors[..., 0, 1])
+    np.testing.assert_array_equal(flipped[..., 1, 2], tensors[..., 1, 2])
+    np.testing.assert_array_equal(to_voxel_axes(tensors, "fsl", left_handed), tensors)
+
+
+def test_big_endian_and_scaled_images_become_native_floats(tmp_path, tensors):
+    components = pack(tensors, "nifti")[..., None, :]
+    for dtype, expected, tolerance in ((np.float32, "=f4", 1e-6), (np.int16, "=f8", 1e-4)):
+        header = nib.Nifti1Header(endianness=">")
+        header.set_data_dtype(dtype)
+        header.set_intent("symmetric matrix", (3,))
+        nib.save(nib.Nifti1Image(components, np.eye(4), header), tmp_path / "t.nii")
+        read = hj.io.read_tensors(tmp_path / "t.nii").tensors
+        assert read.dtype == np.dtype(expected)
+        assert read.dtype.isnative
+        np.testing.assert_allclose(read, tensors, atol=tolerance * np.abs(tensors).max())
+
+
+def test_npz_round_trip_keeps_everything(tmp_path, volume):
+    plane = volume.slice("y", 2)
+    for v in (volume, plane):
+        read = hj.io.read_tensors(hj.io.save_tensors(tmp_path / "t.npz", v))
+        np.testing.assert_array_equal(read.tensors, v.tensors)
+        np.testing.assert_array_equal(read.mask, v.mask)
+        np.testing.assert_array_equal(read.affine, v.affine)
+        assert (read.spacing, read.origin) == (v.spacing, v.origin)
+
+
+def test_npz_defaults(tmp_path):
+    np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2, dtype=int), (3, 4, 2, 2)))
+    read = hj.io.read_tensors(tmp_path / "t.npz")
+    assert (read.spacing, read.origin, read.mask, read.affine) == ((1.0, 1.0), (0.0, 0.0), None, None)
+    assert read.tensors.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"D": np.eye(2)}, "has no array 'tensors' \\(it has D\\)"),
+        ({"tensors": np.zeros((3, 4, 5))}, "expected \\(nx, ny, 2, 2\\) or \\(nx, ny, nz, 3, 3\\)"),
+        ({"tensors": np.zeros((3, 4, 2, 2)), "spacing": [1, 2, 3]}, "spacing: got .* expected 2 finite numbers"),
+        ({"tensors": np.zeros((3, 4, 2, 2)), "mask": np.ones((4, 3))}, "mask: got shape \\(4, 3\\)"),
+        ({"tensors": np.zeros((3, 4, 2, 2)), "mask": np.full((3, 4), 0.5)}, "values other than 0 and 1"),
+        ({"tensors": np.zeros((3, 4, 2, 2), complex)}, "dtype complex128; expected real numbers"),
+    ],
+)
+def test_bad_npz(tmp_path, arrays, message):
+    np.savez(tmp_path / "t.npz", **arrays)
+    with pytest.raises(ValueError, match=message):
+        hj.io.read_tensors(tmp_path / "t.npz")
+
+
+def test_unreadable_files(tmp_path, tensors):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        hj.io.read_tensors(tmp_path / "absent.nii.gz")
+    (tmp_path / "t.mha").write_text("")
+    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii, \.nii\.gz or \.npz"):
+        hj.io.read_tensors(tmp_path / "t.mha")
+    for name in ("t.nii", "t.nii.gz", "t.npz"):
+        (tmp_path / name).write_bytes(b"not what the name says")
+        with pytest.raises(ValueError, match="not a readable"):
+            hj.io.read_tensors(tmp_path / name)
+    whole = write_components(tmp_path / "w.nii.gz", pack(tensors, "nifti")[..., None, :], np.eye(4), intent=True)
+    (tmp_path / "cut.nii").write_bytes(gzip.decompress(whole.read_bytes())[:800])
+    with pytest.raises(ValueError, match="damaged or incomplete"):
+        hj.io.read_tensors(tmp_path / "cut.nii")
+
+
+def test_an_image_that_is_no_tensor_image_is_refused(tmp_path):
+    write_components(tmp_path / "dwi.nii", np.zeros((3, 3, 3, 7)), np.eye(4))
+    with pytest.raises(ValueError, match=r"expected six components per voxel.*fit_dwi"):
+        hj.io.read_tensors(tmp_path / "dwi.nii")
+
+
+def test_nifti_without_nibabel_names_the_extra(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def without_nibabel(name, *args, **kwargs):
+        if name == "nibabel":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_nibabel)
+    with pytest.raises(ImportError, match=r'pip install "hks-jax\[dti\]"'):
+        hj.io.read_tensors(tmp_path / "t.nii")
+
+
+# ---------------------------------------------------------------------------------------------------- slices
+
+
+@pytest.mark.parametrize(("axis", "keep"), [("x", (1, 2)), ("y", (0, 2)), (2, (0, 1))])
+def test_slice_carries_the_in_plane_block_and_its_place(volume, axis, keep):
+    a = "xyz".find(axis) if isinstance(axis, str) else axis
+    plane = volume.slice(axis, 3)
+    assert plane.shape == tuple(SHAPE[b] for b in keep)
+    assert plane.spacing == tuple(volume.spacing[b] for b in keep)
+    np.testing.assert_array_equal(plane.tensors, np.take(volume.tensors, 3, a)[..., keep, :][..., keep])
+    np.testing.assert_array_equal(plane.mask, np.take(volume.mask, 3, a))
+    index = np.array([1, 1, 1, 1])
+    index[a] = 0
+    in_volume = index + 3 * np.eye(4, dtype=int)[a]
+    np.testing.assert_allclose(plane.affine @ index, volume.affine @ in_volume)
+
+
+def test_the_block_is_of_the_diffusion_tensor_not_of_its_inverse():
+    D = np.array([[2.0, 0.3, 0.5], [0.3, 1.0, 0.2], [0.5, 0.2, 1.5]])
+    volume = TensorVolume(np.broadcast_to(D, (3, 3, 3, 3, 3)), (1.0,) * 3, (0.0,) * 3)
+    plane = volume.slice("z", 1)
+    metric = np.asarray(hj.TensorField.from_diffusion(plane.grid(), plane.tensors, "inverse").tensors[0, 0])
+    np.testing.assert_allclose(metric, np.linalg.inv(D[:2, :2]), rtol=1e-6)
+    assert np.abs(metric - np.linalg.inv(D)[:2, :2]).max() > 0.03
+
+
+def test_bad_slices(volume):
+    with pytest.raises(ValueError, match="index: got z = 6; expected 0 … 5"):
+        volume.slice("z", 6)
+    with pytest.raises(ValueError, match="axis: got 'w'"):
+        volume.slice("w", 0)
+    with pytest.raises(ValueError, match="empty in slice x = 0; it has voxels inside at x = 1 … 3"):
+        volume.slice("x", 0)
+    with pytest.raises(ValueError, match="slice already"):
+        volume.slice("z", 0).slice("z", 0)
+
+
+# ---------------------------------------------------------------------------------------------------- masks
+
+
+def test_masks_of_every_kind_of_file(tmp_path, volume):
+    np.save(tmp_path / "m.npy", volume.mask)
+    np.savez(tmp_path / "m.npz", mask=volume.mask)
+    write_components(tmp_path / "m.nii.gz", volume.mask.astype(np.uint8)[..., None], volume.affine)
+    for name in ("m.npy", "m.npz", "m.nii.gz"):
+        np.testing.assert_array_equal(read_mask(tmp_path / name), volume.mask)
+
+
+def test_bad_masks(tmp_path, volume):
+    hj.io.save_tensors(tmp_path / "t.nii", volume)
+    np.save(tmp_path / "m.npy", np.ones((4, 5)))
+    with pytest.raises(ValueError, match=r"mask: got shape \(4, 5\); expected the tensors' shape \(4, 5, 6\)"):
+        hj.io.read_tensors(tmp_path / "t.nii", mask=tmp_path / "m.npy")
+    elsewhere = volume.affine.copy()
+    elsewhere[0, 3] += 2.0
+    write_components(tmp_path / "m.nii", volume.mask.astype(np.uint8), elsewhere)
+    with pytest.raises(ValueError, match="places it up to 2 away"):
+        hj.io.read_tensors(tmp_path / "t.nii", mask=tmp_path / "m.nii")
+    np.savez(tmp_path / "m.npz", inside=volume.mask)
+    with pytest.raises(ValueError, match="has no array 'mask' \\(it has inside\\)"):
+        read_mask(tmp_path / "m.npz")
+
+
+def test_erosion_peels_the_rim_but_not_the_border_of_the_image():
+    mask = np.zeros((9, 9, 2), bool)
+    mask[1:8, 1:8] = True
+    eroded = erode(mask, 2)
+    assert eroded.sum() == 3 * 3 * 2
+    assert eroded[3:6, 3:6].all()
+    assert erode(mask, 0) is mask
+    with pytest.raises(ValueError, match="leaves nothing of 98 voxels"):
+        erode(mask, 4)
+    with pytest.raises(ValueError, match="expected 0 or more"):
+        erode(mask, -1)
+
+
+# ---------------------------------------------------------------------------------------------------- results
+
+
+def test_values_of_a_volume_carry_times_along_the_fourth_axis(tmp_path, volume):
+    values = np.random.default_rng(0).random((7, *SHAPE))
+    values[:, ~volume.mask] = np.nan
+    image = nib.load(hj.io.save(tmp_path / "v.nii.gz", values, volume))
+    assert image.shape == (*SHAPE, 7)
+    np.testing.assert_array_equal(image.get_fdata(), np.moveaxis(values, 0, -1))
+    np.testing.assert_allclose(image.affine, volume.affine, rtol=1e-6)
+    assert nib.load(hj.io.save(tmp_path / "one.nii", values[0], volume)).shape == SHAPE
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_values_of_a_slice_lie_where_the_slice_was_cut(tmp_path, volume, axis):
+    field = np.random.default_rng(1).random(SHAPE)
+    a, index = "xyz".index(axis), 2
+    plane = volume.slice(axis, index)
+    values = np.stack([np.take(field, index, a), 2 * np.take(field, index, a)])
+    image = nib.load(hj.io.save(tmp_path / "v.nii.gz", values, plane))
+    assert image.shape == (*[1 if b == a else n for b, n in enumerate(SHAPE)], 2)
+    # The voxel of the slice at a place in the world holds what the volume's voxel at that place held.
+    node = np.array([1, 1, 1])
+    node[a] = index
+    world = volume.affine @ [*node, 1]
+    i, j, k = np.rint(np.linalg.inv(image.affine) @ world).astype(int)[:3]
+    assert image.get_fdata()[i, j, k, 1] == 2 * field[tuple(node)]
+
+
+def test_a_slice_without_affine_is_placed_by_spacing_and_origin(tmp_path):
+    plane = TensorVolume(np.broadcast_to(np.eye(2), (3, 4, 2, 2)), (0.5, 2.0), (10.0, 20.0))
+    image = nib.load(hj.io.save(tmp_path / "v.nii", np.zeros((3, 4)), plane))
+    assert image.shape == (3, 4, 1)
+    np.testing.assert_array_equal(image.affine @ [2, 1, 0, 1], [11.0, 22.0, 0.0, 1.0])
+
+
+def test_npz_results(tmp_path, volume):
+    plane = volume.slice("z", 1)
+    hj.io.save(tmp_path / "v.npz", np.ones((2, 4, 5)), plane, name="hks", extra={"times": [1.0, 2.0]})
+    with np.load(tmp_path / "v.npz") as read:
+        assert set(read.files) == {"hks", "times", "spacing", "origin", "mask", "affine", "slice_axis"}
+        np.testing.assert_array_equal(read["times"], [1, 2])
+        np.testing.assert_array_equal(read["mask"], plane.mask)
+
+
+def test_results_that_cannot_be_saved(tmp_path, volume):
+    with pytest.raises(ValueError, match=r"values: got shape \(5, 4, 6\); expected \(4, 5, 6\)"):
+        hj.io.save(tmp_path / "v.npz", np.zeros((5, 4, 6)), volume)
+    with pytest.raises(ValueError, match=r"expected a name that ends in \.npz, \.nii or \.nii\.gz"):
+        hj.io.save(tmp_path / "v.txt", np.zeros(SHAPE), volume)
+    with pytest.raises(ValueError, match="NIfTI has no place for more arrays"):
+        hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"times": [1]})
+    with pytest.raises(ValueError, match="no 2×2 tensors"):
+        hj.io.save_tensors(tmp_path / "v.nii", volume.slice("z", 1))
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------------------------------------------- atomicity
+
+
+@pytest.mark.parametrize("name", ["v.npz", "v.nii.gz"])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, volume, monkeypatch, name):
+    path = hj.io.save(tmp_path / name, np.zeros(SHAPE), volume)
+    before = path.read_bytes()
+
+    def half(*args, **kwargs):
+        target = args[0] if name.endswith("npz") else args[1]
+        target.write(b"half") if hasattr(target, "write") else target.write_bytes(b"half")
+        raise OSError("disk full")
+
+    owner = np if name.endswith("npz") else nifti_module.nibabel()
+    monkeypatch.setattr(owner, "savez_compressed" if name.endswith("npz") else "save", half)
+    with pytest.raises(OSError, match="disk full"):
+        hj.io.save(path, np.ones(SHAPE), volume)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_interrupt_leaves_nothing(tmp_path):
+    def interrupted(file):
+        file.write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), atomic_path(tmp_path / "new" / "file") as temporary:
+        interrupted(temporary)
+    assert list((tmp_path / "new").iterdir()) == []
+    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "a" / "b") as folder:
+        interrupted(folder / "file")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_folder_replaces_its_own_files_only(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "old").write_text("kept")
+    (tmp_path / "out" / "file").write_text("replaced")
+    with atomic_folder(tmp_path / "out") as temporary:
+        (temporary / "file").write_text("new")
+        assert (tmp_path / "out" / "file").read_text() == "replaced"
+    assert {f.name: f.read_text() for f in (tmp_path / "out").iterdir()} == {"old": "kept", "file": "new"}
+    assert [f.name for f in tmp_path.iterdir()] == ["out"]
+    with pytest.raises(NotADirectoryError, match="is a file"), atomic_folder(tmp_path / "out" / "old"):
+        pass
+
+
+def test_written_files_have_ordinary_permissions(tmp_path, volume):
+    umask = os.umask(0o022)
+    try:
+        path = hj.io.save(tmp_path / "v.npz", np.zeros(SHAPE), volume)
+    finally:
+        os.umask(umask)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+# ---------------------------------------------------------------------------------------------------- tensor fits
+
+
+@pytest.fixture
+def scan(tmp_path, volume):
+    """Noise-free diffusion-weighted images of the volume's tensors, with a second shell that no tensor explains."""
+    rng = np.random.default_rng(5)
+    directions = rng.normal(size=(25, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    b = np.array([0.0] * 2 + [800.0] * 13 + [2500.0] * 10)
+    directions[b == 0] = 0
+    exponent = np.einsum("na,xyzab,nb->xyzn", directions, volume.tensors, directions) * b
+    signal = 1000 * np.exp(-exponent)
+    signal[..., b > 2000] = 40.0
+    write_components(tmp_path / "dwi.nii.gz", signal, volume.affine)
+    np.savetxt(tmp_path / "b", b[None])
+    fsl = directions * [-1 if np.linalg.det(volume.affine[:3, :3]) > 0 else 1, 1, 1]
+    np.savetxt(tmp_path / "g", fsl.T)
+    return tmp_path
+
+
+def test_fit_recovers_the_tensors_of_a_perfect_scan(scan, volume):
+    fit = hj.io.fit_dwi(scan / "dwi.nii.gz", scan / "b", scan / "g", volume.mask, b_max=1000)
+    np.testing.assert_allclose(fit.tensors[volume.mask], volume.tensors[volume.mask], rtol=1e-5, atol=1e-8)
+    assert not fit.tensors[~volume.mask].any()
+    np.testing.assert_allclose(fit.spacing, volume.spacing, rtol=1e-6)
+    assert fit.notes[0] == "weighted least squares on 15 of 25 images (b ≤ 800 s/mm²)"
+
+
+def test_bad_scans(scan, volume):
+    names = scan / "dwi.nii.gz", scan / "b", scan / "g"
+    with pytest.raises(ValueError, match="leaves 0 weighted and 2 unweighted images"):
+        hj.io.fit_dwi(*names, volume.mask, b_max=10)
+    np.savetxt(scan / "short", np.zeros((1, 7)))
+    with pytest.raises(ValueError, match="7 b-values"):
+        hj.io.fit_dwi(names[0], scan / "short", names[2], volume.mask)
+    with pytest.raises(ValueError, match="expected the images' shape"):
+        hj.io.fit_dwi(*names, np.ones((2, 2, 2), bool))
+
+
+def test_the_example_brain_is_found_by_metadata_alone(tmp_path, monkeypatch):
+    def absent(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "files", absent)
+    assert find_example_brain() is None
+
+    class Entry:
+        def __init__(self, name):
+            self.name = name
+
+        def locate(self):
+            return tmp_path / self.name
+
+    stem = "b1k_b2k_example_slices_24_38"
+    names = [f"{stem}.nii.gz", f"{stem}_mask.nii.gz", "b1k_b2k.bval", "b1k_b2k.bvec"]
+    monkeypatch.setattr(importlib.metadata, "files", lambda name: [Entry(n) for n in [*names, "other.py"]])
+    assert find_example_brain() is None  # listed, but not on disk
+    for name in names:
+        (tmp_path / name).touch()
+    found = find_example_brain()
+    assert found is not None
+    assert found.images == tmp_path / names[0]
+    assert (found.mask, found.bval, found.bvec) == tuple(tmp_path / n for n in names[1:])

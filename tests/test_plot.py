@@ -1,0 +1,379 @@
+"""The pictures: what is drawn is where, as large and as coloured as the mathematics says."""
+
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from hks_jax import Grid, SurfaceMesh, TensorField
+from hks_jax.plot import (
+    ellipses,
+    evenly_spaced_lines,
+    hks_curves,
+    hks_panels,
+    integral_lines,
+    new_figure,
+    save_figure,
+    scalar_image,
+    surface,
+    trace,
+)
+
+
+def rotating_field(index, n=81, centre=(0.0, 0.0), turn=0.0, mask=None):
+    """A degenerate point of the given index: eigenvalues 2 ± |x|, major direction index·θ + turn."""
+    grid = Grid.from_bounds(-1, 1, (n, n), mask=mask)
+
+    def metric(x):
+        x = x - jnp.array(centre)
+        angle = 2 * (index * jnp.arctan2(x[1], x[0]) + turn)
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        radius = jnp.sqrt(x @ x + 1e-30) / 3
+        return 2 * jnp.eye(2) + radius * jnp.array([[c, s], [s, -c]])
+
+    return TensorField.from_function(metric, grid)
+
+
+def disc(n=81, radius=0.8):
+    nodes = Grid.from_bounds(-1, 1, (n, n)).nodes
+    return np.linalg.norm(nodes, axis=-1) < radius
+
+
+def test_plot_is_imported_lazily_and_leaves_pyplot_alone():
+    code = (
+        "import sys, hks_jax; assert 'matplotlib' not in sys.modules; "
+        "import hks_jax.plot; assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+# --- images -------------------------------------------------------------------------------------------------
+
+
+def test_scalar_image_puts_axis_0_horizontally_and_masks_the_outside():
+    mask = np.ones((7, 5), dtype=bool)
+    mask[:2, 0] = False
+    grid = Grid((7, 5), (2.0, 1.0), (10.0, 20.0), mask=mask)
+    values = grid.nodes[..., 0] + 100 * grid.nodes[..., 1]
+    values[3, 3] = np.nan
+    ax = new_figure(3, 3).subplots()
+    image = scalar_image(ax, values, grid, label="f")
+    drawn = image.get_array()
+    assert drawn.shape == (5, 7)
+    expected_mask = ~mask
+    expected_mask[3, 3] = True
+    np.testing.assert_array_equal(np.ma.getmaskarray(drawn), expected_mask.T)
+    np.testing.assert_allclose(drawn.T.compressed(), values[~expected_mask])
+    assert image.get_extent() == [9.0, 23.0, 19.5, 24.5]
+    assert image.origin == "lower"
+    assert image.cmap.get_bad()[3] == 0  # transparent
+    assert ax.get_aspect() == 1
+    assert len(ax.figure.axes) == 1
+    assert len(ax.child_axes) == 1
+    assert ax.child_axes[0].get_ylabel() == "f"
+
+
+def test_scalar_image_colours_by_quantiles():
+    grid = Grid((11, 11))
+    values = np.arange(121.0).reshape(11, 11)
+    ax = new_figure(3, 3).subplots()
+    image = scalar_image(ax, values, grid, quantiles=(0.1, 0.9))
+    np.testing.assert_allclose(image.get_clim(), (12.0, 108.0))
+    assert image.colorbar.extend == "both"
+
+
+def test_a_constant_is_one_colour():
+    grid = Grid((9, 9))
+    noise = 1e-12 * np.random.default_rng(0).standard_normal((9, 9))
+    image = scalar_image(new_figure(3, 3).subplots(), 5 + noise, grid)
+    assert np.ptp(image.norm(image.get_array())) < 1e-5
+
+
+@pytest.mark.parametrize("n", [1, 3, 4, 5, 6, 7, 9, 12])
+def test_hks_panels_has_one_panel_and_bar_per_time(n, tmp_path):
+    grid = Grid((12, 8))
+    values = np.random.default_rng(0).random((n, 12, 8))
+    path = tmp_path / "new" / "panels.png"
+    fig = hks_panels(values, np.geomspace(1e-4, 1e4, n), grid, unit="s", path=path)
+    assert len(fig.axes) == n
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    assert [p.name for p in path.parent.iterdir()] == ["panels.png"]
+    for ax, v in zip(fig.axes, values, strict=True):
+        assert ax.get_title().startswith("$t$ = ")
+        assert ax.get_title().endswith(" s")
+        np.testing.assert_allclose(ax.images[0].get_clim(), (v.min(), v.max()))
+    renderer = FigureCanvasAgg(fig).get_renderer()
+    boxes = [ax.get_tightbbox(renderer) for ax in fig.axes]
+    for i, a in enumerate(boxes):
+        assert fig.bbox.padded(1).containsx(a.x0)
+        assert fig.bbox.padded(1).containsx(a.x1)
+        assert not any(a.padded(-1).overlaps(b.padded(-1)) for b in boxes[i + 1 :])
+
+
+def test_hks_panels_shared_range_and_titles():
+    grid = Grid((6, 6))
+    values = np.stack([np.full((6, 6), 1.0), np.linspace(2, 3, 36).reshape(6, 6)])
+    fig = hks_panels(values, [1.0, 2.0], grid, shared_range=True, titles=["one", "two"], suptitle="both")
+    assert [ax.get_title() for ax in fig.axes] == ["one", "two"]
+    assert all(ax.images[0].get_clim() == (1.0, 3.0) for ax in fig.axes)
+
+
+def test_image_errors():
+    grid = Grid((6, 5))
+    ax = new_figure(2, 2).subplots()
+    with pytest.raises(ValueError, match=r"values: got shape \(5, 6\); expected the grid's shape \(6, 5\)"):
+        scalar_image(ax, np.zeros((5, 6)), grid)
+    with pytest.raises(ValueError, match="no finite value"):
+        scalar_image(ax, np.full((6, 5), np.nan), grid)
+    with pytest.raises(ValueError, match=r"3 dimensions.*Draw a slice"):
+        scalar_image(ax, np.zeros((3, 3, 3)), Grid((3, 3, 3)))
+    with pytest.raises(ValueError, match=r"values: got shape \(6, 5\)"):
+        hks_panels(np.zeros((6, 5)), [1.0], grid)
+    with pytest.raises(ValueError, match=r"titles: got 1; expected 2"):
+        hks_panels(np.zeros((2, 6, 5)), [1.0, 2.0], grid, titles=["one"])
+
+
+def test_save_figure_is_atomic(tmp_path):
+    fig = new_figure(2, 2)
+    fig.subplots()
+    path = save_figure(fig, tmp_path / "f.svg")
+    old = path.read_bytes()
+    assert b"<svg" in old
+    with pytest.raises(ValueError, match=r"path: got .*f.docx.*png"):
+        save_figure(fig, tmp_path / "f.docx")
+
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    fig.savefig = fail
+    with pytest.raises(OSError, match="disk full"):
+        save_figure(fig, path)
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["f.svg"]
+
+
+# --- ellipses -----------------------------------------------------------------------------------------------
+
+
+def drawn_ellipses(collection):
+    return (
+        np.asarray(collection.get_offsets()),
+        np.asarray(collection.get_widths()),
+        np.asarray(collection.get_heights()),
+        np.radians(np.asarray(collection.get_angles())),
+    )
+
+
+@pytest.mark.parametrize("kind", ["metric", "tensor"])
+@pytest.mark.parametrize("sizes", ["common", "fit"])
+def test_ellipses_have_the_tensors_axes(kind, sizes):
+    field = rotating_field(0.5)
+    ax = new_figure(3, 3).subplots()
+    centres, width, height, angle = drawn_ellipses(ellipses(ax, field, every=8, kind=kind, sizes=sizes))
+    nodes = np.rint((centres + 1) / field.grid.spacing).astype(int)
+    tensors = np.asarray(field.tensors)[tuple(nodes.T)]
+    values, vectors = np.linalg.eigh(tensors)
+    np.testing.assert_allclose(width / height, np.sqrt(values[:, 1] / values[:, 0]))
+    longer = vectors[..., 0 if kind == "metric" else 1]
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    isotropic = values[:, 1] - values[:, 0] < 1e-9
+    np.testing.assert_allclose(np.abs(np.sum(along * longer, axis=1))[~isotropic], 1.0)
+    if sizes == "common":
+        length = width * np.sqrt(values[:, 0] if kind == "metric" else 1 / values[:, 1])
+        np.testing.assert_allclose(length, length[0])
+
+
+@pytest.mark.parametrize("every", [None, 3, (5, 9)])
+@pytest.mark.parametrize("sizes", ["common", "fit"])
+def test_ellipses_never_overlap_and_are_centred_in_the_frame(every, sizes):
+    rng = np.random.default_rng(1)
+    a = rng.standard_normal((50, 37, 2, 2)) * rng.lognormal(size=(50, 37, 1, 1))
+    grid = Grid((50, 37), (1.0, 2.0))
+    field = TensorField(grid, a @ np.swapaxes(a, -1, -2) + 0.02 * np.eye(2))
+    ax = new_figure(3, 3).subplots()
+    centres, width, height, angle = drawn_ellipses(ellipses(ax, field, every, sizes=sizes))
+    assert len(centres) > 20
+    # Dense outlines: no point of one ellipse lies inside another.
+    s = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    outline = (
+        centres[:, None]
+        + 0.5 * width[:, None, None] * np.cos(s)[:, None] * along[:, None]
+        + 0.5 * height[:, None, None] * np.sin(s)[:, None] * across[:, None]
+    )
+    for i in range(len(centres)):
+        rest = np.delete(outline, i, axis=0) - centres[i]
+        u, v = rest @ along[i] / width[i], rest @ across[i] / height[i]
+        assert (u**2 + v**2 > 0.25).all()
+    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+    np.testing.assert_allclose(centres.min(axis=0) - [x0, y0], [x1, y1] - centres.max(axis=0), atol=2.0)
+
+
+def test_ellipses_respect_the_mask_and_colour():
+    field = rotating_field(1, mask=disc())
+    ax = new_figure(3, 3).subplots()
+    collection = ellipses(ax, field, color="orientation", kind="tensor")
+    centres, _, _, angle = drawn_ellipses(collection)
+    assert np.linalg.norm(centres, axis=1).max() < 0.8
+    np.testing.assert_allclose(collection.get_array(), np.degrees(angle), atol=1e-9)
+    plain = ellipses(new_figure(3, 3).subplots(), field, color="tab:red")
+    assert plain.get_array() is None
+    anisotropy = ellipses(new_figure(3, 3).subplots(), field).get_array()
+    assert anisotropy.min() >= 0
+    assert anisotropy.max() <= 0.8 / 6 + 1e-12
+
+
+def test_ellipse_errors():
+    field = rotating_field(1, n=9)
+    ax = new_figure(2, 2).subplots()
+    with pytest.raises(ValueError, match=r'kind: got "?\'?glyph'):
+        ellipses(ax, field, kind="glyph")
+    with pytest.raises(ValueError, match="sizes: got 'big'"):
+        ellipses(ax, field, sizes="big")
+    with pytest.raises(ValueError, match=r"fill: got 1.5"):
+        ellipses(ax, field, fill=1.5)
+    with pytest.raises(ValueError, match=r"every: got 0; expected positive integers"):
+        ellipses(ax, field, every=0)
+
+
+# --- integral lines -----------------------------------------------------------------------------------------
+
+
+def test_lines_of_a_circular_field_are_circles():
+    field = rotating_field(1, n=101)  # major: radial, minor: circular
+    seeds = np.array([[0.3, 0.0], [0.0, 0.6], [-0.5, 0.5]])
+    for seed, line in zip(seeds, trace(field, seeds, "minor", max_length=8.0), strict=True):
+        radius = np.linalg.norm(line, axis=1)
+        assert len(line) > 200
+        assert np.abs(radius - np.linalg.norm(seed)).max() < 1e-3
+        turned = np.abs(np.diff(np.unwrap(np.arctan2(line[:, 1], line[:, 0])))).sum()
+        assert turned > 2 * np.pi
+
+
+def test_tracing_converges_with_the_grid():
+    seed = np.array([[0.45, 0.2]])
+    drift = []
+    for n in (21, 41, 81):
+        (line,) = trace(rotating_field(1, n=n, centre=(0.013, 0.007)), seed, "minor", max_length=4.0, step=0.02)
+        radius = np.linalg.norm(line - [0.013, 0.007], axis=1)
+        drift.append(np.ptp(radius))
+    assert drift[0] / drift[1] > 3
+    assert drift[1] / drift[2] > 3
+
+
+def test_radial_lines_end_at_the_side_and_near_the_degenerate_point():
+    field = rotating_field(1, n=101)
+    (line,) = trace(field, np.array([[0.4, 0.2]]), "major")
+    np.testing.assert_allclose(line[:, 1] / line[:, 0], 0.5, atol=5e-3)
+    inner, outer = np.sort(np.abs(line[[0, -1], 0]))
+    assert inner < 0.03
+    assert outer > 0.98
+
+
+def test_half_integer_points_have_no_consistent_sign_but_lines_pass():
+    """A wedge (index ½) turns lines around it: they come from the right and go back there."""
+    (line,) = trace(rotating_field(0.5, n=101), np.array([[-0.3, 0.0]]), "major")
+    assert line[0, 0] > 0.5
+    assert line[-1, 0] > 0.5
+    assert line[0, 1] * line[-1, 1] < 0
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.01, rtol=0.02)
+
+
+def test_lines_stay_inside_the_mask():
+    field = rotating_field(0.5, mask=disc())
+    lines = evenly_spaced_lines(field, separation=0.1)
+    assert max(np.linalg.norm(line, axis=1).max() for line in lines) < 0.8
+    (outside,) = trace(field, np.array([[0.95, 0.95]]))
+    assert outside.shape == (0, 2)
+
+
+@pytest.mark.parametrize("index", [-1.5, 0.5, 1, 2])
+@pytest.mark.parametrize("which", ["major", "minor"])
+def test_evenly_spaced_lines_cover_and_keep_their_distance(index, which):
+    field, separation = rotating_field(index), 0.12
+    lines = evenly_spaced_lines(field, which, separation=separation)
+    points = np.concatenate(lines)
+    owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    apart = np.linalg.norm(points[:, None, :] - points[None, ::3, :], axis=-1)
+    apart[owner[:, None] == owner[None, ::3]] = np.inf
+    assert apart.min() >= separation / 2 * 0.999
+    probes = np.random.default_rng(0).uniform(-0.95, 0.95, (500, 2))
+    nearest = np.linalg.norm(probes[:, None] - points[None], axis=-1).min(axis=1)
+    assert np.quantile(nearest, 0.95) < separation
+
+
+def test_circles_close():
+    lines = evenly_spaced_lines(rotating_field(1), "minor", separation=0.15)
+    full = [line for line in lines if np.linalg.norm(line, axis=1).max() < 0.97]
+    closed = [line for line in full if np.array_equal(line[0], line[-1])]
+    assert len(closed) >= 4
+    assert len(closed) >= 0.8 * len(full)
+
+
+def test_integral_lines_draws_on_the_axes_it_is_given():
+    field = rotating_field(0.5, n=41)
+    ax = new_figure(3, 3).subplots()
+    sparse = integral_lines(ax, field, density=0.5, colors="white")
+    dense = integral_lines(ax, field, "minor", density=1.5, linewidths=0.3)
+    seeded = integral_lines(ax, field, seeds=np.array([[0.5, 0.5], [5.0, 5.0]]))
+    assert list(ax.collections) == [sparse, dense, seeded]
+    assert len(dense.get_segments()) > 1.5 * len(sparse.get_segments()) > 0
+    assert len(seeded.get_segments()) == 1
+    with pytest.raises(ValueError, match='which: got \'medium\'; expected "major" or "minor"'):
+        integral_lines(ax, field, "medium")
+    with pytest.raises(ValueError, match=r"density: got 0"):
+        integral_lines(ax, field, density=0)
+    with pytest.raises(ValueError, match=r"seeds: got shape \(3,\)"):
+        trace(field, np.zeros(3))
+    with pytest.raises(ValueError, match=r"separation: got -1"):
+        evenly_spaced_lines(field, separation=-1)
+
+
+# --- curves and surfaces ------------------------------------------------------------------------------------
+
+
+def test_hks_curves_are_the_values_at_the_nodes():
+    grid = Grid((5, 4), 0.5)
+    times = np.array([0.1, 1.0, 10.0])
+    values = np.random.default_rng(0).random((3, 5, 4)) + 1
+    ax = new_figure(3, 3).subplots()
+    lines = hks_curves(ax, values, times, grid, [[0.5, 0.6], [2.0, 1.5]], expansion=2 * values)
+    np.testing.assert_allclose(lines[0].get_ydata(), values[:, 1, 1])
+    np.testing.assert_allclose(lines[1].get_ydata(), values[:, 4, 3])
+    assert len(ax.lines) == 4
+    np.testing.assert_allclose(ax.lines[1].get_ydata(), 2 * values[:, 1, 1])
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["(0.5, 0.5)", "(2, 1.5)", "expansion"]
+    assert ax.get_xscale() == ax.get_yscale() == "log"
+    scaled = hks_curves(new_figure(3, 3).subplots(), values, times, grid, [[0, 0]], scaled=True, labels=["a"])
+    np.testing.assert_allclose(scaled[0].get_ydata(), 4 * np.pi * times * values[:, 0, 0])
+
+
+def test_hks_curves_errors():
+    grid = Grid((5, 4))
+    ax = new_figure(3, 3).subplots()
+    with pytest.raises(ValueError, match=r"values: got shape \(2, 5, 4\); expected .* \(1, 5, 4\)"):
+        hks_curves(ax, np.zeros((2, 5, 4)), [1.0], grid, [[0, 0]])
+    with pytest.raises(ValueError, match=r"points: \(9.0, 0.0\) lies outside"):
+        hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[9, 0]])
+    with pytest.raises(ValueError, match=r"points: got shape \(2,\)"):
+        hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [0, 0])
+
+
+def test_surface_colours_triangles_by_their_vertices():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    values = np.array([0.0, 1.0, 2.0, 3.0])
+    ax = new_figure(3, 3).add_subplot(projection="3d")
+    mappable = surface(ax, SurfaceMesh(vertices, faces), values, relief=0.0)
+    (collection,) = ax.collections
+    expected = mappable.to_rgba(values[faces].mean(axis=1))
+    # The collection keeps its triangles sorted by depth.
+    np.testing.assert_allclose(np.sort(collection.get_facecolor(), axis=0), np.sort(expected, axis=0))
+    assert mappable.get_clim() == (0.0, 3.0)
+    with pytest.raises(ValueError, match=r"values: got shape \(3,\); expected \(4,\)"):
+        surface(ax, SurfaceMesh(vertices, faces), values[:3])
