@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import hks_jax as hj
+from hks_jax import paper
 from hks_jax.cli import demo, main
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
@@ -259,6 +260,15 @@ def test_demo_fits_and_draws_an_installed_brain(tmp_path, monkeypatch, capsys):
     assert image.shape == (20, 22, 1, 7)
     inside = np.isfinite(image.get_fdata()[:, :, 0, 0])
     assert inside.sum() < mask[..., 0].sum() - 60  # the rim is gone
+
+
+def test_paper_passes_its_flags_on(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(paper, "run", lambda *args: calls.append(args[:3]))
+    out = tmp_path / "out"
+    assert main(["paper", "-q", "-o", str(out), "--full", "--only", "table1", "figure3"]) == 0
+    assert main(["paper", "-q", "-o", str(out)]) == 0
+    assert calls == [(out, True, ["table1", "figure3"]), (out, False, None)]
 
 
 # ---------------------------------------------------------------------------------------------------- what goes wrong

@@ -39,6 +39,8 @@ def test_figure4_fields_have_constant_eigenvalues():
     for name, field in examples.figure4_fields(9).items():
         values = np.linalg.eigvalsh(field.tensors)
         np.testing.assert_allclose(values, np.broadcast_to([1, 4], values.shape), err_msg=name)
+        curvature = np.abs(hj.gaussian_curvature(field)).max()
+        assert curvature < 1e-10 if name in ("straight", "circles", "spirals") else curvature > 1
 
 
 @pytest.mark.parametrize("index", [-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3])

@@ -55,9 +55,8 @@ def run(args: argparse.Namespace) -> None:
         times = lengths**2 / np.median(mean[volume.mask])
         settings = Settings(metric="inverse", components="largest", k=N_PAIRS, times=Times(tuple(times.tolist()), 0))
         result = compute(volume, settings, progress)
-        time_unit, length_unit = ("", "") if brain is None else (" s", " mm")
         titles = [
-            rf"$t$ = {number_text(t)}{time_unit}  ($\sqrt{{Dt}}$ ≈ {length:.2g}{length_unit})"
+            rf"$t$ = {number_text(t)} s  ($\sqrt{{Dt}}$ ≈ {length:.2g} mm)"
             for t, length in zip(times, lengths, strict=True)
         ]
         files = write_outputs(
@@ -68,7 +67,7 @@ def run(args: argparse.Namespace) -> None:
                 result,
                 path,
                 titles=titles,
-                first=(f"mean diffusivity{'' if brain is None else ', mm²/s'}", mean),
+                first=("mean diffusivity, mm²/s", mean),
                 title=f"Heat kernel signature of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹",
             ),
             nifti=brain is not None,

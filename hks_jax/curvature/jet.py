@@ -25,15 +25,15 @@ class Jet(NamedTuple):
     hessian: Float[Array, "... d d"]
 
 
-def function_jet(fn: Callable[[Array], Array], x: Float[Array, " d"]) -> Jet:
+def function_jet(fn: Callable[[Array], Any], x: Float[Array, " d"]) -> Jet:
     """Return the jet of a function at a point."""
 
     # The lower derivatives ride along as auxiliary outputs: else nested jets trace `fn` 7 times per level.
-    def value(y: Array) -> tuple[Array, Array]:
+    def value(y: Array) -> tuple[Any, Any]:
         f = fn(y)
         return f, f
 
-    def gradient(y: Array) -> tuple[Array, tuple[Array, Array]]:
+    def gradient(y: Array) -> tuple[Any, tuple[Any, Any]]:
         df, f = jax.jacfwd(value, has_aux=True)(y)
         return df, (f, df)
 

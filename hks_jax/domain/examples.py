@@ -128,15 +128,15 @@ def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metr
 def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, TensorField]:
     """Return fields of constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
 
-    All of them have the same trace, determinant and anisotropy everywhere; only the directions differ. The spirals and
-    circles turn about (−0.3, −0.3), outside of the square.
+    All of them have the same trace, determinant and anisotropy everywhere; only the directions differ. Circles and
+    spirals turn about (−0.3, −0.3), outside of the square; like the straight field they are flat, the others are not.
     """
 
     def polar(u: Point) -> Array:
         return jnp.arctan2(u[1] + 0.3, u[0] + 0.3)
 
     angles: dict[str, Callable[[Point], Array]] = {
-        "straight": lambda u: jnp.full_like(u[0], pi / 6),
+        "straight": lambda u: jnp.zeros_like(u[0]),
         "circles": lambda u: polar(u) + pi / 2,
         "spirals": lambda u: polar(u) + pi / 4,
         "waves": lambda u: jnp.arctan(jnp.cos(2 * pi * u[0])),

@@ -79,7 +79,14 @@ class ShiftInvert(Eigensolver):
         start = np.random.default_rng(0).standard_normal(n)
         try:
             values, vectors = eigsh(
-                K, k, M, -shift, OPinv=inverse, v0=start, ncv=min(n, self.basis or 2 * k + 20), maxiter=self.max_restarts
+                K,
+                k,
+                M,
+                -shift,
+                OPinv=inverse,
+                v0=start,
+                ncv=min(n, self.basis or 2 * k + 20),
+                maxiter=self.max_restarts,
             )
         except ArpackNoConvergence as stopped:
             values, vectors = stopped.eigenvalues, stopped.eigenvectors

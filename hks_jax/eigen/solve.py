@@ -3,6 +3,8 @@
 import math
 import warnings
 from collections.abc import Callable
+from functools import partial
+from typing import NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.shift_invert import ShiftInvert
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import MirrorPencil, Pencil
@@ -95,8 +97,24 @@ def _solve_part(pencil: Pencil, solver: Eigensolver, k: int, name: str) -> Eigen
             f"k: the {solver.name} solver gives at most {solver.max_pairs(n_dof)} of {n_dof} pairs, and {k} are needed "
             "(one beyond k, to see where the spectrum is cut). Use a smaller k or the dense solver"
         )
-    values, vectors = solver.lowest(pencil, k)
+    values, vectors = _lowest(solver, pencil, k)
     return _finish(pencil, values, vectors, solver.tolerance, name)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 2))
+def _lowest(solver: Eigensolver, pencil: Pencil, k: int) -> RawPairs:
+    return solver.lowest(pencil, k)
+
+
+@_lowest.defjvp
+def _lowest_jvp(solver: Eigensolver, k: int, primals: tuple, tangents: tuple) -> NoReturn:
+    # Differentiating eigenvectors one by one gives NaN where eigenvalues repeat, and an answer that is wrong by many
+    # per cent where only k of them are known. An error is better than either.
+    raise NotImplementedError(
+        "eigenpairs: derivatives with respect to the tensors, the vertices or the pencil are not implemented. Derivatives "
+        "with respect to times, and of what `assemble` returns, are: compute the eigenpairs outside of the function that "
+        "you differentiate, or stop the gradient at its tensors (jax.lax.stop_gradient)"
+    )
 
 
 def _finish_impl(

@@ -17,7 +17,7 @@ from hks_jax.fem.boundary import crop, reflect
 from hks_jax.paper.signature import enough_pairs, signature
 
 TIME = 0.01
-QUICK, FULL = 61, 201
+QUICK, FULL = 41, 201
 
 
 def flat(x: Float[Array, " 2"]) -> Float[Array, "2 2"]:
@@ -58,7 +58,7 @@ def _row(panels: np.ndarray, field: TensorField, name: str) -> None:
     }
     expansion = 4 * math.pi * TIME * np.asarray(hks_expansion(field, jnp.array([TIME])))[0]
     for ax, values in zip(panels, images.values(), strict=False):
-        plot.scalar_image(ax, values, grid, least_range=0.1)
+        plot.scalar_image(ax, values, grid, least_range=0.1, interpolation="bilinear")
         ax.set_xlabel("$u_1$")
     panels[0].set_ylabel(f"{name}\n$u_2$")
     _profiles(panels[3], grid, images, expansion)

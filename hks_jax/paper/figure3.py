@@ -8,7 +8,7 @@ from hks_jax.domain.examples import figure3_fields
 from hks_jax.paper.signature import enough_pairs, signature
 
 TIME = 1.0
-QUICK, FULL = 61, 201
+QUICK, FULL = 51, 201
 TITLES = (
     r"$T^1 = \mathrm{diag}(f(u_1), 1)$",
     r"$T^2 = \mathrm{diag}(f(u_2), 1)$",
@@ -27,7 +27,7 @@ def figure3(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         echo(f"figure3: {n}² nodes, {k} eigenpairs")
         (values,) = signature(field, [TIME], k, boundary="mirror", normalisation="flat")
         plot.ellipses(top, field, colorbar=top is tops[-1])
-        plot.scalar_image(bottom, values, field.grid, least_range=0.1)
+        plot.scalar_image(bottom, values, field.grid, least_range=0.1, interpolation="bilinear")
         top.set_title(title)
         bottom.set_xlabel("$u_1$")
     tops[0].set_ylabel("unit circles of the metric\n$u_2$")

@@ -9,7 +9,7 @@ from hks_jax.paper.signature import continued_signature
 
 TIME = 0.01
 STRIP = 0.28  # heat falls to exp(−STRIP²/t) = exp(−8); the circles' and spirals' centre is further out
-QUICK, FULL = 61, 201  # nodes per axis
+QUICK, FULL = 47, 201  # nodes per axis
 
 
 def figure4(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
@@ -23,7 +23,7 @@ def figure4(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         values = continued_signature(field, TIME, STRIP)
         plot.integral_lines(top, field, "minor", density=0.7, colors="tab:orange", linewidths=0.5)
         plot.integral_lines(top, field, "major", density=0.7, colors="black")
-        plot.scalar_image(bottom, values, field.grid, least_range=0.004)
+        plot.scalar_image(bottom, values, field.grid, least_range=0.004, interpolation="bilinear")
         plot.integral_lines(bottom, field, "major", density=0.7, colors="white", alpha=0.7)
         top.set_title(name)
         bottom.set_xlabel("$u_1$")

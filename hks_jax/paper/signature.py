@@ -56,5 +56,5 @@ def continued_signature(field: TensorField, time: float, distance: float) -> Flo
     origin = [o - width * h for o, h in zip(grid.origin, grid.spacing, strict=True)]
     assert field.function is not None
     wide = TensorField.from_function(field.function, Grid(shape, grid.spacing, origin))
-    (values,) = signature(wide, [time], enough_pairs(wide, time))
+    (values,) = signature(wide, [time], enough_pairs(wide, time, exponent=7.0))
     return values[tuple(slice(width, width + n) for n in grid.shape)]
