@@ -16,8 +16,8 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## Two fields with the same eigenvalues
 #
-# Both fields have eigenvalues 4 and 1 at every point: the same trace, determinant and anisotropy. In one the major direction
-# is constant, in the other it swings to and fro. The first is flat; the second is curved.
+# Both fields have eigenvalues 4 and 1 at every point: the same trace, determinant and anisotropy. In one the major
+# direction is constant, in the other it swings to and fro. The first is flat; the second is curved.
 
 # %%
 fields = hj.examples.figure4_fields(41)
@@ -33,9 +33,7 @@ print("curvature of 'cells': ", float(jnp.abs(hj.gaussian_curvature(cells)).max(
 # `"mirror"` reflects the domain on every side, so that a flat metric shows no boundary effect.
 
 # %%
-pairs = {
-    name: hj.eigenpairs(field, k, "mirror") for name, field, k in (("straight", straight, 301), ("cells", cells, 300))
-}
+pairs = {"straight": hj.eigenpairs(straight, 301, "mirror"), "cells": hj.eigenpairs(cells, 300, "mirror")}
 print(pairs["cells"].summary())
 
 # %% [markdown]
@@ -53,7 +51,7 @@ assert np.ptp(signatures["cells"][1]) > 10 * np.ptp(signatures["straight"][1])
 
 # %%
 figure = hj.plot.hks_panels(signatures["cells"], times, cells.grid)
-assert len(figure.axes) == 6  # three images with their colour bars
+assert [len(ax.images) for ax in figure.axes] == [1, 1, 1]
 
 # %% [markdown]
 # ## What to trust
@@ -65,12 +63,15 @@ print("bias of the grid:  ", report.resolution_bias)
 assert report.tail.max() < 0.01
 
 # %% [markdown]
-# ## Inside, the short-time expansion in curvature agrees
+# ## Small times see the curvature
+#
+# Inside, 4πt·HKS = 1 + K t/3 + … What the expansion leaves unexplained here is the grid's bias, 0.05·h²/t.
 
 # %%
-t = 0.03
+t = 0.01
 inner = (slice(12, -12), slice(12, -12))
-expansion = hj.hks_expansion(cells, [t])[0][inner]
-difference = jnp.abs(hj.hks(pairs["cells"], [t])[0][inner] / expansion - 1).max()
-print(f"HKS / expansion − 1 at t = {t}: {difference:.1e}")
-assert difference < 0.05
+values = hj.hks(pairs["cells"], [t], "flat")[0][inner]
+for order in range(4):
+    series = 4 * np.pi * t * hj.hks_expansion(cells, [t], order)[0][inner]
+    print(f"expansion to order {order}: largest difference {float(jnp.abs(values - series).max()):.4f}")
+assert jnp.abs(values - series).max() < 0.2 * jnp.abs(values - 1).max()

@@ -1,4 +1,4 @@
-"""The heat kernel of a torus of revolution to rounding error, by a Fourier method that shares nothing with the library."""
+"""The heat kernel of a torus of revolution to rounding error, by a Fourier method of its own."""
 
 import numpy as np
 from scipy.linalg import eigh

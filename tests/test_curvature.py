@@ -164,7 +164,7 @@ def test_slip_curvature_of_a_diagonal_metric_needs_a_plus():
         def root(x):
             return jnp.sqrt(E(x) * G(x))
 
-        E = G = lambda x: 4 / (1 + x @ x) ** 2  # noqa: E731
+        E = G = lambda x: 4 / (1 + x @ x) ** 2
         first = jax.grad(lambda x: jax.grad(G)(x)[0] / root(x))(x)[0]
         second = jax.grad(lambda x: jax.grad(E)(x)[1] / root(x))(x)[1]
         return -(first + sign * second) / (2 * root(x))
@@ -196,13 +196,13 @@ def test_bad_arguments():
     cube = hj.TensorField(hj.Grid((9, 9, 9)), np.broadcast_to(np.eye(3), (9, 9, 9, 3, 3)))
     flat = hj.TensorField(hj.Grid((9, 9)), np.broadcast_to(np.eye(2), (9, 9, 2, 2)))
     small = hj.TensorField(hj.Grid((5, 9)), np.broadcast_to(np.eye(2), (5, 9, 2, 2)))
-    with pytest.raises(ValueError, match="field: got a grid of shape .* two dimensions"):
+    with pytest.raises(ValueError, match=r"field: got a grid of shape .* two dimensions"):
         hj.gaussian_curvature(cube)
     with pytest.raises(ValueError, match="8"):
         hj.gaussian_curvature(small)
     with pytest.raises(ValueError, match="order: got 4; expected 0, 1, 2 or 3"):
         hj.hks_expansion(flat, [0.1], 4)
-    with pytest.raises(ValueError, match="times: got -0.1; expected positive finite"):
+    with pytest.raises(ValueError, match=r"times: got -0\.1; expected positive finite"):
         hj.hks_expansion(flat, [-0.1])
     with pytest.raises(ValueError, match="periodic"):
         hj.gaussian_curvature(flat, periodic=(True,) * 3)

@@ -31,8 +31,13 @@ for boundary, solver in CASES:
         others += [hj.biharmonic_distance(pairs, (4, 4)), hj.diffusion_distance(pairs, times, (4, 4))]
     assert all(x.dtype == jnp.float32 for x in others)
     assert all(np.isfinite(x[..., 1:-1, 1:-1] if x.ndim > 2 else x).all() for x in others)
-    out |= {{name + "values": pairs.eigenvalues, name + "converged": pairs.converged, name + "hks": hj.hks(pairs, TIMES),
-            name + "gram": pairs.vectors @ pairs.pencil.parts[0].mass.apply(pairs.vectors).T}}
+    mass = pairs.pencil.parts[0].mass
+    out |= {{
+        name + "values": pairs.eigenvalues,
+        name + "converged": pairs.converged,
+        name + "hks": hj.hks(pairs, TIMES),
+        name + "gram": pairs.vectors @ mass.apply(pairs.vectors).T,
+    }}
 np.savez(sys.argv[2], **out)
 """
 

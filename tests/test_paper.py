@@ -4,10 +4,8 @@ import csv
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 from hks_jax.paper import run, table1
-from hks_jax.paper.signature import enough_pairs, signature
 
 # DESIGN's own figures, to the digits it gives: an independent implementation of the same method.
 INDEPENDENT = {50: 0.0580, 100: 0.0223, 200: 0.0056, 400: 0.00085}

@@ -63,7 +63,7 @@ def eigenpairs(
             f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
             "Use a smaller k or a finer grid"
         )
-    choices = [_choose(solver, part, int(k)) for part in pencil.parts]
+    choices = [choose_solver(solver, part, int(k)) for part in pencil.parts]
     name = " + ".join(dict.fromkeys(choice.name for choice in choices))
     if isinstance(pencil, MirrorPencil):
         pairs = _united(pencil, choices, int(k), name)
@@ -75,7 +75,8 @@ def eigenpairs(
     return pairs
 
 
-def _choose(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
+def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
+    """Return the solver that a name stands for; ``"auto"`` chooses by the pencil's size and k."""
     if isinstance(solver, Eigensolver):
         return solver
     if solver == "auto":
@@ -111,9 +112,9 @@ def _lowest_jvp(solver: Eigensolver, k: int, primals: tuple, tangents: tuple) ->
     # Differentiating eigenvectors one by one gives NaN where eigenvalues repeat, and an answer that is wrong by many
     # per cent where only k of them are known. An error is better than either.
     raise NotImplementedError(
-        "eigenpairs: derivatives with respect to the tensors, the vertices or the pencil are not implemented. Derivatives "
-        "with respect to times, and of what `assemble` returns, are: compute the eigenpairs outside of the function that "
-        "you differentiate, or stop the gradient at its tensors (jax.lax.stop_gradient)"
+        "eigenpairs: derivatives with respect to the tensors, the vertices or the pencil are not implemented. "
+        "Derivatives with respect to times, and of what `assemble` returns, are: compute the eigenpairs outside of the "
+        "function that you differentiate, or stop the gradient at its tensors (jax.lax.stop_gradient)"
     )
 
 

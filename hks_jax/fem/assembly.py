@@ -127,7 +127,8 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
     total = jnp.stack([sums[offset] for offset in product((-1, 0, 1), repeat=d)])
     for axis, wraps in enumerate(periodic, start=1):
         if wraps:  # the last node is the first again
-            inner, last = jax.lax.slice_in_dim(total, 0, -1, axis=axis), jax.lax.slice_in_dim(total, -1, None, axis=axis)
+            inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
+            last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
     return total
 

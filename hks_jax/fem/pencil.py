@@ -36,7 +36,8 @@ class Pencil(eqx.Module):
 class MirrorPencil(eqx.Module):
     """The 2^m mixed Neumann/Dirichlet pencils of a domain reflected along m axes.
 
-    Their spectra united are the spectrum of the reflected domain. An eigenfunction of a part, divided by √2^m, is one of the reflected domain, restricted to the original.
+    Their spectra united are the spectrum of the reflected domain. An eigenfunction of a part, divided by √2^m, is
+    one of the reflected domain, restricted to the original.
     """
 
     parts: tuple[Pencil, ...]
