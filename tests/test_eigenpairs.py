@@ -36,8 +36,10 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("mass", ["consistent", "lumped"])
-@pytest.mark.parametrize(("boundary", "lengths"), CASES)
+@pytest.mark.parametrize(
+    ("boundary", "lengths", "mass"),
+    [(*case, "consistent") for case in CASES] + [(*CASES[0], "lumped"), (*CASES[6], "lumped")],
+)
 def test_second_order_convergence_to_the_exact_spectrum(boundary, lengths, mass):
     k, periodic = 6, tuple(c == "periodic" for c in boundary)
     sizes = (10, 20) if len(lengths) == 2 else (5, 9)
@@ -68,7 +70,7 @@ def test_hks_converges_at_second_order_to_theta_sums(boundary):
         return 2 * np.sum(decay * np.sin(np.pi * i * x / length) ** 2, axis=0) / length
 
     errors = []
-    for n in (12, 24):
+    for n in (10, 20):
         periodic = tuple(c == "periodic" for c in names)
         field = flat(tuple(n if w else n + 1 for w in periodic), lengths, periodic)
         pairs = hj.eigenpairs(field, hj.assemble(field, boundary).space.n_dof, boundary)

@@ -12,8 +12,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_field import MetricChoice, TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.shift_invert import ShiftInvert
-from hks_jax.eigen.solve import choose_solver as choose_solver
-from hks_jax.eigen.solve import eigenpairs
+from hks_jax.eigen.solve import choose_solver, eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
