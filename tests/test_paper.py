@@ -2,12 +2,18 @@
 
 import csv
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.image import imread
 
-from hks_jax.paper import run, table1
+from hks_jax import Grid, SurfaceMesh, TensorField, plot
+from hks_jax.domain.examples import bumpy_torus_mesh, figure4_fields
+from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, run, table1
+from hks_jax.paper.signature import continued_signature, enough_pairs, signature
 
-# DESIGN's own figures, to the digits it gives: an independent implementation of the same method.
+# What an independent implementation of the same method gives.
 INDEPENDENT = {50: 0.0580, 100: 0.0223, 200: 0.0056, 400: 0.00085}
 
 
@@ -59,14 +65,16 @@ def test_periodic_interpolation_is_bilinear():
     fine = table1.interpolate_periodic(values, 4)
     assert fine.shape == (24, 24)
     np.testing.assert_allclose(fine[::4, ::4], values)
-    np.testing.assert_allclose(fine[2, 1], 0.5 * (0.75 * (values[0, 0] + values[1, 0]) + 0.25 * (values[0, 1] + values[1, 1])))
+    middle = 0.375 * (values[0, 0] + values[1, 0]) + 0.125 * (values[0, 1] + values[1, 1])
+    np.testing.assert_allclose(fine[2, 1], middle)
     np.testing.assert_allclose(fine[-1, 0], 0.25 * values[-1, 0] + 0.75 * values[0, 0])
 
 
 def test_relative_difference():
     reference = np.array([[3.0, 4.0]])
     assert table1.relative_difference(reference * 1.5, reference, np.ones((1, 2))) == pytest.approx(0.5)
-    assert table1.relative_difference(reference + [[1, 0]], reference, np.array([[16.0, 1.0]])) == pytest.approx(0.5 / np.sqrt(2.5))
+    weighted = table1.relative_difference(np.array([[4.0, 4.0]]), reference, np.array([[16.0, 1.0]]))
+    assert weighted == pytest.approx(4 / np.sqrt(16 * 9 + 16))
 
 
 def test_table_files_state_their_conventions(tmp_path, monkeypatch):
@@ -95,3 +103,171 @@ def test_table_files_state_their_conventions(tmp_path, monkeypatch):
 def test_unknown_items_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"only: got 'figure7', 'table'; expected some of table1, figure1"):
         run(tmp_path, only=["figure7", "table1", "table"])
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that were saved, by file name."""
+    figures, save = {}, plot.save_figure
+
+    def capture(fig, path, **kwargs):
+        figures[path.name] = fig
+        return save(fig, path, **kwargs)
+
+    monkeypatch.setattr(plot, "save_figure", capture)
+    return figures
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    """Something smooth in place of every signature: layout does not depend on the values."""
+
+    def cheap_signature(domain, times, k, boundary="neumann", normalisation="raw"):
+        if isinstance(domain, SurfaceMesh):
+            values = 2 + np.sin(np.asarray(domain.vertices)).sum(axis=1)
+        else:
+            values = np.where(domain.grid.inside, 2 + np.sin(domain.grid.nodes).sum(axis=-1), np.nan)
+        return np.stack([values / t for t in times])
+
+    for module in (figure1, figure2, figure3, figure6):
+        monkeypatch.setattr(module, "signature", cheap_signature)
+    for module in (figure4, figure5):
+        monkeypatch.setattr(module, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
+    monkeypatch.setattr(figure2, "hks_expansion", lambda f, t: cheap_signature(f, t, 1))
+
+
+def draw(module, tmp_path, drawn, monkeypatch, **settings):
+    """Run one figure with small settings, and return it once its file and its layout are right."""
+    name = module.__name__.rsplit(".", 1)[-1]
+    for setting, value in settings.items():
+        monkeypatch.setattr(module, setting, value)
+    (path,) = run(tmp_path, only=[name], echo=lambda text: None)
+    pixels = imread(path)
+    assert path == tmp_path / f"{name}.png"
+    assert min(pixels.shape[:2]) > 600
+    assert pixels[..., :3].std() > 0.1
+    fig = drawn[path.name]
+    renderer = FigureCanvasAgg(fig).get_renderer()
+    boxes = [ax.get_tightbbox(renderer).padded(-1) for ax in fig.axes if ax.name != "3d"]
+    for i, box in enumerate(boxes):
+        assert box.x0 > -2
+        assert box.x1 < fig.bbox.x1 + 2
+        assert not any(box.overlaps(other) for other in boxes[i + 1 :])
+    for ax in fig.axes:
+        for image in ax.images:
+            assert np.ptp(np.asarray(image.get_clim())) > 0
+            assert image.get_array().count() > 0
+    return fig
+
+
+@pytest.mark.usefixtures("cheap")
+def test_figure_1_shows_a_surface_and_its_chart(tmp_path, drawn, monkeypatch):
+    fig = draw(figure1, tmp_path, drawn, monkeypatch, QUICK=(60, 10), DRAWN=20)
+    assert [ax.name for ax in fig.axes[:4]] == ["3d", "3d", "rectilinear", "rectilinear"]
+    surface = bumpy_torus_mesh(20)
+    for ax in fig.axes[:2]:
+        assert len(ax.collections[0].get_facecolor()) == len(surface.faces)
+    assert len(fig.axes[2].collections[0].get_offsets()) > 400
+    assert fig.axes[3].images[0].get_array().shape == (60, 60)
+
+
+@pytest.mark.usefixtures("cheap")
+def test_figure_2_has_three_boundaries_and_profiles_for_two_metrics(tmp_path, drawn, monkeypatch):
+    fig = draw(figure2, tmp_path, drawn, monkeypatch, QUICK=41)
+    assert [len(ax.images) for ax in fig.axes] == [1, 1, 1, 0] * 2
+    assert [line.get_label() for line in fig.axes[3].lines] == ["natural", "strip", "mirror", "expansion"]
+    # The reflected strip is cropped to the same nodes.
+    np.testing.assert_allclose(fig.axes[1].images[0].get_array(), fig.axes[0].images[0].get_array())
+
+
+@pytest.mark.usefixtures("cheap")
+def test_figure_3_has_ellipses_over_images(tmp_path, drawn, monkeypatch):
+    fig = draw(figure3, tmp_path, drawn, monkeypatch)
+    assert [len(ax.collections) for ax in fig.axes] == [1] * 4 + [0] * 4
+    assert [len(ax.images) for ax in fig.axes] == [0] * 4 + [1] * 4
+
+
+@pytest.mark.usefixtures("cheap")
+def test_figure_4_has_lines_over_every_field(tmp_path, drawn, monkeypatch):
+    fig = draw(figure4, tmp_path, drawn, monkeypatch, QUICK=31)
+    n = len(figure4_fields(5))
+    assert len(fig.axes) == 2 * n
+    for top, bottom in zip(fig.axes[:n], fig.axes[n:], strict=True):
+        assert [len(lines.get_segments()) > 5 for lines in top.collections] == [True, True]
+        assert len(bottom.collections[0].get_segments()) > 5
+
+
+@pytest.mark.usefixtures("cheap")
+def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
+    fig = draw(figure5, tmp_path, drawn, monkeypatch, QUICK=31)
+    titles = [ax.get_title() for ax in fig.axes]
+    assert titles == [f"index {i}" for i in ("−2", "−3/2", "−1", "−1/2", "1/2", "1", "3/2", "2", "5/2", "3")]
+    assert all(len(ax.collections[0].get_segments()) > 10 for ax in fig.axes)
+
+
+@pytest.mark.usefixtures("cheap")
+def test_figure_6_draws_a_phantom_where_there_is_no_brain(tmp_path, drawn, monkeypatch):
+    monkeypatch.setattr(figure6, "find_example_brain", lambda: None)
+    fig = draw(figure6, tmp_path, drawn, monkeypatch)
+    assert len(fig.axes) == 10
+    assert "phantom" in fig.get_suptitle()
+    for ax in fig.axes:
+        image = ax.images[0].get_array()
+        assert 0.3 < image.count() / image.size < 0.95  # nothing outside the mask
+
+
+def test_signature_and_enough_pairs():
+    """Enough pairs are enough, and a continued metric has no boundary: the flat square is flat up to its sides."""
+    metric = jnp.array([[2.0, 0.5], [0.5, 1.0]])
+    field = TensorField.from_function(lambda x: metric, Grid.from_bounds(0, 1, (21, 21)))
+    values = continued_signature(field, 0.02, 0.4)
+    assert values.shape == (21, 21)
+    np.testing.assert_allclose(4 * np.pi * 0.02 * values, 1.0, rtol=0.02)
+    (wide,) = signature(field, [0.02], enough_pairs(field, 0.02, exponent=12.0))
+    (same,) = signature(field, [0.02], enough_pairs(field, 0.02))
+    np.testing.assert_allclose(same, wide, rtol=5e-3)
+
+
+@pytest.mark.slow
+def test_figure_1_shows_the_same_hks_on_surface_and_chart(tmp_path, drawn, monkeypatch):
+    fig = draw(figure1, tmp_path, drawn, monkeypatch, QUICK=(100, 60), DRAWN=20, TIME=4.0)
+    on_chart = fig.axes[3].images[0].get_array()
+    (on_surface,) = signature(bumpy_torus_mesh(100), [4.0], 60)
+    np.testing.assert_allclose(on_chart.T, on_surface.reshape(100, 100), rtol=0.05)
+
+
+@pytest.mark.slow
+def test_figure_2_shows_the_boundary_and_its_removal(tmp_path, drawn, monkeypatch):
+    fig = draw(figure2, tmp_path, drawn, monkeypatch, QUICK=31)
+    natural, strip, mirror = (fig.axes[i].images[0].get_array() for i in range(3))
+    assert natural.max() == pytest.approx(4, rel=0.05)  # a corner
+    assert natural[0, 15] == pytest.approx(2, rel=0.05)  # a side
+    np.testing.assert_allclose(mirror, 1.0, rtol=0.02)
+    np.testing.assert_allclose(strip, mirror, rtol=0.01)
+    curved_strip, curved_mirror = (fig.axes[i].images[0].get_array() for i in (5, 6))
+    np.testing.assert_allclose(curved_strip, curved_mirror, rtol=0.01)
+    assert np.ptp(curved_mirror) > 0.05
+
+
+@pytest.mark.slow
+def test_figures_3_and_4_see_which_fields_are_flat(tmp_path, drawn, monkeypatch):
+    fig = draw(figure3, tmp_path, drawn, monkeypatch)
+    spread = [float(np.ptp(ax.images[0].get_array())) for ax in fig.axes[4:]]
+    assert spread[0] < 0.02
+    assert min(spread[1:]) > 0.1
+    fig = draw(figure4, tmp_path, drawn, monkeypatch)
+    spread = [float(np.ptp(ax.images[0].get_array())) for ax in fig.axes[5:]]
+    assert max(spread[:3]) < 0.1 * min(spread[3:])  # straight, circles and spirals; waves and cells
+
+
+@pytest.mark.slow
+def test_figure_5_has_the_symmetries_of_its_fields(tmp_path, drawn, monkeypatch):
+    fig = draw(figure5, tmp_path, drawn, monkeypatch, QUICK=31)
+    images = {ax.get_title(): ax.images[0].get_array().T for ax in fig.axes}
+    # The field of index i is the same after a turn by 2π/|2i − 2|; those of a quarter turn are nodes again.
+    for index in ("−1", "3"):
+        image = images[f"index {index}"]
+        np.testing.assert_allclose(np.rot90(image), image, rtol=1e-3)
+    # u₂ → −u₂ only reverses the sign of the angle.
+    for image in images.values():
+        np.testing.assert_allclose(image[:, ::-1], image, rtol=1e-3)

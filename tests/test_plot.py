@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -23,18 +22,13 @@ from hks_jax.plot import (
 )
 
 
-def rotating_field(index, n=81, centre=(0.0, 0.0), turn=0.0, mask=None):
-    """A degenerate point of the given index: eigenvalues 2 ± |x|, major direction index·θ + turn."""
+def rotating_field(index, n=81, centre=(0.0, 0.0), mask=None):
+    """A degenerate point of the given index: eigenvalues 2 ± |x|/3, major direction index·θ."""
     grid = Grid.from_bounds(-1, 1, (n, n), mask=mask)
-
-    def metric(x):
-        x = x - jnp.array(centre)
-        angle = 2 * (index * jnp.arctan2(x[1], x[0]) + turn)
-        c, s = jnp.cos(angle), jnp.sin(angle)
-        radius = jnp.sqrt(x @ x + 1e-30) / 3
-        return 2 * jnp.eye(2) + radius * jnp.array([[c, s], [s, -c]])
-
-    return TensorField.from_function(metric, grid)
+    x, y = np.moveaxis(grid.nodes - np.array(centre), -1, 0)
+    angle, size = 2 * index * np.arctan2(y, x), np.hypot(x, y) / 3
+    c, s = size * np.cos(angle), size * np.sin(angle)
+    return TensorField(grid, np.stack([np.stack([2 + c, s], -1), np.stack([s, 2 - c], -1)], -1))
 
 
 def disc(n=81, radius=0.8):
@@ -92,7 +86,7 @@ def test_a_constant_is_one_colour():
     assert np.ptp(image.norm(image.get_array())) < 1e-5
 
 
-@pytest.mark.parametrize("n", [1, 3, 4, 5, 6, 7, 9, 12])
+@pytest.mark.parametrize("n", [1, 4, 7, 12])
 def test_hks_panels_has_one_panel_and_bar_per_time(n, tmp_path):
     grid = Grid((12, 8))
     values = np.random.default_rng(0).random((n, 12, 8))
@@ -360,6 +354,8 @@ def test_hks_curves_errors():
         hks_curves(ax, np.zeros((2, 5, 4)), [1.0], grid, [[0, 0]])
     with pytest.raises(ValueError, match=r"points: \(9.0, 0.0\) lies outside"):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[9, 0]])
+    with pytest.raises(ValueError, match=r"expansion: got shape \(2, 5, 4\); expected that of values, \(1, 5, 4\)"):
+        hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[0, 0]], expansion=np.ones((2, 5, 4)))
     with pytest.raises(ValueError, match=r"points: got shape \(2,\)"):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [0, 0])
 

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.curvature import taylor
 from hks_jax.curvature.gaussian import brioschi, require_surface
 from hks_jax.curvature.jet import (
-    Jet,
     at_nodes,
     domain_nodes,
-    function_jet,
     inner,
     metric_function,
     metric_jet,
@@ -28,6 +27,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.signatures.times import checked_times
 
 Invariants: TypeAlias = tuple[Array, ...]
+Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
 
 
 def hks_expansion(
@@ -89,22 +89,47 @@ def _coefficients(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bil
 
 
 def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
-    """Return K, then as far as the order needs ∇²K, |∇K|² and ∇⁴K, as nested derivatives of the metric's function."""
+    """Return K, then as far as the order needs ∇²K, |∇K|² and ∇⁴K, from the Taylor series of the metric's function."""
     metric = metric_function(field)
 
-    def curvature(x: Array) -> Invariants:
-        return (brioschi(function_jet(metric, x)),)
-
-    def second(x: Array) -> Invariants:
-        g, K = function_jet(metric, x), _part(function_jet(curvature, x), 0)
-        return K.value, laplacian(g, K), inner(spd.inverse(g.value), K.gradient, K.gradient)
-
-    def third(x: Array) -> Invariants:
-        jets = function_jet(second, x)
-        return *jets.value, laplacian(function_jet(metric, x), _part(jets, 1))
+    def invariants(x: Array) -> Invariants:
+        g = taylor.expand(metric, x, degree=2 * max(order, 1))
+        return tuple(series[0] for series in _invariant_series(g[0, 0], g[0, 1], g[1, 1], order))
 
     inside = domain_nodes(field.grid, wraps)
-    return at_nodes((curvature, curvature, second, third)[order], field.grid, inside), inside
+    return at_nodes(invariants, field.grid, inside), inside
+
+
+def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, order: int) -> tuple[taylor.Series, ...]:
+    """Return what `brioschi` and `laplacian` say, of the metric ((E, F), (F, G)), in Taylor arithmetic."""
+    add, times, d = taylor.add, taylor.product, taylor.derivative
+    determinant = add(times(E, G), -times(F, F))
+    over = taylor.reciprocal(determinant)
+
+    def raised(p: Pair) -> Pair:  # by the adjugate: |g| times the vector
+        return add(times(G, p[0]), -times(F, p[1])), add(times(E, p[1]), -times(F, p[0]))
+
+    def inner(p: Pair, q: Pair) -> taylor.Series:
+        v = raised(p)
+        return times(over, add(times(v[0], q[0]), times(v[1], q[1])))
+
+    def gradient(f: taylor.Series) -> Pair:
+        return d(f, 0), d(f, 1)
+
+    def laplacian(f: taylor.Series) -> taylor.Series:
+        # (1/√|g|) ∂ₐ(vᵃ/√|g|), with the square roots differentiated away.
+        v, slope = raised(gradient(f)), gradient(determinant)
+        along = times(over, add(times(v[0], slope[0]), times(v[1], slope[1])))
+        return times(over, add(d(v[0], 0), d(v[1], 1), -along / 2))
+
+    (E1, E2), (F1, F2), (G1, G2) = map(gradient, (E, F, G))
+    linear = add(d(F1, 1), -d(E2, 1) / 2, -d(G1, 0) / 2)
+    mixed, pure = (E2 / 2, G1 / 2), ((E1 / 2, F1 - E2 / 2), (F2 - G1 / 2, G2 / 2))
+    K = times(over, add(linear, inner(mixed, mixed), -inner(*pure)))
+    if order < 2:
+        return (K,)
+    invariants = K, laplacian(K), inner(gradient(K), gradient(K))
+    return invariants if order < 3 else (*invariants, laplacian(invariants[1]))
 
 
 def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
@@ -118,8 +143,3 @@ def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Inv
         laplacian_K, known = nodal_jet(invariants[1], field.grid, known, wraps)
         invariants += (laplacian(g, laplacian_K),)
     return invariants, known
-
-
-def _part(jets: Jet, index: int) -> Jet:
-    """Return the jet of one component of a function with several."""
-    return Jet(*(part[index] for part in jets))

@@ -95,7 +95,6 @@ class StencilOperator(Operator):
         where, pattern = _stencil_pattern(self.space)
         return self.coefficients.reshape(-1)[where], pattern
 
-
     def diagonal(self) -> Float[Array, " n_dof"]:
         """Return the main diagonal."""
         return self.space.restrict(self.coefficients[self.coefficients.shape[0] // 2])

@@ -4,4 +4,4 @@ V. Zobel, J. Reininghaus, I. Hotz: “Visualization of Two-Dimensional Symmetric
 Heat Kernel Signature”, Topological Methods in Data Analysis and Visualization III, 2014.
 """
 
-from hks_jax.paper.run import run as run
+from hks_jax.paper.reproduce import run as run

@@ -23,10 +23,11 @@ def figure4(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         values = continued_signature(field, TIME, STRIP)
         plot.integral_lines(top, field, "minor", density=0.7, colors="tab:orange", linewidths=0.5)
         plot.integral_lines(top, field, "major", density=0.7, colors="black")
-        plot.scalar_image(bottom, values, field.grid, least_range=0.004, interpolation="bilinear")
+        plot.scalar_image(bottom, values, field.grid, least_range=0.1, interpolation="bilinear")
         plot.integral_lines(bottom, field, "major", density=0.7, colors="white", alpha=0.7)
         top.set_title(name)
         bottom.set_xlabel("$u_1$")
     tops[0].set_ylabel("major (black), minor lines\n$u_2$")
     bottoms[0].set_ylabel(f"HKS at $t$ = {TIME:g}\n$u_2$")
+    fig.suptitle("Constant eigenvalues, turning eigenvectors: the first three fields are flat, the others are not")
     return [plot.save_figure(fig, output / "figure4.png")]

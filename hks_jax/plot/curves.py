@@ -10,8 +10,10 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from hks_jax.domain.grid import Grid
+from hks_jax.plot.figure import number_text
 
 
 def hks_curves(
@@ -48,6 +50,9 @@ def hks_curves(
     curves = np.asarray(values, dtype=np.float64)
     if curves.shape != (t.size, *grid.shape):
         raise ValueError(f"values: got shape {curves.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}")
+    series = None if expansion is None else np.asarray(expansion, dtype=np.float64)
+    if series is not None and series.shape != curves.shape:
+        raise ValueError(f"expansion: got shape {series.shape}; expected that of values, {curves.shape}")
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)
     if labels is None:
         labels = ["(" + ", ".join(f"{c:.3g}" for c in grid.nodes[node]) + ")" for node in nodes]
@@ -58,21 +63,21 @@ def hks_curves(
         history: Any = (slice(None), *node)
         style = {"color": colour, "label": label, **kwargs}
         lines += ax.plot(t, factor * curves[history], **style)
-        if expansion is not None:
-            approximation = np.asarray(expansion, dtype=np.float64)[history]
-            ax.plot(t, factor * approximation, color=style["color"], linestyle="--", linewidth=1.0)
-    ax.set_xscale("log")
-    if not scaled:
-        ax.set_yscale("log")
-    elif expansion is not None:
-        # The series leaves the picture at large t: the curves, not it, choose the scale.
-        low, high = _span([np.asarray(line.get_ydata()) for line in lines])
-        ax.set_ylim(low, high)
+        if series is not None:
+            ax.plot(t, factor * series[history], color=style["color"], linestyle="--", linewidth=1.0)
+    # The series leaves the picture at large t: the curves, not it, choose the scale.
+    drawn = np.concatenate([np.asarray(line.get_ydata()) for line in lines])
+    _logarithmic(ax, "x", t)
+    if scaled:
+        margin = 0.08 * float(np.ptp(drawn)) or 0.1
+        ax.set_ylim(drawn.min() - margin, drawn.max() + margin)
+    else:
+        _logarithmic(ax, "y", drawn)
     ax.set_xlabel("$t$")
     power = {2: r"4\pi t\,", 3: r"(4\pi t)^{3/2}\,"}[grid.dimension] if scaled else ""
     ax.set_ylabel(rf"${power}\mathrm{{HKS}}(t)$")
     handles = list(lines)
-    if expansion is not None:
+    if series is not None:
         handles.append(Line2D([], [], color="0.3", linestyle="--", linewidth=1.0, label="expansion"))
     ax.legend(handles=handles, fontsize="small", frameon=False)
     ax.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
@@ -91,7 +96,15 @@ def _nearest_nodes(points: np.ndarray, grid: Grid) -> list[tuple[int, ...]]:
     return nodes
 
 
-def _span(curves: list[np.ndarray]) -> tuple[float, float]:
-    low, high = min(c.min() for c in curves), max(c.max() for c in curves)
-    margin = 0.08 * (high - low) or 0.1
-    return low - margin, high + margin
+def _logarithmic(ax: Axes, name: str, values: np.ndarray) -> None:
+    """Make an axis logarithmic over the positive values, with few labels and a small margin."""
+    positive = values[values > 0]
+    low, high = (float(positive.min()), float(positive.max())) if positive.size else (0.1, 1.0)
+    short = high < 50 * low
+    margin = max(high / low, 1.1) ** 0.04
+    ax.set(**{f"{name}scale": "log", f"{name}lim": (low / margin, high * margin)})
+    axis = ax.xaxis if name == "x" else ax.yaxis
+    if short:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: number_text(value)))
+    axis.set_minor_formatter(NullFormatter())
