@@ -117,6 +117,31 @@ def test_volume_counts_eliminated_nodes_and_lumping_keeps_it(rng):
     np.testing.assert_allclose(lumped.mass @ jnp.ones(45), hj.assemble(field).mass @ jnp.ones(45), atol=1e-15)
 
 
+def test_lumped_mass_is_the_integral_of_the_basis_function_also_beside_eliminated_nodes():
+    field = flat((6, 6), (1.0, 1.0))
+    np.testing.assert_allclose(hj.assemble(field, "dirichlet", "lumped").mass.diagonal(), 1 / 25, rtol=1e-13)
+    square = skfem.MeshTri().refined(3)
+    mesh = hj.SurfaceMesh(np.pad(square.p.T, [(0, 0), (0, 1)]), square.t.T)
+    lumped = hj.assemble(mesh, mass="lumped").mass.diagonal()
+    inner = ~mesh.triangulation.boundary_vertices
+    np.testing.assert_allclose(hj.assemble(mesh, "dirichlet", "lumped").mass.diagonal(), lumped[inner], rtol=1e-13)
+
+
+def test_dirichlet_that_nothing_feels_is_reported():
+    mask = np.zeros((8, 8), dtype=bool)
+    mask[2:6, 2:6] = True
+    field = hj.TensorField(hj.Grid((8, 8), mask=mask), np.broadcast_to(np.eye(2), (8, 8, 2, 2)))
+    with pytest.warns(hj.AccuracyWarning, match="which the mask does not reach"):
+        hj.assemble(field, "dirichlet")
+
+
+def test_a_batch_is_refused_with_the_remedy(rng):
+    grid = hj.Grid((4, 5))
+    fields = jax.vmap(lambda T: hj.TensorField(grid, T))(jnp.stack([jnp.asarray(random_spd(rng, (4, 5)))] * 2))
+    with pytest.raises(ValueError, match="domain: got a batch of tensor fields; expected one"):
+        hj.assemble(fields)
+
+
 def test_nodes_outside_the_mask_have_no_influence_and_no_gradient(rng):
     shape = (6, 7)
     mask = np.ones(shape, dtype=bool)
@@ -129,6 +154,7 @@ def test_nodes_outside_the_mask_have_no_influence_and_no_gradient(rng):
         return x @ (pencil.stiffness @ x) + x @ (pencil.mass @ x)
 
     poisoned = tensors.at[:3, :3].set(jnp.nan)
+    assert np.isnan(poisoned).any()
     assert energy(poisoned) == energy(tensors)
     gradient = jax.grad(energy)(poisoned)
     assert np.isfinite(gradient).all()
@@ -152,8 +178,10 @@ def test_assembly_batches_like_a_loop(rng):
     ("arguments", "message"),
     [
         ({"boundary": "robin"}, "boundary: got 'robin'; expected one of 'neumann', 'dirichlet', 'periodic', 'mirror'"),
-        ({"boundary": ("neumann",) * 3}, "boundary: got 3 entries"),
+        ({"boundary": ("neumann",) * 3}, r"boundary: got .* expected one name, or a tuple of 2"),
         ({"boundary": (("neumann", "periodic"), "neumann")}, "bind both sides"),
+        ({"boundary": None}, "boundary: got None; expected one name"),
+        ({"boundary": (("neumann",) * 3, "neumann")}, r"boundary: got .* for one axis; expected a name or a pair"),
         ({"mass": "full"}, 'mass: got \'full\'; expected "consistent" or "lumped"'),
     ],
 )

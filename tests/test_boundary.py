@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -5,7 +6,7 @@ from fields import flat, random_spd
 
 import hks_jax as hj
 
-TIMES = [0.2, 1.0, 5.0]
+TIMES = [0.5, 2.0, 5.0]
 
 
 def mirrored_torus(field: hj.TensorField) -> hj.TensorField:
@@ -30,12 +31,12 @@ def field_diagonal_on_the_sides(rng, shape) -> hj.TensorField:
     return hj.TensorField(hj.Grid(shape, 0.2), tensors)
 
 
-@pytest.mark.parametrize("shape", [(7, 9), (4, 5, 4)])
-def test_mirror_is_the_really_doubled_torus(rng, shape):
+@pytest.mark.parametrize(("shape", "mass"), [((7, 9), "consistent"), ((7, 9), "lumped"), ((4, 5, 4), "consistent")])
+def test_mirror_is_the_really_doubled_torus(rng, shape, mass):
     field = field_diagonal_on_the_sides(rng, shape)
     doubled = mirrored_torus(field)
-    mirror = hj.eigenpairs(field, doubled.grid.size, "mirror")
-    torus = hj.eigenpairs(doubled, doubled.grid.size, "periodic")
+    mirror = hj.eigenpairs(field, doubled.grid.size, "mirror", mass=mass)
+    torus = hj.eigenpairs(doubled, doubled.grid.size, "periodic", mass=mass)
     # λ_max is about 1e3; rounding in the solver is relative to it
     np.testing.assert_allclose(mirror.eigenvalues, torus.eigenvalues, atol=1e-10)
     original = (slice(None), *[slice(n) for n in shape])
@@ -55,6 +56,17 @@ def test_mirror_is_the_mean_of_the_mixed_problems(rng):
     total = 42 + 30 + 28 + 20
     mirror = hj.eigenpairs(field, total, "mirror")
     np.testing.assert_allclose(hj.hks(mirror, TIMES), np.mean(mixed, axis=0), rtol=1e-11)
+
+
+def test_a_mirror_part_too_small_for_lanczos_is_solved_densely():
+    field = flat((20, 4), (1.0, 0.2))
+
+    def signature(T):
+        pairs = hj.eigenpairs(hj.TensorField(field.grid, T), 37, "mirror", "shift-invert")
+        return hj.hks(pairs, jnp.array([0.05])), pairs.eigenvalues
+
+    eager = signature(field.tensors)
+    np.testing.assert_allclose(jax.jit(signature)(field.tensors)[1], eager[1], rtol=1e-9, atol=1e-9)
 
 
 def test_truncated_mirror_spectrum_misses_nothing(rng):

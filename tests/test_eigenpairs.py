@@ -171,8 +171,16 @@ def test_derivatives_are_refused_not_wrong(rng):
         assert slope[i] == pytest.approx(float(difference), rel=1e-6)
 
 
+def two_squares() -> hj.TensorField:
+    mask = np.ones((4, 9), dtype=bool)
+    mask[:, 4] = False
+    return hj.TensorField(hj.Grid((4, 9), mask=mask, components="all"), np.broadcast_to(np.eye(2), (4, 9, 2, 2)))
+
+
 def test_a_cut_multiplet_is_reported():
     field = flat((12, 12), (1.0, 1.0))  # λ₁ = λ₂ by symmetry
+    with pytest.warns(hj.AccuracyWarning, match="is arbitrary. Take a larger k$"):
+        hj.eigenpairs(two_squares(), 1)
     with pytest.warns(hj.AccuracyWarning, match="k = 2 cuts a multiple eigenvalue: its last 1 pair.*Take k = 1 or"):
         pairs = hj.eigenpairs(field, 2)
     assert pairs.cut_multiplet == 1
@@ -180,9 +188,21 @@ def test_a_cut_multiplet_is_reported():
     assert hj.eigenpairs(field, 144).next_eigenvalue == np.inf
 
 
+def test_all_copies_of_a_highly_multiple_eigenvalue_are_found():
+    """Nine separate equal squares: every eigenvalue at least nine-fold, which plain Lanczos misses."""
+    mask = np.zeros((18, 18), dtype=bool)
+    for i, j in np.ndindex(3, 3):
+        mask[6 * i : 6 * i + 5, 6 * j : 6 * j + 5] = True
+    grid = hj.Grid(mask.shape, mask=mask, components="all")
+    field = hj.TensorField(grid, np.broadcast_to(np.eye(2), (18, 18, 2, 2)))
+    dense, sparse = (hj.eigenpairs(field, 27, solver=name) for name in ("dense", "shift-invert"))
+    np.testing.assert_allclose(sparse.eigenvalues, dense.eigenvalues, atol=1e-10)
+    np.testing.assert_allclose(hj.hks(sparse, [4.0]), hj.hks(dense, [4.0]), rtol=1e-9)
+
+
 def test_unconverged_pairs_are_reported_not_hidden(rng):
     field = hj.TensorField(hj.Grid((20, 20)), random_spd(rng, (20, 20), 3.0))
-    with pytest.warns(hj.AccuracyWarning, match="of 30 eigenpairs did not converge .*allow more restarts"):
+    with pytest.warns(hj.AccuracyWarning, match="of 30 eigenpairs did not converge .*or allow more restarts"):
         pairs = hj.eigenpairs(field, 30, solver=hj.ShiftInvert(max_restarts=1, basis=32))
     assert not pairs.converged.all()
     assert np.isnan(pairs.eigenvalues).any()
@@ -214,7 +234,7 @@ def test_auto_chooses_by_size_and_says_so(rng):
     assert "5 of 5 converged" in text
 
 
-@pytest.mark.parametrize("k", [0, -1, 2.5, 31])
+@pytest.mark.parametrize("k", [0, -1, 2.5, 31, None, float("nan")])
 def test_k_out_of_range(k):
     with pytest.raises(ValueError, match=f"k: got {k}; expected an integer from 1 to 30, .*finer grid"):
         hj.eigenpairs(flat((5, 6), (1.0, 1.0)), k)

@@ -56,6 +56,16 @@ def test_degenerate_points_have_their_index(index):
     assert (turned[-1] - turned[0]) / (2 * np.pi) == pytest.approx(index)
 
 
+def test_curvature_at_a_degenerate_point_is_right_or_nan():
+    # T = 10 + 3((x, ±y), (±y, −x)) is linear, and Brioschi's formula leaves (Γ₁₂² − Γ₁₁Γ₂₂)/10/100, with
+    # Γ₁₂ = (0, −1.5), Γ₁₁ = (1.5, 0) and Γ₂₂ = (±3 + 1.5, 0).
+    for index, expected in ((0.5, (2.25 - 6.75) / 1000), (-0.5, (2.25 + 2.25) / 1000)):
+        curvature = hj.gaussian_curvature(examples.degenerate_point_field(index, 3))[1, 1]
+        assert curvature == pytest.approx(expected)
+    curvature = hj.gaussian_curvature(examples.degenerate_point_field(1.5, 3))
+    assert np.argwhere(np.isnan(curvature)).tolist() == [[1, 1]]
+
+
 @pytest.mark.parametrize("index", [0, 0.3])
 def test_impossible_indices_are_refused(index):
     with pytest.raises(ValueError, match=f"index: got {index}; expected a non-zero multiple of 1/2"):

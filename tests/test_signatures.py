@@ -91,11 +91,13 @@ def test_distances_are_metrics_with_their_definitions(pairs):
     gaps = phi[:, :, None] - phi[:, None, :]
     diffusion = hj.diffusion_distance(pairs, [0.3], nodes)[0][:, inside]
     expected = np.sqrt(np.einsum("i,ixy->xy", np.exp(-0.6 * pairs.eigenvalues), gaps**2))
-    # √ of a rounding error of 1e-15
-    np.testing.assert_allclose(diffusion, expected, atol=3e-7)
+    np.testing.assert_allclose(diffusion, expected, rtol=1e-12, atol=1e-14)
+    late = hj.diffusion_distance(pairs, [20.0], nodes[0])[0, 0][inside]
+    first = np.exp(-20.0 * pairs.eigenvalues[1]) * np.abs(phi[1] - phi[1][0])
+    np.testing.assert_allclose(late, first, rtol=1e-6, atol=1e-6 * first.max())
     biharmonic = hj.biharmonic_distance(pairs, nodes)[:, inside]
     expected = np.sqrt(np.einsum("i,ixy->xy", np.asarray(pairs.eigenvalues)[1:] ** -2.0, gaps[1:] ** 2))
-    np.testing.assert_allclose(biharmonic, expected, atol=3e-7)
+    np.testing.assert_allclose(biharmonic, expected, rtol=1e-12, atol=1e-14)
     embedding = hj.global_point_signature(pairs)[:, inside]
     np.testing.assert_allclose(embedding * np.sqrt(pairs.eigenvalues[1:, None]), phi[1:], rtol=1e-12)
     # The root at distance zero has a derivative, and it is zero.
@@ -117,6 +119,13 @@ def test_tail_estimate_is_of_the_right_size():
         true_tail = 1 - hj.heat_trace(few, [t])[0] / hj.heat_trace(many, [t])[0]
         assert 0.5 < hj.truncation(few, [t]).tail[0] / true_tail < 2
     assert hj.truncation(hj.eigenpairs(flat((5, 5), (1, 1)), 25), [1e-3]).tail[0] == 0
+    # A strip, whose sides Weyl's area term does not see, and a single pair.
+    strip = flat((120, 3), (60.0, 0.02))
+    few, many = hj.eigenpairs(strip, 30), hj.eigenpairs(strip, 119)
+    true_tail = 1 - np.exp(-few.eigenvalues).sum() / np.exp(-many.eigenvalues).sum()
+    assert 0.3 < hj.truncation(few, [1.0]).tail[0] / true_tail < 3
+    alone = hj.truncation(hj.eigenpairs(flat((9, 10), (1.0, 1.0)), 1), [1.0])
+    assert not alone.messages()
 
 
 def test_resolution_bias_bounds_the_discretisation_error():
@@ -175,7 +184,18 @@ def test_other_bad_arguments(pairs):
     with pytest.raises(ValueError, match="energies, sigma: give both or neither"):
         hj.wks(pairs, [1.0])
     with pytest.raises(ValueError, match="sigma: got 0"):
-        hj.wks(pairs, [1.0], 0)
+        hj.wks(pairs, [1.0], np.float32(0))
+    with pytest.raises(ValueError, match=r"energies: got .*nan"):
+        hj.wks(pairs, [np.nan], 1.0)
+    with pytest.raises(ValueError, match="expected two or more"):
+        hj.wks(hj.eigenpairs(flat((5, 6), (1.0, 1.2)), 2))
+    with pytest.raises(ValueError, match="times: got 'soon'"):
+        hj.hks(pairs, "soon")
+    squares = np.ones((4, 9), dtype=bool)
+    squares[:, 4] = False
+    apart = hj.TensorField(hj.Grid((4, 9), mask=squares, components="all"), np.broadcast_to(np.eye(2), (4, 9, 2, 2)))
+    with pytest.raises(ValueError, match=r"pairs: the domain has 2 components.* infinite"):
+        hj.biharmonic_distance(hj.eigenpairs(apart, 32), (0, 0))
     with pytest.raises(ValueError, match="n_frequencies: got 200; 256 times have 1 … 129"):
         hj.scale_invariant_hks(pairs, 200)
     with pytest.raises(ValueError, match="n: got 0"):
@@ -183,6 +203,17 @@ def test_other_bad_arguments(pairs):
     alone = hj.eigenpairs(flat((5, 6), (1.0, 1.2)), 1)
     with pytest.raises(ValueError, match="all k = 1 eigenvalues are zero"):
         hj.default_times(alone)
+
+
+def test_batches_and_other_objects_are_refused(field, pairs):
+    batch = jax.vmap(lambda T: hj.eigenpairs(hj.TensorField(field.grid, T), 5))(jnp.stack([field.tensors] * 3))
+    for function in (hj.hks, hj.heat_trace, hj.truncation):
+        with pytest.raises(ValueError, match=r"pairs: got a batch, eigenvalues of shape \(3, 5\).*jax.vmap"):
+            function(batch, [1.0, 2.0, 3.0])
+        with pytest.raises(TypeError, match="pairs: got TensorField; expected what `eigenpairs` returns"):
+            function(field, [1.0])
+    each = jax.vmap(lambda p: hj.heat_trace(p, jnp.array([1.0, 2.0])))(batch)
+    np.testing.assert_allclose(each[0], hj.heat_trace(hj.eigenpairs(field, 5), [1.0, 2.0]), rtol=1e-10)
 
 
 def test_everything_runs_under_jit(field):

@@ -100,5 +100,24 @@ def test_wrong_shapes_and_types_are_named(rng):
         hj.TensorField.from_diffusion(hj.Grid((4, 5)), np.zeros((4, 5, 2, 2)), metric="inverse")
 
 
+def test_functions_are_checked_as_arrays_are():
+    grid = hj.Grid((4, 5))
+    with pytest.raises(ValueError, match=r"fn: got shape \(4, 5\); expected"):
+        hj.TensorField.from_function(lambda x: x[0], grid)
+    with pytest.raises(ValueError, match="fn: 20 of 20 tensors are unsymmetric"):
+        hj.TensorField.from_function(lambda x: jnp.array([[2.0, 1.0], [0.0, 2.0]]), grid)
+
+
+def test_a_function_singular_outside_the_mask_spoils_no_gradient():
+    grid = hj.Grid.from_bounds(-1, 1, (9, 9))
+    grid = hj.Grid(grid.shape, grid.spacing, grid.origin, mask=np.linalg.norm(grid.nodes, axis=-1) < 0.9)
+
+    def volume(scale):
+        disk = jax.tree_util.Partial(lambda a, x: a / jnp.sqrt(1 - x @ x) * jnp.eye(2), scale)
+        return hj.assemble(hj.TensorField.from_function(disk, grid)).volume
+
+    assert jax.grad(volume)(1.0) == pytest.approx(float(volume(1.0)))
+
+
 def test_integer_tensors_become_floating(rng):
     assert hj.TensorField(hj.Grid((2, 2)), np.broadcast_to(np.eye(2, dtype=int), (2, 2, 2, 2))).tensors.dtype == float

@@ -41,9 +41,11 @@ def hks_expansion(
     with the Gaussian curvature K and ∇² = div grad (Polterovich 2000; McKean and Singer 1967 to u₂). It knows of no
     boundary: it holds at distances well beyond 3√t from it.
 
-    Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order, whose
-    rounding errors grow with the sixth derivative that u₃ contains: relative to the result, about 30·ε·(t/h²)³ at nodes
-    spaced h in length, with the floating-point ε. In float32 keep t below some 10 h², or the order below 3.
+    Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order, h the spacing
+    of the nodes in length: beside the sides of a grid and the rim of a mask, where they are one-sided, u₂ is of fourth
+    order and u₃ of second. Their rounding errors grow with the sixth derivative in u₃: relative to the result, some
+    ε(t/h²)³/5 with the floating-point ε, and some hundred times more within eight nodes of a side or rim. In float32
+    keep t below some 30 h², or the order below 3.
 
     Args:
         field: the metric, d = 2.

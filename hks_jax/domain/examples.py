@@ -151,20 +151,23 @@ def degenerate_point_field(index: float, n: int) -> TensorField:
 
     The eigenvalues are 10 ± 3|u|, and the major eigenvector is at ``index`` (a multiple of ½) times the polar angle θ:
     T = 10·I + 3|u| [[c, s], [s, −c]], c = cos(2·index·θ), s = sin(2·index·θ). With m = |2·index| and z = u₁ ± iu₂, the
-    sign that of the index, |u| (c + is) = zᵐ |z|^(1−m), which needs no angle.
+    sign that of the index, |u| (c + is) = |u| (z/|z|)ᵐ, which needs no angle. At the centre this is smooth for the
+    indices ±½, where it is z. The others have no derivative there, and so NaN for their curvature at that node.
     """
     m = round(abs(2 * index))
     if m == 0 or abs(m - abs(2 * index)) > 1e-12:
         raise ValueError(f"index: got {index}; expected a non-zero multiple of 1/2")
 
     def metric(u: Point) -> Float[Array, "2 2"]:
-        squared = u @ u
-        safe = jnp.where(squared > 0, squared, 1)  # the field is continuous at the centre, not differentiable
         x, y = u[0], u[1] if index > 0 else -u[1]
+        length = jnp.ones_like(x)
+        if m > 1:
+            squared = u @ u
+            length, safe = jnp.sqrt(squared), jnp.sqrt(jnp.where(squared > 0, squared, 1))
+            x, y = x / safe, y / safe
         c, s = x, y
         for _ in range(m - 1):
             c, s = x * c - y * s, x * s + y * c
-        scale = 3 * jnp.where(squared > 0, safe ** ((1 - m) / 2), 0)
-        return 10 * jnp.eye(2) + scale * jnp.stack([jnp.stack([c, s]), jnp.stack([s, -c])])
+        return 10 * jnp.eye(2) + 3 * length * jnp.stack([jnp.stack([c, s]), jnp.stack([s, -c])])
 
     return TensorField.from_function(metric, Grid.from_bounds(-1, 1, (n, n)))

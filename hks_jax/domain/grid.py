@@ -1,6 +1,7 @@
 """A regular grid in 2D or 3D, with an optional mask."""
 
 import math
+import operator
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Literal
@@ -44,7 +45,7 @@ class Grid:
         mask: Any = None,
         components: Literal["raise", "largest", "all"] = "raise",
     ) -> None:
-        self.shape = tuple(int(n) for n in shape)
+        self.shape = _checked_shape(shape)
         if len(self.shape) not in (2, 3) or min(self.shape) < 2:
             raise ValueError(f"shape: got {tuple(shape)}; expected 2 or 3 axes with at least 2 nodes each")
         self.spacing = _per_axis("spacing", spacing, self.dimension)
@@ -64,6 +65,7 @@ class Grid:
         **kwargs: Any,
     ) -> "Grid":
         """Return the grid whose first node is at `lower` and whose last node is at `upper`."""
+        shape = _checked_shape(shape)
         low, high = _per_axis("lower", lower, len(shape)), _per_axis("upper", upper, len(shape))
         if any(b <= a for a, b in zip(low, high, strict=True)):
             raise ValueError(f"upper: got {high}; expected more than lower = {low} on every axis")
@@ -120,8 +122,18 @@ class Grid:
         return f"Grid(shape={self.shape}, spacing={self.spacing}, origin={self.origin}{masked})"
 
 
+def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
+    try:
+        return tuple(operator.index(n) for n in shape)
+    except TypeError:
+        raise ValueError(f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, nodes per axis") from None
+
+
 def _per_axis(name: str, value: float | Sequence[float], dimension: int) -> tuple[float, ...]:
-    values = np.asarray(value, dtype=np.float64)
+    try:
+        values = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: got {value!r}; expected {dimension} numbers, one per axis of shape") from None
     if values.ndim == 0:
         values = np.full(dimension, values)
     if values.shape != (dimension,) or not np.isfinite(values).all():

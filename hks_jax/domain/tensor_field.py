@@ -49,12 +49,12 @@ class TensorField(eqx.Module):
         The function stays with the field, so that curvature and its derivatives are exact. Parameters that should
         be traced belong in a `jax.tree_util.Partial` or an Equinox module.
         """
-        is_pytree = isinstance(fn, jtu.Partial | eqx.Module)
+        function: Any = fn if isinstance(fn, jtu.Partial | eqx.Module) else jtu.Partial(fn)
         field = cls.__new__(cls)
         object.__setattr__(field, "grid", grid)
-        object.__setattr__(field, "function", fn if is_pytree else jtu.Partial(fn))
+        object.__setattr__(field, "function", function)
         object.__setattr__(field, "_tensors", None)
-        _checked_tensors("fn", grid, field.tensors)
+        _checked_tensors("fn", grid, _evaluate(function, grid))
         return field
 
     @classmethod
@@ -71,7 +71,7 @@ class TensorField(eqx.Module):
         """
         if metric not in ("tensor", "inverse", "adjugate"):
             raise ValueError(
-                f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, Brownian motion with diffusivity D), '
+                f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, the distances of diffusion), '
                 '"tensor" (g = D, as in the paper) or "adjugate" (g = |D| D⁻¹). There is no default: choose one'
             )
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
@@ -83,18 +83,24 @@ class TensorField(eqx.Module):
     @property
     def tensors(self) -> Float[Array, "*shape d d"]:
         """The tensors at the nodes, symmetric."""
-        function = self.function
-        if function is None:
+        if self.function is None:
             assert self._tensors is not None
             return self._tensors
-        nodes = jnp.asarray(self.grid.nodes).reshape(-1, self.grid.dimension)
-        flat = jax.vmap(lambda x: jnp.asarray(function(x), dtype=nodes.dtype))(nodes)
-        return spd.symmetrise(flat.reshape(*self.grid.shape, *flat.shape[1:]))
+        return spd.symmetrise(_evaluate(self.function, self.grid))
 
     @property
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
         """The tensors, with the identity outside the mask: what computations read."""
         return _identity_outside(self.grid, self.tensors)
+
+
+def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
+    # Outside the mask the function may be singular, and 0·NaN would reach its parameters' derivatives: there it is
+    # evaluated at a node inside instead.
+    inside = grid.inside
+    nodes = jnp.asarray(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]))
+    flat = jax.vmap(lambda x: jnp.asarray(function(x), dtype=nodes.dtype))(nodes.reshape(-1, grid.dimension))
+    return flat.reshape(*grid.shape, *flat.shape[1:])
 
 
 def _identity_outside(grid: Grid, tensors: Float[Array, "*shape d d"]) -> Float[Array, "*shape d d"]:

@@ -67,17 +67,19 @@ class Eigenpairs(eqx.Module):
         if bad.any():
             missing = int(np.isnan(np.asarray(self.eigenvalues)).sum())
             worst = np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
+            remedy = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
             found.append(
                 f"{int(bad.sum())} of {self.k} eigenpairs did not converge ({missing} of them not found, worst "
                 f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
-                "Ask for fewer pairs, allow more restarts, or use float64"
+                f"Use float64, fewer pairs, or {remedy}"
             )
         cut = int(self.cut_multiplet)
         if cut:
+            remedy = f"Take k = {self.k - cut} or a larger one" if cut < self.k else "Take a larger k"
             found.append(
                 f"k = {self.k} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = "
                 f"{float(self.eigenvalues[-1]):.6g}, have equals beyond k, and which of them are here is arbitrary. "
-                f"Take k = {self.k - cut}" + " or a larger one"
+                f"{remedy}"
             )
         return found
 

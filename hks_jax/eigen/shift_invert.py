@@ -7,19 +7,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh, splu
+from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, SuperLU, eigsh, splu
 
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.operators import Pattern
 from hks_jax.fem.pencil import Pencil
 
+_ROUNDS = 20
+"""How often to look for missed copies of a multiple eigenvalue; each round finds at least one."""
+
 
 class ShiftInvert(Eigensolver):
     """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M, factorised by SuperLU; float64 on the host.
 
-    Under `jit` and `vmap` it runs through a host callback, one problem at a time; called plainly it can be
-    interrupted, and reports progress.
+    That no eigenvalue below the last was missed is checked by the inertia of a second factorisation. Under `jit` and
+    `vmap` it runs through a host callback, one problem at a time; called plainly it can be interrupted, and reports
+    progress.
 
     Attributes:
         tolerance: relative residual that counts as converged; ARPACK itself runs to machine precision.
@@ -38,17 +42,28 @@ class ShiftInvert(Eigensolver):
         """Return n_dof − 1: a Lanczos basis must be larger than what is wanted."""
         return n_dof - 1
 
+    def __check_init__(self) -> None:
+        """Check the settings."""
+        if self.max_restarts < 1 or (self.basis is not None and self.basis < 2):
+            raise ValueError(
+                f"max_restarts, basis: got {self.max_restarts}, {self.basis}; expected at least 1, at least 2 or None"
+            )
+
     def lowest(self, pencil: Pencil, k: int) -> RawPairs:
         """Return the k lowest eigenpairs."""
         stiffness, mass, volume = pencil.stiffness, pencil.mass, pencil.volume
         n, dtype, dimension = pencil.space.n_dof, stiffness.dtype, pencil.space.dimension
         data_k, pattern_k = stiffness.triplets()
         data_m, pattern_m = mass.triplets()
+        natural = bool((pencil.space.free == pencil.space.domain).all())
 
         def solve(data_k: np.ndarray, data_m: np.ndarray, volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # The shift keeps K + sM positive definite; Weyl's λ₁ is the scale on which it is small.
             shift = 0.1 * (2 * np.pi) ** 2 / float(volume) ** (2 / dimension)
-            values, vectors = self._lanczos(_csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n), k, shift)
+            K, M = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n)
+            if natural:  # the rows add up to zero; what float32 entries leave would act as a potential
+                K = K - diags(np.asarray(K.sum(axis=1)).ravel())
+            values, vectors = self._lanczos(K, M, k, shift)
             return values.astype(dtype), vectors.astype(dtype)
 
         inputs = (data_k, data_m, volume)
@@ -64,44 +79,60 @@ class ShiftInvert(Eigensolver):
         if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
             return nothing
         self._report("factorising")
-        # A symmetric positive definite matrix needs no pivoting, and fills in least under a symmetric ordering.
-        factor = splu(K + shift * M, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        solves = 0
+        factor = _factorise(K + shift * M)
+        values, vectors = np.empty(0), np.empty((n, 0))
+        solves, wanted = 0, k
 
         def apply_inverse(x: np.ndarray) -> np.ndarray:
             nonlocal solves
             solves += 1
             if solves % 50 == 0:
                 self._report(f"{solves} solves")
-            return factor.solve(x)
+            y = factor.solve(x)
+            return y - vectors @ (vectors.T @ (M @ y))
 
         inverse = LinearOperator(K.shape, matvec=apply_inverse, dtype=np.float64)
-        start = np.random.default_rng(0).standard_normal(n)
-        try:
-            values, vectors = eigsh(
-                K,
-                k,
-                M,
-                -shift,
-                OPinv=inverse,
-                v0=start,
-                ncv=min(n, self.basis or 2 * k + 20),
-                maxiter=self.max_restarts,
-            )
-        except ArpackNoConvergence as stopped:
-            values, vectors = stopped.eigenvalues, stopped.eigenvectors
-        except ArpackError:
-            return nothing
-        order = np.argsort(values)
-        missing = k - values.size
-        return (
-            np.pad(values[order], (0, missing), constant_values=np.nan),
-            np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
-        )
+        for seed in range(_ROUNDS):
+            start = np.random.default_rng(seed).standard_normal(n)
+            basis = min(n, max(wanted + 1, self.basis or 2 * wanted + 20))
+            try:
+                more, found = eigsh(K, wanted, M, -shift, OPinv=inverse, v0=start, ncv=basis, maxiter=self.max_restarts)
+            except ArpackNoConvergence as stopped:
+                return _padded(stopped.eigenvalues, stopped.eigenvectors, k) if seed == 0 else nothing
+            except ArpackError:
+                return nothing
+            order = np.argsort(np.concatenate([values, more]))[:k]
+            values = np.concatenate([values, more])[order]
+            vectors = np.concatenate([vectors, found], axis=1)[:, order]
+            # Lanczos with single vectors can miss copies of a multiple eigenvalue. By Sylvester's law of inertia the
+            # negative pivots of K − σM count the eigenvalues below σ: look again, past what is found, for the missing.
+            below = values[-1] - 1e-6 * max(values[-1], shift)
+            if below <= 0:  # nothing but constants
+                return _padded(values, vectors, k)
+            missing = int((_factorise(K - below * M).U.diagonal() < 0).sum()) - int((values < below).sum())
+            if missing <= 0:
+                return _padded(values, vectors, k)
+            self._report(f"{missing} missed: looking again")
+            wanted = min(missing + 2, n - 1)
+        return nothing
 
     def _report(self, text: str) -> None:
         if self.progress is not None:
             self.progress(text)
+
+
+def _factorise(matrix: csc_matrix) -> SuperLU:
+    """Factorise a symmetric matrix without pivoting, under a symmetric ordering, which fills in least."""
+    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _padded(values: np.ndarray, vectors: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return eigenvalues ascending and eigenvectors as rows, NaN where there are fewer than k."""
+    order, missing = np.argsort(values), k - values.size
+    return (
+        np.pad(values[order], (0, missing), constant_values=np.nan),
+        np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
+    )
 
 
 def _csc(data: np.ndarray, pattern: Pattern, n: int) -> csc_matrix:

@@ -1,5 +1,6 @@
 """From a tensor field or a surface to its stiffness and mass: one element's integrals, mapped over all elements."""
 
+import warnings
 from functools import lru_cache, partial
 from itertools import product
 from typing import Literal
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.accuracy import AccuracyWarning
 from hks_jax.domain.static_array import StaticArray
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -43,6 +45,9 @@ def assemble(
 
     Raises:
         ValueError: an unknown boundary or mass, a domain without elements or free nodes.
+
+    Warns:
+        AccuracyWarning: a Dirichlet condition that no node of the domain feels.
     """
     if mass not in ("consistent", "lumped"):
         raise ValueError(f'mass: got {mass!r}; expected "consistent" or "lumped"')
@@ -52,21 +57,34 @@ def assemble(
         return _assemble_mesh(domain, mesh_space(domain.triangulation, boundary), mass)
     if not isinstance(domain, TensorField):
         raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField or a SurfaceMesh")
-    problems = mirror_problems(normalise_boundary(boundary, domain.grid.dimension))
-    pencils = [_assemble_grid(domain, grid_space(domain.grid, sides), mass) for sides in problems]
+    if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
+        raise ValueError("domain: got a batch of tensor fields; expected one. Map over the batch with jax.vmap")
+    sides = normalise_boundary(boundary, domain.grid.dimension)
+    problems = mirror_problems(sides)
+    pencils = [_assemble_grid(domain, grid_space(domain.grid, problem), mass) for problem in problems]
+    space = pencils[0].space
+    if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
+        warnings.warn(
+            f'boundary: got {boundary!r}, but "dirichlet" acts on the sides of the grid, which the mask does not '
+            "reach. The mask's own rim is natural",
+            AccuracyWarning,
+            stacklevel=2,
+        )
     return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))
 
 
 def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Pencil:
     # The masks go in as arrays, so that problems that differ only in them share one compilation.
-    stiffness, consistent, width, volume = _grid_integrals(
-        field.domain_tensors, space.elements, _free_couplings(space), space.periodic, space.grid.spacing
+    tensors = field.domain_tensors
+    tensors = jnp.where(space.domain[..., None, None], tensors, jnp.eye(space.dimension, dtype=tensors.dtype))
+    stiffness, consistent, lumped, width = _grid_integrals(
+        tensors, space.elements, _free_couplings(space), space.periodic, space.grid.spacing
     )
     return _pencil(
         StencilOperator(coefficients=stiffness, space=space),
         StencilOperator(coefficients=consistent, space=space),
-        space.restrict(width),
-        volume,
+        lumped,
+        width,
         mass,
     )
 
@@ -79,7 +97,7 @@ def _grid_integrals(
     periodic: tuple[bool, ...],
     spacing: tuple[float, ...],
 ) -> tuple[Array, Array, Array, Array]:
-    """Return stiffness and mass as stencils, the nodes' mesh width, and the volume."""
+    """Return stiffness and mass as stencils, ∫ √|T| hᵢ of all nodes, and the nodes' mesh width."""
     element = tensor_product_element(spacing)
 
     def integrals(corner_tensors: Float[Array, "n d d"]) -> tuple[Array, Array]:
@@ -87,21 +105,22 @@ def _grid_integrals(
 
     def stencil(matrices: Float[Array, "E n n"]) -> Float[Array, "offsets *shape"]:
         kept = jnp.where(elements[..., None, None], matrices.reshape(*elements.shape, *matrices.shape[1:]), 0)
-        return jnp.where(couplings, _stencil(kept, periodic), 0)
+        return _stencil(kept, periodic)
 
     stiffness, mass = jax.vmap(integrals)(_corner_tensors(tensors, periodic))
     squared = jnp.asarray(np.square(spacing), tensors.dtype)
     width = jnp.sqrt(jnp.max(jnp.diagonal(tensors, axis1=-2, axis2=-1) * squared, axis=-1))
-    volume = jnp.sum(mass, where=elements.reshape(-1, 1, 1))
-    return stencil(stiffness), stencil(mass), width, volume
+    stiffness, mass = stencil(stiffness), stencil(mass)
+    # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
+    lumped = jnp.sum(mass, axis=0)
+    return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, width
 
 
-def _pencil(stiffness: Operator, consistent: Operator, width: Array, volume: Array, mass: MassKind) -> Pencil:
-    if mass == "consistent":
-        return Pencil(stiffness, consistent, width, volume)
-    data, (rows, _) = consistent.triplets()
-    lumped = DiagonalOperator(entries=jax.ops.segment_sum(data, rows, width.size), space=stiffness.space)
-    return Pencil(stiffness, lumped, width, volume)
+def _pencil(stiffness: Operator, consistent: Operator, lumped: Array, width: Array, mass: MassKind) -> Pencil:
+    """Choose the mass; ``lumped`` and ``width`` are nodal."""
+    space, volume = stiffness.space, jnp.sum(lumped)
+    chosen = consistent if mass == "consistent" else DiagonalOperator(entries=space.restrict(lumped), space=space)
+    return Pencil(stiffness, chosen, space.restrict(width), volume)
 
 
 def _corner_tensors(tensors: Float[Array, "*shape d d"], periodic: tuple[bool, ...]) -> Float[Array, "E n d d"]:
@@ -168,7 +187,8 @@ def _assemble_mesh(mesh: SurfaceMesh, space: MeshSpace, mass: MassKind) -> Penci
     # A vertex is as coarse as its longest edge.
     longest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(metric, axis1=1, axis2=2), axis=1), 0))
     width = jax.ops.segment_max(jnp.repeat(longest, 3), mesh.faces.ravel(), mesh.vertices.shape[0])
-    return _pencil(gather(stiffness), gather(consistent), space.restrict(width), jnp.sum(consistent), mass)
+    lumped = jax.ops.segment_sum(jnp.sum(consistent, axis=-1).ravel(), mesh.faces.ravel(), mesh.vertices.shape[0])
+    return _pencil(gather(stiffness), gather(consistent), lumped, width, mass)
 
 
 @lru_cache(maxsize=16)

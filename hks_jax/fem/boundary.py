@@ -26,12 +26,15 @@ def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, .
             axis, each one of these names or a pair (low, high) of ``"neumann"`` and ``"dirichlet"``.
         dimension: the number of axes.
     """
-    entries = (boundary,) * dimension if isinstance(boundary, str) else tuple(boundary)
-    if len(entries) != dimension:
-        raise ValueError(f"boundary: got {len(entries)} entries {boundary!r}; expected one name, or {dimension}")
+    entries = (boundary,) * dimension if isinstance(boundary, str) else boundary
+    if not isinstance(entries, tuple | list) or len(entries) != dimension:
+        raise ValueError(f"boundary: got {boundary!r}; expected one name, or a tuple of {dimension}, one per axis")
     sides = []
     for entry in entries:
-        low, high = pair = (entry, entry) if isinstance(entry, str) else tuple(entry)
+        pair = (entry, entry) if isinstance(entry, str) else entry
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ValueError(f"boundary: got {entry!r} for one axis; expected a name or a pair (low, high)")
+        low, high = pair
         unknown = [name for name in pair if name not in _CONDITIONS]
         if unknown:
             raise ValueError(f"boundary: got {unknown[0]!r}; expected one of {', '.join(map(repr, _CONDITIONS))}")

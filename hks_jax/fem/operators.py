@@ -49,7 +49,9 @@ class Operator(eqx.Module):
     def __matmul__(self, x: Float[Array, "n_dof *m"]) -> Float[Array, "n_dof *m"]:
         """Multiply a vector (n_dof,) or a block of columns (n_dof, m)."""
         if x.ndim not in (1, 2) or x.shape[0] != self.space.n_dof:
-            raise ValueError(f"@: got an array of shape {x.shape}; expected ({self.space.n_dof},) or (…, m)")
+            raise ValueError(
+                f"@: got an array of shape {x.shape}; expected ({self.space.n_dof},) or ({self.space.n_dof}, m)"
+            )
         return self.apply(x.T).T
 
     def to_dense(self) -> Float[Array, "n_dof n_dof"]:

@@ -2,12 +2,14 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal
-from hks_jax.signatures.times import checked_times, positive_range
+from hks_jax.signatures.spectral import source_indices
+from hks_jax.signatures.times import checked_times, positive_range, require_pairs
+from hks_jax.signatures.truncation import warn_if_truncated
 
 
 def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_times n_sources *shape"]:
@@ -21,7 +23,8 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     Returns:
         (n_times, n_sources, *shape) in 1/(metric length)^(d/2); NaN outside the mask.
     """
-    times = checked_times("times", times, pairs.eigenvalues.dtype)
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    warn_if_truncated(pairs, 2 * times)
     return _distance(pairs, jnp.exp(-2 * times[:, None] * pairs.eigenvalues), sources)
 
 
@@ -34,7 +37,15 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
 
     Returns:
         (n_sources, *shape) in (metric length)^(2 − d/2); NaN outside the mask.
+
+    Raises:
+        ValueError: sources out of range or outside the mask; a domain of several components; no positive eigenvalue.
     """
+    if pairs.n_null > 1:
+        raise ValueError(
+            f"pairs: the domain has {pairs.n_null} components, and the biharmonic distance between two of them is "
+            "infinite; compute the eigenpairs of one component"
+        )
     positive_range(pairs)
     positive = jnp.arange(pairs.k) >= pairs.n_null
     values = jnp.where(positive, pairs.eigenvalues, 1)
@@ -42,15 +53,19 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
 
 
 def _distance(pairs: Eigenpairs, filters: Float[Array, "m k"], sources: Any) -> Float[Array, "m s *shape"]:
-    nodes = source_indices(pairs, sources)
-    columns = spectral_columns(pairs, filters, nodes)
-    here = spectral_diagonal(pairs, filters)
-    there = here.reshape(here.shape[0], pairs.space.free.size)[:, nodes]
-    squared = here[:, None] + there.reshape(*there.shape, *[1] * (here.ndim - 1)) - 2 * columns
+    # NaN comes last: as 0·NaN it would reach the derivatives of what is inside.
+    nodal = pairs.space.extend(pairs.vectors, outside=0.0)
+    flat = nodal.reshape(pairs.k, pairs.space.free.size)
+
+    def squared_from(source: Float[Array, " k"]) -> Float[Array, "m nodes"]:
+        # The sum of squared differences: expanded, its terms would cancel to nothing at large times.
+        return jnp.matmul(filters, jnp.square(flat - source[:, None]), precision="highest")
+
+    squared = jax.lax.map(squared_from, flat[:, source_indices(pairs, sources)].T)
+    squared = jnp.moveaxis(squared, 0, 1).reshape(filters.shape[0], -1, *nodal.shape[1:])
     # The root has no derivative at distance zero; there the distance is set, with derivative zero.
-    positive = squared > 0
-    root = jnp.sqrt(jnp.where(positive, squared, 1))
-    return jnp.where(jnp.isnan(squared), jnp.nan, jnp.where(positive, root, 0))
+    root = jnp.sqrt(jnp.where(squared == 0, 1, squared))
+    return jnp.where(pairs.space.domain, jnp.where(squared == 0, 0, root), jnp.nan)
 
 
 def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:

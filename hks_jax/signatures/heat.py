@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal
-from hks_jax.signatures.times import checked_times, positive_range
+from hks_jax.signatures.times import checked_times, positive_range, require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
 
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
@@ -34,7 +34,7 @@ def hks(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> 
     Warns:
         AccuracyWarning: times too small for the number of pairs or for the grid (see `truncation`).
     """
-    times = checked_times("times", times, pairs.eigenvalues.dtype)
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
     signature = spectral_diagonal(pairs, _decay(pairs, times))
     scale = _normaliser(pairs, times, normalisation)
@@ -49,7 +49,7 @@ def _normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str
     if normalisation == "raw":
         return jnp.ones_like(times)
     if normalisation == "heat-trace":
-        return 1 / heat_trace(pairs, times)
+        return 1 / jnp.sum(_decay(pairs, times), axis=1)
     if normalisation == "volume":
         return jnp.broadcast_to(pairs.pencil.volume, times.shape)
     if normalisation == "flat":
@@ -58,8 +58,16 @@ def _normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str
 
 
 def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:
-    """Compute the heat trace Σᵢ exp(−λᵢt) = ∫ HKS(t, x) dx at times (n_times,)."""
-    times = checked_times("times", times, pairs.eigenvalues.dtype)
+    """Compute the heat trace Σᵢ exp(−λᵢt) = ∫ HKS(t, x) dx at times (n_times,).
+
+    Raises:
+        ValueError: times that are not positive and finite.
+
+    Warns:
+        AccuracyWarning: times too small for the number of pairs or for the grid.
+    """
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    warn_if_truncated(pairs, times)
     return jnp.sum(_decay(pairs, times), axis=1)
 
 
@@ -77,7 +85,7 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
     Raises:
         ValueError: bad times, or sources out of range or outside the mask.
     """
-    times = checked_times("times", times, pairs.eigenvalues.dtype)
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
     return spectral_columns(pairs, _decay(pairs, times), source_indices(pairs, sources))
 
@@ -103,13 +111,14 @@ def scale_invariant_hks(
     if times is None:
         first, last = positive_range(pairs)
         times = 4 * math.log(10.0) / jnp.geomspace(last, first, n_times)
-    times = checked_times("times", times, pairs.eigenvalues.dtype)
+    else:
+        times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+        warn_if_truncated(pairs, times)
     if not 1 <= n_frequencies <= times.size // 2 + 1:
         raise ValueError(
             f"n_frequencies: got {n_frequencies}; {times.size} times have 1 … {times.size // 2 + 1} frequencies"
         )
-    values = pairs.eigenvalues
-    decay = jnp.exp(-times[:, None] * values)
+    values, decay = pairs.eigenvalues, _decay(pairs, times)
     signature = spectral_diagonal(pairs, decay)
     # d/dτ at t = exp τ is t d/dt, known in closed form: no differences needed.
     slope = spectral_diagonal(pairs, -times[:, None] * values * decay) / signature

@@ -12,7 +12,10 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 
 def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
     """Return times as an array (n,); raise ValueError unless they are 1-D, positive and finite."""
-    array = jnp.asarray(times, dtype)
+    try:
+        array = jnp.asarray(times, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: got {times!r}; expected a 1-D array of positive numbers") from None
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}; expected a non-empty 1-D array; wrap one time as [t]")
     if not isinstance(array, jax.core.Tracer):
@@ -23,13 +26,25 @@ def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
     return array
 
 
+def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
+    """Return the pairs of one domain; raise TypeError or ValueError for anything else."""
+    if not isinstance(pairs, Eigenpairs):
+        raise TypeError(f"pairs: got {type(pairs).__name__}; expected what `eigenpairs` returns")
+    if pairs.eigenvalues.ndim != 1:
+        raise ValueError(
+            f"pairs: got a batch, eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Map over the batch "
+            "with jax.vmap"
+        )
+    return pairs
+
+
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     """Return the first positive and the last eigenvalue.
 
     Raises:
         ValueError: if all k eigenvalues belong to constants.
     """
-    if pairs.n_null >= pairs.k:
+    if require_pairs(pairs).n_null >= pairs.k:
         raise ValueError(
             f"pairs: all k = {pairs.k} eigenvalues are zero (one per natural component); compute more eigenpairs"
         )
@@ -54,6 +69,8 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
     """
     if n < 29:
         raise ValueError(f"n: got {n}; expected at least 29, so that 2σ fits between the ends twice")
+    if pairs.k - pairs.n_null < 2:
+        raise ValueError(f"pairs: got {pairs.k - pairs.n_null} positive eigenvalue(s); expected two or more")
     first, last = (jnp.log(value) for value in positive_range(pairs))
     sigma = 7 * (last - first) / n
     return jnp.linspace(first + 2 * sigma, last - 2 * sigma, n), sigma

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from hks_jax.accuracy import AccuracyWarning
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.operators import DiagonalOperator
-from hks_jax.signatures.times import checked_times
+from hks_jax.signatures.times import checked_times, require_pairs
 
 TAIL_LIMIT = 0.01
 BIAS_LIMIT = 0.1
@@ -62,21 +62,23 @@ class Truncation(eqx.Module):
 def truncation(pairs: Eigenpairs, times: Float[Array, " n"]) -> Truncation:
     """Estimate what k pairs and the node spacing leave out of the signature at each time.
 
-    With Weyl's law N(λ) ∝ V λ^(d/2), the trace beyond Λ is V (4πt)^(−d/2) Q(d/2, Λt), Q the regularised upper
-    incomplete gamma function.
+    With Weyl's law N(λ) = k (λ/Λ)^(d/2), whose constant is taken from the spectrum itself (Λ is the first eigenvalue
+    beyond the k), the trace beyond Λ is k Γ(d/2 + 1) (Λt)^(−d/2) Q(d/2, Λt), Q the regularised upper incomplete gamma
+    function.
     """
-    values = pairs.eigenvalues
+    values = require_pairs(pairs).eigenvalues
     times = checked_times("times", times, values.dtype)
-    half_d, last = pairs.space.dimension / 2, values[-1]
-    beyond = pairs.pencil.volume * (4 * math.pi * times) ** -half_d * gammaincc(half_d, last * times)
+    half_d, complete = pairs.space.dimension / 2, jnp.isinf(pairs.next_eigenvalue)
+    following = jnp.where(complete, 1, pairs.next_eigenvalue)
+    x = following * times
+    beyond = pairs.k * math.gamma(half_d + 1) * x**-half_d * gammaincc(half_d, x)
     kept = jnp.sum(jnp.exp(-times[:, None] * values), axis=1)
-    complete = jnp.isinf(pairs.next_eigenvalue)
     tail = jnp.where(complete, 0, beyond / (beyond + kept))
     lumped = isinstance(pairs.pencil.parts[0].mass, DiagonalOperator)
     bias = _BIAS["lumped" if lumped else "consistent"] * jnp.square(pairs.pencil.mesh_width) / times[:, None]
     coarse = jnp.mean(bias > BIAS_LIMIT, axis=1)
     # Q(d/2, x) falls to 1 % at x = 4.6 (d = 2) and 5.7 (d = 3).
-    smallest = jnp.where(complete, 0, (4.6 if pairs.space.dimension == 2 else 5.7) / last)
+    smallest = jnp.where(complete, 0, (4.6 if pairs.space.dimension == 2 else 5.7) / following)
     return Truncation(times, tail, jnp.median(bias, axis=1), coarse, smallest)
 
 

@@ -2,7 +2,9 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -31,11 +33,11 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     positive_range(pairs)
     if energies is None:
         energies, sigma = default_energies(pairs)
-    energies = jnp.asarray(energies, pairs.eigenvalues.dtype)
-    if energies.ndim != 1 or energies.size == 0:
-        raise ValueError(f"energies: got shape {energies.shape}; expected a non-empty 1-D array")
-    if isinstance(sigma, int | float) and not sigma > 0:
-        raise ValueError(f"sigma: got {sigma}; expected a positive width in log λ")
+    energies, sigma = (jnp.asarray(value, pairs.eigenvalues.dtype) for value in (energies, sigma))
+    if energies.ndim != 1 or energies.size == 0 or (_known(energies) and not np.isfinite(energies).all()):
+        raise ValueError(f"energies: got {energies}; expected a non-empty 1-D array of finite values of log λ")
+    if sigma.ndim != 0 or (_known(sigma) and not 0 < float(sigma) < np.inf):
+        raise ValueError(f"sigma: got {sigma}; expected one positive width in log λ")
     positive = jnp.arange(pairs.k) >= pairs.n_null
     logs = jnp.log(jnp.where(positive, pairs.eigenvalues, 1))
     exponent = -jnp.square((energies[:, None] - logs) / sigma) / 2
@@ -43,3 +45,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     exponent = jnp.where(positive, exponent, -jnp.inf)
     weights = jnp.exp(exponent - jnp.max(exponent, axis=1, keepdims=True))
     return spectral_diagonal(pairs, weights / jnp.sum(weights, axis=1, keepdims=True))
+
+
+def _known(array: Array) -> bool:
+    return not isinstance(array, jax.core.Tracer)
