@@ -284,7 +284,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch):
         (["--slice", "14"], ["--slice", "such as z=14"]),
         (["--slice", "z=1"], ["slice", "only volumes can be sliced"]),
         (["--boundary", "robin"], ["boundary: got 'robin'", "'neumann'"]),
-        (["--boundary", "neumann,neumann,neumann"], ["boundary: got 3 entries"]),
+        (["--boundary", "neumann,neumann,neumann"], ["expected one name, or a tuple of 2"]),
         (["--metric", "euclid"], ["--metric", "invalid choice", "inverse"]),
         (["--order", "fsl"], ["order", "npz holds whole matrices"]),
         (["--erode", "40"], ["leaves nothing"]),
