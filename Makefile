@@ -11,6 +11,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Test processes. Each compiles for itself, so more than there are cores do not pay.
 JOBS ?= auto
+# As many BLAS threads as cores in each of them would fight for the cores.
+ONE_THREAD := OPENBLAS_NUM_THREADS=1
 
 BIN := $(VENV)/bin
 # A stamp is newer than pyproject.toml as long as what it names is installed: nothing is installed twice.
@@ -24,10 +26,10 @@ demo: $(STAMPS)/dti $(STAMPS)/brain
 	$(BIN)/python -m hks_jax demo -o demo
 
 test: $(STAMPS)/test
-	$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) -m "not slow"
 
 test-slow: $(STAMPS)/test
-	$(BIN)/python -m pytest -n $(JOBS) -m slow
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) -m slow
 
 lint: $(STAMPS)/lint
 	$(BIN)/ruff check .
