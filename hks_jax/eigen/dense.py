@@ -23,6 +23,10 @@ class Dense(Eigensolver):
         """Return the k lowest eigenpairs."""
         return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
 
+    def guards(self, k: int, n_dof: int) -> int:
+        """Return all the pairs beyond k: they cost nothing, and leave no complement to solve on."""
+        return n_dof - k
+
 
 @partial(jax.jit, static_argnames="k")
 def _dense(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"], k: int) -> RawPairs:

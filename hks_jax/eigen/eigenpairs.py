@@ -1,9 +1,10 @@
 """Eigenpairs of the Laplace–Beltrami operator, and what is known of their quality."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
@@ -17,7 +18,10 @@ class Eigenpairs(eqx.Module):
         vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the reflected domain under "mirror").
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁).
         converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
-        next_eigenvalue: the first eigenvalue not among the k; infinite if there is none.
+        kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was
+            dropped or completed: then signatures leave out the last pairs, those that are not kept.
+        part: (k,) under "mirror", which of the mixed problems a pair comes from; else 0.
+        next_eigenvalue: the first eigenvalue not kept; infinite if there is none.
         multiplet_tolerance: the relative gap below which neighbouring eigenvalues count as one multiple eigenvalue.
         pencil: the matrices.
         solver_name: the method that found them.
@@ -27,6 +31,8 @@ class Eigenpairs(eqx.Module):
     vectors: Float[Array, "k n_dof"]
     residuals: Float[Array, " k"]
     converged: Bool[Array, " k"]
+    kept: Bool[Array, " k"]
+    part: Int[Array, " k"]
     next_eigenvalue: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
     pencil: Pencil | MirrorPencil
@@ -53,11 +59,16 @@ class Eigenpairs(eqx.Module):
         return min(self.k, sum(part.space.n_null for part in self.pencil.parts))
 
     @property
+    def last_eigenvalue(self) -> Float[Array, ""]:
+        """The largest eigenvalue that is kept."""
+        return self.eigenvalues[jnp.sum(self.kept) - 1]
+
+    @property
     def cut_multiplet(self) -> Array:
-        """How many of the last pairs belong to a multiple eigenvalue that k cuts; 0 if k cuts none."""
-        last = self.eigenvalues[-1]
+        """How many of the last kept pairs belong to a multiple eigenvalue that the truncation cuts; 0 if none is."""
+        last = jax.lax.stop_gradient(self.last_eigenvalue)
         tolerance = self.multiplet_tolerance * jnp.maximum(last, jnp.finfo(last.dtype).tiny)
-        together = jnp.sum(self.eigenvalues >= last - tolerance)
+        together = jnp.sum(self.kept & (self.eigenvalues >= last - tolerance))
         return jnp.where(self.next_eigenvalue - last <= tolerance, together, 0)
 
     def messages(self) -> list[str]:
@@ -73,12 +84,12 @@ class Eigenpairs(eqx.Module):
                 f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
                 f"Use float64, fewer pairs, or {remedy}"
             )
-        cut = int(self.cut_multiplet)
+        cut, kept = int(self.cut_multiplet), int(self.kept.sum())
         if cut:
-            remedy = f"Take k = {self.k - cut} or a larger one" if cut < self.k else "Take a larger k"
+            remedy = f"Take k = {kept - cut} or a larger one" if cut < kept else "Take a larger k"
             found.append(
-                f"k = {self.k} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = "
-                f"{float(self.eigenvalues[-1]):.6g}, have equals beyond k, and which of them are here is arbitrary. "
+                f"k = {kept} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = "
+                f"{float(self.last_eigenvalue):.6g}, have equals beyond k, and which of them are here is arbitrary. "
                 f"{remedy}"
             )
         return found
@@ -86,10 +97,13 @@ class Eigenpairs(eqx.Module):
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Needs concrete values."""
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
-        following = float(self.next_eigenvalue)
+        kept, following = int(self.kept.sum()), float(self.next_eigenvalue)
+        last = float(self.last_eigenvalue)
         lines = [
             f"{self.k} eigenpairs of {sum(p.space.n_dof for p in self.pencil.parts)} by {self.solver_name}",
-            f"eigenvalues {values[0]:.6g} … {values[-1]:.6g} ({self.n_null} zero; the next is {following:.6g})",
+            f"eigenvalues {values[0]:.6g} … {last:.6g} ({self.n_null} zero; the next is {following:.6g})",
             f"worst relative residual {np.max(residuals):.1e}; {int(np.sum(self.converged))} of {self.k} converged",
         ]
+        if kept < self.k:
+            lines.append(f"{kept} of them kept, so that no multiple eigenvalue is cut")
         return "\n".join(lines + self.messages())

@@ -1,5 +1,6 @@
 """Large sparse pencils by SciPy's shift-invert Lanczos on the host."""
 
+import warnings
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -7,9 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, SuperLU, eigsh, splu
 
+from hks_jax.accuracy import AccuracyWarning
+from hks_jax.eigen.complement import solve_complement
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.operators import Pattern
 from hks_jax.fem.pencil import Pencil
@@ -29,6 +33,7 @@ class ShiftInvert(Eigensolver):
         tolerance: relative residual that counts as converged; ARPACK itself runs to machine precision.
         max_restarts: implicit restarts before giving up.
         basis: size of the Lanczos basis, more than k; None takes 2k + 20.
+        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm.
         progress: called with short texts such as ``"150 solves"`` while it runs; None is silent.
     """
 
@@ -36,6 +41,7 @@ class ShiftInvert(Eigensolver):
     tolerance: float = eqx.field(default=1e-8, static=True)
     max_restarts: int = eqx.field(default=300, static=True)
     basis: int | None = eqx.field(default=None, static=True)
+    derivative_tolerance: float = eqx.field(default=1e-11, static=True)
     progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
 
     def max_pairs(self, n_dof: int) -> int:
@@ -44,6 +50,8 @@ class ShiftInvert(Eigensolver):
 
     def __check_init__(self) -> None:
         """Check the settings."""
+        if not 0 < self.derivative_tolerance < 1:
+            raise ValueError(f"derivative_tolerance: got {self.derivative_tolerance}; expected between 0 and 1")
         if self.max_restarts < 1 or (self.basis is not None and self.basis < 2):
             raise ValueError(
                 f"max_restarts, basis: got {self.max_restarts}, {self.basis}; expected at least 1, at least 2 or None"
@@ -51,27 +59,63 @@ class ShiftInvert(Eigensolver):
 
     def lowest(self, pencil: Pencil, k: int) -> RawPairs:
         """Return the k lowest eigenpairs."""
-        stiffness, mass, volume = pencil.stiffness, pencil.mass, pencil.volume
-        n, dtype, dimension = pencil.space.n_dof, stiffness.dtype, pencil.space.dimension
-        data_k, pattern_k = stiffness.triplets()
-        data_m, pattern_m = mass.triplets()
-        natural = bool((pencil.space.free == pencil.space.domain).all())
+        n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
+        (data_k, data_m), matrices = _host_matrices(pencil)
 
         def solve(data_k: np.ndarray, data_m: np.ndarray, volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # The shift keeps K + sM positive definite; Weyl's λ₁ is the scale on which it is small.
             shift = 0.1 * (2 * np.pi) ** 2 / float(volume) ** (2 / dimension)
-            K, M = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n)
-            if natural:  # the rows add up to zero; what float32 entries leave would act as a potential
-                K = K - diags(np.asarray(K.sum(axis=1)).ravel())
+            K, M = matrices(data_k, data_m)
             values, vectors = self._lanczos(K, M, k, shift)
             return values.astype(dtype), vectors.astype(dtype)
 
-        inputs = (data_k, data_m, volume)
+        inputs = (data_k, data_m, pencil.volume)
         if not any(isinstance(x, jax.core.Tracer) for x in inputs):
             values, vectors = solve(*map(np.asarray, inputs))
             return jnp.asarray(values), jnp.asarray(vectors)
         shapes = (jax.ShapeDtypeStruct((k,), dtype), jax.ShapeDtypeStruct((k, n), dtype))
         return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
+
+    def solve_complement(
+        self,
+        pencil: Pencil,
+        values: Float[Array, " p"],
+        vectors: Float[Array, "p n_dof"],
+        rhs: Float[Array, "k n_dof"],
+    ) -> Float[Array, "k n_dof"]:
+        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement`."""
+        data, matrices = _host_matrices(pencil)
+
+        def solve(data_k: np.ndarray, data_m: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+            values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
+            if not all(np.isfinite(array).all() for array in (values, vectors, b)):
+                return np.full(rhs.shape, np.nan, rhs.dtype)
+            K, M = matrices(data_k, data_m)
+            x, errors = solve_complement(
+                K,
+                M,
+                values,
+                vectors,
+                b,
+                factorise=_factorise,
+                tolerance=self.derivative_tolerance,
+                report=self._report,
+            )
+            failed = ~(errors <= 1)
+            if failed.any():
+                warnings.warn(
+                    f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
+                    f"converge (worst error {np.max(errors[failed]):.1e} times the tolerance), and their part is NaN. "
+                    "k may cut a cluster of eigenvalues: take another k, or set multiplet='drop' in `eigenpairs`",
+                    AccuracyWarning,
+                    stacklevel=2,
+                )
+                x[failed] = np.nan
+            self._report(f"derivative: error {np.max(errors, initial=0.0) * self.derivative_tolerance:.1e}")
+            return x.astype(rhs.dtype)
+
+        shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
+        return jax.pure_callback(solve, shape, *data, values, vectors, rhs, vmap_method="sequential")
 
     def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float) -> tuple[np.ndarray, np.ndarray]:
         n = K.shape[0]
@@ -133,6 +177,21 @@ def _padded(values: np.ndarray, vectors: np.ndarray, k: int) -> tuple[np.ndarray
         np.pad(values[order], (0, missing), constant_values=np.nan),
         np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
     )
+
+
+def _host_matrices(pencil: Pencil) -> tuple[tuple[Array, Array], Callable[..., tuple[csc_matrix, csc_matrix]]]:
+    """Return the entries of K and M, and the function that makes float64 SciPy matrices of them on the host."""
+    (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
+    n = pencil.space.n_dof
+    natural = bool((pencil.space.free == pencil.space.domain).all())
+
+    def matrices(data_k: np.ndarray, data_m: np.ndarray) -> tuple[csc_matrix, csc_matrix]:
+        K, M = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n)
+        if natural:  # the rows add up to zero; what float32 entries leave would act as a potential
+            K = K - diags(np.asarray(K.sum(axis=1)).ravel())
+        return K, M
+
+    return (data_k, data_m), matrices
 
 
 def _csc(data: np.ndarray, pattern: Pattern, n: int) -> csc_matrix:

@@ -30,6 +30,25 @@ class Eigensolver(eqx.Module):
         What was not found is NaN. Traceable: works under `jit` and `vmap`.
         """
 
+    def solve_complement(
+        self,
+        pencil: Pencil,
+        values: Float[Array, " p"],
+        vectors: Float[Array, "p n_dof"],
+        rhs: Float[Array, "k n_dof"],
+    ) -> Float[Array, "k n_dof"]:
+        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0, Φ the p ≥ k given eigenvectors, p < n_dof.
+
+        Derivatives need it, unless `guards` are all the other pairs. What did not converge is NaN. Traceable.
+        """
+        raise NotImplementedError(
+            f"eigenpairs: the {self.name} solver has no solve_complement, which derivatives need; use another solver"
+        )
+
+    def guards(self, k: int, n_dof: int) -> int:
+        """Return how many pairs beyond k to compute where derivatives are wanted."""
+        return 8 + k // 20
+
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k that the method can deliver for n_dof degrees of freedom."""
         return n_dof

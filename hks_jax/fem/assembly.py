@@ -195,9 +195,7 @@ def _assemble_mesh(mesh: SurfaceMesh, space: MeshSpace, mass: MassKind) -> Penci
 def _mesh_pattern(space: MeshSpace) -> tuple[StaticArray, StaticArray, StaticArray, StaticArray]:
     """Which local entries count (both ends free), the matrix entry that each adds to, and the entries' positions."""
     n = space.n_dof
-    number = np.full(space.free.size, -1)
-    number[space.free] = np.arange(n)
-    faces = number[space.triangulation.faces]
+    faces = space.degrees_of_freedom[space.triangulation.faces]
     rows, cols = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, (1, 3)).ravel()
     where = np.flatnonzero((rows >= 0) & (cols >= 0))
     keys, slots = np.unique(rows[where] * n + cols[where], return_inverse=True)

@@ -106,9 +106,7 @@ class StencilOperator(Operator):
 def _stencil_pattern(space: GridSpace) -> tuple[np.ndarray, Pattern]:
     """Where in the coefficients each entry lies, and its (row, column), for the couplings between free nodes."""
     shape, d = space.node_shape, space.dimension
-    number = np.full(space.free.size, -1)
-    number[np.flatnonzero(space.free)] = np.arange(space.n_dof)
-    number = number.reshape(shape)
+    number = space.degrees_of_freedom.reshape(shape)
     for axis, wraps in enumerate(space.periodic):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
         number = np.pad(number, widths, mode="wrap") if wraps else np.pad(number, widths, constant_values=-1)

@@ -1,7 +1,8 @@
 """The matrix pencil of the Laplace–Beltrami operator."""
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from hks_jax.fem.operators import Operator
 from hks_jax.fem.space import FunctionSpace
@@ -32,6 +33,14 @@ class Pencil(eqx.Module):
         """The pencil itself: one problem."""
         return (self,)
 
+    def apply_stiffness(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
+        """Apply K to each row; ``part`` tells rows apart only where there are several parts."""
+        return self.stiffness.apply(x)
+
+    def apply_mass(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
+        """Apply M to each row."""
+        return self.mass.apply(x)
+
 
 class MirrorPencil(eqx.Module):
     """The 2^m mixed Neumann/Dirichlet pencils of a domain reflected along m axes.
@@ -56,3 +65,19 @@ class MirrorPencil(eqx.Module):
     def volume(self) -> Float[Array, ""]:
         """The area or volume of the reflected domain."""
         return len(self.parts) * self.parts[0].volume
+
+    def apply_stiffness(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
+        """Apply to each row, a function of one part in the space of the first, the stiffness of its part."""
+        return self._apply([piece.stiffness for piece in self.parts], x, part)
+
+    def apply_mass(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
+        """Apply to each row the mass of its part."""
+        return self._apply([piece.mass for piece in self.parts], x, part)
+
+    def _apply(self, operators: list[Operator], x: Array, part: Array) -> Array:
+        total = jnp.zeros_like(x)
+        for i, operator in enumerate(operators):
+            rows = self.space.extend(jnp.where(part[:, None] == i, x, 0), outside=0.0)
+            image = operator.space.extend(operator.apply(operator.space.restrict(rows)), outside=0.0)
+            total = total + self.space.restrict(image)
+        return total

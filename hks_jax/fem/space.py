@@ -43,6 +43,13 @@ class FunctionSpace:
     def _free_indices(self) -> np.ndarray:
         return np.flatnonzero(self.free)
 
+    @cached_property
+    def degrees_of_freedom(self) -> Int[np.ndarray, " nodes"]:
+        """For each node, flat, the number of its degree of freedom, or −1."""
+        numbers = np.full(self.free.size, -1)
+        numbers[self._free_indices] = np.arange(self.n_dof)
+        return numbers
+
     @property
     def _all_free(self) -> bool:
         return self.n_dof == self.free.size
@@ -77,7 +84,7 @@ class FunctionSpace:
             return values.reshape(shape)
         fill = jnp.asarray(np.where(self.domain.ravel(), 0.0, outside), values.dtype)
         full = jnp.broadcast_to(fill, (*values.shape[:-1], fill.size))
-        return full.at[..., self._free_indices].set(values).reshape(shape)
+        return full.at[..., self._free_indices].set(values, unique_indices=True, indices_are_sorted=True).reshape(shape)
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, FunctionSpace) and self._key == other._key)

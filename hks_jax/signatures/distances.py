@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.signatures.spectral import source_indices
+from hks_jax.signatures.filters import Filter, Heat, Power
+from hks_jax.signatures.spectral import source_indices, spectral_squared_distances
 from hks_jax.signatures.times import checked_times, positive_range, require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
 
@@ -25,7 +25,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     """
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, 2 * times)
-    return _distance(pairs, jnp.exp(-2 * times[:, None] * pairs.eigenvalues), sources)
+    return _distance(pairs, Heat(2 * times), sources)
 
 
 def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sources *shape"]:
@@ -47,22 +47,11 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
             "infinite; compute the eigenpairs of one component"
         )
     positive_range(pairs)
-    positive = jnp.arange(pairs.k) >= pairs.n_null
-    values = jnp.where(positive, pairs.eigenvalues, 1)
-    return _distance(pairs, jnp.where(positive, values**-2, 0)[None], sources)[0]
+    return _distance(pairs, Power(jnp.full(1, -2.0, pairs.eigenvalues.dtype)), sources)[0]
 
 
-def _distance(pairs: Eigenpairs, filters: Float[Array, "m k"], sources: Any) -> Float[Array, "m s *shape"]:
-    # NaN comes last: as 0·NaN it would reach the derivatives of what is inside.
-    nodal = pairs.space.extend(pairs.vectors, outside=0.0)
-    flat = nodal.reshape(pairs.k, pairs.space.free.size)
-
-    def squared_from(source: Float[Array, " k"]) -> Float[Array, "m nodes"]:
-        # The sum of squared differences: expanded, its terms would cancel to nothing at large times.
-        return jnp.matmul(filters, jnp.square(flat - source[:, None]), precision="highest")
-
-    squared = jax.lax.map(squared_from, flat[:, source_indices(pairs, sources)].T)
-    squared = jnp.moveaxis(squared, 0, 1).reshape(filters.shape[0], -1, *nodal.shape[1:])
+def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, "m s *shape"]:
+    squared = spectral_squared_distances(pairs, filters, source_indices(pairs, sources))
     # The root has no derivative at distance zero; there the distance is set, with derivative zero.
     root = jnp.sqrt(jnp.where(squared == 0, 1, squared))
     return jnp.where(pairs.space.domain, jnp.where(squared == 0, 0, root), jnp.nan)

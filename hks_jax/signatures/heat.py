@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal
+from hks_jax.signatures.filters import Derivative, Heat
+from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import checked_times, positive_range, require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
 
@@ -36,20 +37,16 @@ def hks(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> 
     """
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
-    signature = spectral_diagonal(pairs, _decay(pairs, times))
+    signature = spectral_diagonal(pairs, Heat(times))
     scale = _normaliser(pairs, times, normalisation)
     return signature * scale.reshape(-1, *[1] * (signature.ndim - 1))
-
-
-def _decay(pairs: Eigenpairs, times: Float[Array, " n"]) -> Float[Array, "n k"]:
-    return jnp.exp(-times[:, None] * pairs.eigenvalues)
 
 
 def _normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
     if normalisation == "raw":
         return jnp.ones_like(times)
     if normalisation == "heat-trace":
-        return 1 / jnp.sum(_decay(pairs, times), axis=1)
+        return 1 / spectral_trace(pairs, Heat(times))
     if normalisation == "volume":
         return jnp.broadcast_to(pairs.pencil.volume, times.shape)
     if normalisation == "flat":
@@ -68,7 +65,7 @@ def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:
     """
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
-    return jnp.sum(_decay(pairs, times), axis=1)
+    return spectral_trace(pairs, Heat(times))
 
 
 def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_times n_sources *shape"]:
@@ -87,7 +84,7 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
     """
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
-    return spectral_columns(pairs, _decay(pairs, times), source_indices(pairs, sources))
+    return spectral_columns(pairs, Heat(times), source_indices(pairs, sources))
 
 
 def scale_invariant_hks(
@@ -118,8 +115,7 @@ def scale_invariant_hks(
         raise ValueError(
             f"n_frequencies: got {n_frequencies}; {times.size} times have 1 … {times.size // 2 + 1} frequencies"
         )
-    values, decay = pairs.eigenvalues, _decay(pairs, times)
-    signature = spectral_diagonal(pairs, decay)
+    signature = spectral_diagonal(pairs, Heat(times))
     # d/dτ at t = exp τ is t d/dt, known in closed form: no differences needed.
-    slope = spectral_diagonal(pairs, -times[:, None] * values * decay) / signature
+    slope = spectral_diagonal(pairs, Derivative(Heat(times), Heat(times))) / signature
     return jnp.abs(jnp.fft.rfft(slope, axis=0))[:n_frequencies] / times.size

@@ -1,29 +1,142 @@
-"""Spectral functions: the diagonal, columns and trace of Φ f(Λ) Φᵀ, on which every signature stands."""
+"""Spectral functions Φ f(Λ) Φᵀ, on which every signature stands, and their derivative rule."""
 
+from functools import partial
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.domain.static_array import StaticArray
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.first_order import first_order_only
+from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.signatures.contractions import Columns, Contraction, Diagonal, SquaredDistances
+from hks_jax.signatures.filters import Filter
 
 
-def spectral_diagonal(pairs: Eigenpairs, filters: Float[Array, "m k"]) -> Float[Array, "m *shape"]:
-    """Return Σᵢ f(λᵢ) φᵢ(x)² for each row f(λ) of ``filters``; NaN outside the mask."""
-    return pairs.space.extend(jnp.matmul(filters, jnp.square(pairs.vectors), precision="highest"))
+def spectral_diagonal(pairs: Eigenpairs, filters: Filter) -> Float[Array, "m *shape"]:
+    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters; NaN outside the mask."""
+    return pairs.space.extend(_kernel(Diagonal(), filters, pairs))
 
 
-def spectral_columns(
-    pairs: Eigenpairs, filters: Float[Array, "m k"], sources: Int[np.ndarray, " s"]
-) -> Float[Array, "m s *shape"]:
+def spectral_columns(pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x_s) φᵢ(x) for each filter and each source node (flat node index); NaN outside the mask."""
-    weighted = filters[:, None, :] * at_nodes(pairs, sources).T[None, :, :]
-    return pairs.space.extend(jnp.matmul(weighted, pairs.vectors, precision="highest"))
+    return pairs.space.extend(_kernel(Columns(pairs.space, StaticArray(sources)), filters, pairs))
 
 
-def at_nodes(pairs: Eigenpairs, sources: Int[np.ndarray, " s"]) -> Float[Array, "k s"]:
-    """Return the eigenfunctions' values at the source nodes."""
-    nodal = pairs.space.extend(pairs.vectors)
-    return nodal.reshape(nodal.shape[0], pairs.space.free.size)[:, sources]
+def spectral_squared_distances(
+    pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]
+) -> Float[Array, "m s *shape"]:
+    """Return Σᵢ f(λᵢ) (φᵢ(x_s) − φᵢ(x))² for each filter and each source node; meaningless outside the mask."""
+    squared = _kernel(SquaredDistances(pairs.space, StaticArray(sources)), filters, pairs)
+    return squared.reshape(*squared.shape[:-1], *pairs.space.node_shape)
+
+
+def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
+    """Return Σᵢ f(λᵢ) for each of m filters. Its derivative is f'(λᵢ) dλᵢ: no eigenvector enters."""
+    return jnp.sum(_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
+    """Read the kernels Φ f(Λ) Φᵀ of m filters."""
+    return contraction.weighted(_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
+
+
+# The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M where the eigenvectors are not. Of all n eigenpairs its
+# differential is Φ F Φᵀ with the divided differences of f (Daleckii and Krein 1965), G = Φᵀ dK Φ and H = Φᵀ dM Φ:
+#
+#     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
+#
+# Nothing in it depends on the basis chosen within a multiple eigenvalue, and nothing is singular there. Truncated to
+# the kept pairs, f is zero on all others: F stands as it is among the kept, and between a kept i and the others j
+# the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
+#
+#     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
+#
+# the part of dφᵢ outside of the span of Φ, which the eigenvectors' own rule supplies (hks_jax/eigen/derivative.py), by
+# a linear solve and without any gauge. Pairs in the arrays that are not kept count as pairs with f = 0. Under
+# "mirror" pairs of different parts do not mix, and φᵢᵀMφⱼ is δᵢⱼ divided by the number of parts.
+@partial(_kernel.defjvp, symbolic_zeros=True)
+def _kernel_jvp(contraction: Contraction, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    filters, pairs = primals
+    d_filters, d_pairs = tangents
+    d_filters = _instantiated(d_filters)
+    fixed = jax.tree.leaves(d_pairs.pencil, is_leaf=_is_zero)
+    if all(isinstance(leaf, SymbolicZero) for leaf in fixed):
+        # Nothing moves but the filters, or the arrays of the pairs themselves: plain differentiation.
+        return jax.jvp(
+            lambda f, v, x: contraction.weighted(_weights(f, v, pairs.kept), x),
+            (filters, pairs.eigenvalues, pairs.vectors),
+            (d_filters, _instantiated(d_pairs.eigenvalues), _instantiated(d_pairs.vectors)),
+        )
+    pairs = first_order_only(pairs)
+    value = contraction.weighted(_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
+    d_pencil, d_vectors = _instantiated((d_pairs.pencil, d_pairs.vectors))
+    return value, _tangent(contraction, filters, d_filters, pairs, d_pencil, d_vectors)
+
+
+@partial(jax.jit, static_argnums=0)
+def _tangent(
+    contraction: Contraction,
+    filters: Filter,
+    d_filters: Filter,
+    pairs: Eigenpairs,
+    d_pencil: Pencil | MirrorPencil,
+    d_vectors: Float[Array, "k n_dof"],
+) -> Array:
+    pencil, values, vectors, kept, part = pairs.pencil, pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
+    together, copies = part[:, None] == part, len(pencil.parts)
+
+    def among(images: Float[Array, "k n_dof"]) -> Float[Array, "k k"]:
+        return jnp.where(together, copies * jnp.matmul(images, vectors.T, precision="highest"), 0)
+
+    stiffness = among(d_pencil.apply_stiffness(vectors, part))
+    mass = among(d_pencil.apply_mass(vectors, part))
+    inside = jnp.matmul(among(pencil.apply_mass(d_vectors, part)), vectors, precision="highest")
+    _, outer = jax.jvp(
+        lambda f, x: contraction.weighted(_weights(f, values, kept), x),
+        (filters, vectors),
+        (d_filters, d_vectors - inside),
+    )
+
+    def inner(one: Filter) -> Array:
+        of_f, of_lambda_f = _divided_differences(one, values, kept)
+        return contraction.mixed(of_f * stiffness - of_lambda_f * mass, vectors)
+
+    return outer + jax.lax.map(inner, filters)
+
+
+def _weights(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, "m k"]:
+    return jnp.where(kept, jax.vmap(lambda one: one(values))(filters), 0)
+
+
+def _divided_differences(
+    one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]
+) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
+    """Return the matrices [f] and [λf], f being zero where the pairs are not kept."""
+    low, high = jnp.minimum(values[:, None], values), jnp.maximum(values[:, None], values)
+    f = jnp.where(kept, one(values), 0)
+    gap = values[:, None] - values
+    quotient = (f[:, None] - f) / jnp.where(gap == 0, 1, gap)
+    both = kept[:, None] & kept
+    of_f = jnp.where(both, one.divided_difference(low, high), quotient)
+    # f at the larger eigenvalue, where it is small, and not the other way round: no cancellation.
+    return of_f, jnp.where(gap >= 0, f[:, None], f) + low * of_f
+
+
+def _is_zero(leaf: Any) -> bool:
+    return isinstance(leaf, SymbolicZero)
+
+
+def _instantiated(tree: Any) -> Any:
+    def instantiate(leaf: Any) -> Array:
+        return jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf
+
+    return jax.tree.map(instantiate, tree, is_leaf=_is_zero)
 
 
 def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:

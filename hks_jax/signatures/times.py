@@ -48,7 +48,7 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
         raise ValueError(
             f"pairs: all k = {pairs.k} eigenvalues are zero (one per natural component); compute more eigenpairs"
         )
-    return pairs.eigenvalues[pairs.n_null], pairs.eigenvalues[-1]
+    return pairs.eigenvalues[pairs.n_null], pairs.last_eigenvalue
 
 
 def default_times(pairs: Eigenpairs, n: int = 16) -> Float[Array, " n"]:

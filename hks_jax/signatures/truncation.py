@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 from hks_jax.accuracy import AccuracyWarning
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.operators import DiagonalOperator
+from hks_jax.signatures.filters import Heat
+from hks_jax.signatures.spectral import spectral_trace
 from hks_jax.signatures.times import checked_times, require_pairs
 
 TAIL_LIMIT = 0.01
@@ -71,8 +73,8 @@ def truncation(pairs: Eigenpairs, times: Float[Array, " n"]) -> Truncation:
     half_d, complete = pairs.space.dimension / 2, jnp.isinf(pairs.next_eigenvalue)
     following = jnp.where(complete, 1, pairs.next_eigenvalue)
     x = following * times
-    beyond = pairs.k * math.gamma(half_d + 1) * x**-half_d * gammaincc(half_d, x)
-    kept = jnp.sum(jnp.exp(-times[:, None] * values), axis=1)
+    beyond = jnp.sum(pairs.kept) * math.gamma(half_d + 1) * x**-half_d * gammaincc(half_d, x)
+    kept = spectral_trace(pairs, Heat(times))
     tail = jnp.where(complete, 0, beyond / (beyond + kept))
     lumped = isinstance(pairs.pencil.parts[0].mass, DiagonalOperator)
     bias = _BIAS["lumped" if lumped else "consistent"] * jnp.square(pairs.pencil.mesh_width) / times[:, None]
@@ -84,6 +86,7 @@ def truncation(pairs: Eigenpairs, times: Float[Array, " n"]) -> Truncation:
 
 def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
     """Warn (AccuracyWarning) of times that k or the spacing does not resolve, where values are concrete."""
+    pairs, times = jax.lax.stop_gradient((pairs, times))
     leaves = jax.tree.leaves((pairs.eigenvalues, pairs.pencil, times))
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         return

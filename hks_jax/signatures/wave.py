@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.signatures.spectral import spectral_diagonal
+from hks_jax.signatures.filters import Wave
+from hks_jax.signatures.spectral import spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import default_energies, positive_range
 
 
@@ -38,13 +39,14 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
         raise ValueError(f"energies: got {energies}; expected a non-empty 1-D array of finite values of log λ")
     if sigma.ndim != 0 or (_known(sigma) and not 0 < float(sigma) < np.inf):
         raise ValueError(f"sigma: got {sigma}; expected one positive width in log λ")
-    positive = jnp.arange(pairs.k) >= pairs.n_null
+    # The largest exponent is taken out of both sums: they do not underflow far outside of the spectrum.
+    positive = pairs.kept & (pairs.eigenvalues > 0)
     logs = jnp.log(jnp.where(positive, pairs.eigenvalues, 1))
-    exponent = -jnp.square((energies[:, None] - logs) / sigma) / 2
-    # Softmax: the sum in the denominator, safe from underflow far outside the spectrum.
-    exponent = jnp.where(positive, exponent, -jnp.inf)
-    weights = jnp.exp(exponent - jnp.max(exponent, axis=1, keepdims=True))
-    return spectral_diagonal(pairs, weights / jnp.sum(weights, axis=1, keepdims=True))
+    exponents = jnp.where(positive, -jnp.square((energies[:, None] - logs) / sigma) / 2, -jnp.inf)
+    offset = jax.lax.stop_gradient(jnp.max(exponents, axis=1))
+    bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
+    signature = spectral_diagonal(pairs, bells)
+    return signature / spectral_trace(pairs, bells).reshape(-1, *[1] * (signature.ndim - 1))
 
 
 def _known(array: Array) -> bool:

@@ -1,0 +1,117 @@
+"""The lowest eigenpairs of a pencil, and their derivatives with respect to stiffness and mass."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.eigen.first_order import first_order_only
+from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.fem.pencil import Pencil
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3))
+def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> RawPairs:
+    """Return the k + extra lowest eigenpairs; the derivatives of the last ``extra`` are set to zero."""
+    return _exact_null_modes(pencil, *solver.lowest(pencil, k + extra))
+
+
+# From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ, with the force fᵢ = (dK − λᵢ dM) φᵢ,
+#
+#     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
+#
+# The sum is over all j. Over the computed pairs it is taken as it stands; the rest of it, xᵢ, is what solves
+#
+#     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
+#
+# on the M-orthogonal complement of the computed Φ, where K − λᵢM is positive definite. The map fᵢ ↦ xᵢ is symmetric,
+# which gives reverse mode. The solver computes some guard pairs beyond k, so that λᵢ keeps a distance from what is
+# left to the linear solve.
+#
+# Within a multiple eigenvalue the rotation (j ≠ i, λᵢ = λⱼ) is a matter of gauge: a perturbation may choose any basis
+# there. The rule takes −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN; and so it does where the gap is
+# below √ε λ, because dividing by it would leave no digits. So dφᵢ is the derivative of an eigenvector only where λᵢ is
+# simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What does not depend on the basis, such
+# as every spectral function, must not be computed from that gauge: hks_jax/signatures/spectral.py takes from dφᵢ only
+# what is outside of the span of Φ.
+@lowest.defjvp
+def _lowest_jvp(
+    solver: Eigensolver, k: int, extra: int, primals: tuple[Pencil], tangents: tuple[Pencil]
+) -> tuple[RawPairs, RawPairs]:
+    pencil, (change,) = first_order_only(primals[0]), tangents
+    n_dof = pencil.space.n_dof
+    total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
+    values, vectors = _exact_null_modes(pencil, *solver.lowest(pencil, total))
+    d_values, d_vectors = _tangents(solver, k, pencil, change, values, vectors)
+    primal = values[: k + extra], vectors[: k + extra]
+    return primal, (jnp.pad(d_values, (0, extra)), jnp.pad(d_vectors, ((0, extra), (0, 0))))
+
+
+@partial(jax.jit, static_argnames=("solver", "k"))
+def _tangents(
+    solver: Eigensolver,
+    k: int,
+    pencil: Pencil,
+    change: Pencil,
+    values: Float[Array, " p"],
+    vectors: Float[Array, "p n_dof"],
+) -> RawPairs:
+    """Return dλ and dφ of the first k of p computed pairs."""
+    eigenvalues, functions = values[:k], vectors[:k]
+    moved = change.mass.apply(functions)
+    force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
+    into = jnp.matmul(force, vectors.T, precision="highest")
+    gap = eigenvalues[:, None] - values
+    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(eigenvalues[:, None], values)
+    apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
+    gauge = -jnp.matmul(moved, vectors.T, precision="highest") / 2
+    rotation = jnp.where(apart, into / jnp.where(apart, gap, 1), gauge)
+    inside = jnp.matmul(rotation, vectors, precision="highest")
+    return jnp.diagonal(into), inside + _outside(solver, pencil, values, vectors, -force)
+
+
+def _outside(
+    solver: Eigensolver,
+    pencil: Pencil,
+    values: Float[Array, " p"],
+    vectors: Float[Array, "p n_dof"],
+    rhs: Float[Array, "k n_dof"],
+) -> Float[Array, "k n_dof"]:
+    """Solve (K − λᵢM) xᵢ = Q rhsᵢ on the complement of the p computed eigenvectors."""
+    if values.size == pencil.space.n_dof:
+        return jnp.zeros_like(rhs)
+    shifts = values[: rhs.shape[0], None]
+
+    def matvec(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
+
+    def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        return solver.solve_complement(pencil, values, vectors, b)
+
+    return jax.lax.custom_linear_solve(matvec, rhs, solve, symmetric=True)
+
+
+def indistinct(pencil: Pencil, dtype: np.dtype) -> Float[Array, ""]:
+    """Return the distance below which rounding in K alone makes two eigenvalues one: about ε·λ_max, times 16.
+
+    4·max(Kᵢᵢ/Mᵢᵢ) is λ_max on a uniform grid in 2D and 3D.
+    """
+    return 4 * jnp.finfo(dtype).eps * 4 * jnp.max(pencil.stiffness.diagonal() / pencil.mass.diagonal())
+
+
+@jax.jit
+def _exact_null_modes(pencil: Pencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]) -> RawPairs:
+    """Put the constants, which the stiffness annihilates exactly, in place of the solver's approximations to them.
+
+    Their eigenvalue is 0 and not the ±1e-13 of a solver; what rounding left of them in the other vectors is taken out.
+    """
+    mass, dtype = pencil.mass, values.dtype
+    n_null = min(pencil.space.n_null, values.size)
+    constants = jnp.asarray(pencil.space.null_labels == np.arange(n_null)[:, None], dtype)
+    constants /= jnp.sqrt(jnp.sum(constants * mass.apply(constants), axis=1, keepdims=True))
+    rest = vectors[n_null:]
+    rest = rest - jnp.matmul(jnp.matmul(mass.apply(rest), constants.T, precision="highest"), constants)
+    rest /= jnp.sqrt(jnp.sum(rest * mass.apply(rest), axis=1, keepdims=True))
+    return jnp.concatenate([jnp.zeros(n_null, dtype), values[n_null:]]), jnp.concatenate([constants, rest])

@@ -1,0 +1,28 @@
+"""A guard: what stands in a first-derivative rule must not be differentiated again."""
+
+from typing import NoReturn, TypeVar
+
+import jax
+
+Tree = TypeVar("Tree")
+
+
+@jax.custom_jvp
+def first_order_only(tree: Tree) -> Tree:
+    """Return ``tree`` unchanged; differentiating it raises NotImplementedError.
+
+    The rules for eigenpairs and spectral functions hold at eigenpairs. Along a path their ingredients would have to
+    rotate within multiple eigenvalues in a way that first derivatives do not know, so that differentiating the rules
+    gives wrong numbers there. An error is better.
+    """
+    return tree
+
+
+@first_order_only.defjvp
+def _refuse(primals: tuple, tangents: tuple) -> NoReturn:
+    raise NotImplementedError(
+        "second derivatives of eigenpairs and of their signatures with respect to the tensors, the vertices or the "
+        "pencil are not implemented (first derivatives are, and so is differentiating these once more with respect to "
+        "times and other parameters of the filter). For a Hessian use Gauss-Newton products, jax.vjp after jax.jvp of "
+        "the signature, or central differences of jax.grad"
+    )

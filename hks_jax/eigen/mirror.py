@@ -1,0 +1,68 @@
+"""The mixed problems of a reflected domain, their spectra merged into one."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.part import solve_part
+from hks_jax.eigen.solver import Eigensolver
+from hks_jax.fem.pencil import MirrorPencil
+
+
+def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, name: str) -> Eigenpairs:
+    """Solve the mixed problems and return the k lowest pairs of all, or as many as there are.
+
+    How many come from each part is not known beforehand. Where values are concrete, ask for a fair share with a margin
+    and double it wherever the merged spectrum could still miss a pair; traced, ask every part for k.
+    """
+    parts = pencil.parts
+    limits = [min(k, part.space.n_dof) for part in parts]
+    share = math.ceil(k / len(parts)) + 2 * math.isqrt(k) + 4
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(jax.lax.stop_gradient(pencil)))
+    wanted = limits if traced else [min(limit, share) for limit in limits]
+    # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
+    solvers = [
+        solver if limit <= solver.max_pairs(part.space.n_dof) else Dense(solver.tolerance)
+        for solver, part, limit in zip(solvers, parts, limits, strict=True)
+    ]
+    solved = [solve_part(part, solver, w, 0, name) for part, solver, w in zip(parts, solvers, wanted, strict=True)]
+    while not traced:
+        spectra = [np.asarray(jax.lax.stop_gradient(pairs.eigenvalues)) for pairs in solved]
+        merged = np.sort(np.concatenate(spectra))
+        reach = merged[k - 1] if merged.size >= k else np.inf
+        short = [
+            i
+            for i, spectrum in enumerate(spectra)
+            if wanted[i] < limits[i] and (merged.size < k or spectrum[-1] < reach)
+        ]
+        if not short:
+            break
+        for i in short:
+            wanted[i] = min(limits[i], 2 * wanted[i])
+            solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name)
+    return _merge(pencil, tuple(solved), k, name)
+
+
+def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, name: str) -> Eigenpairs:
+    values = jnp.concatenate([pairs.eigenvalues for pairs in solved])
+    lowest = jnp.argsort(values)[:k]
+    # An eigenfunction of the reflected domain has unit norm there, hence 1/√2^m of it here.
+    vectors = jnp.concatenate(
+        [pencil.space.restrict(pairs.space.extend(pairs.vectors, outside=0.0)) for pairs in solved]
+    ) / math.sqrt(len(solved))
+    return Eigenpairs(
+        values[lowest],
+        vectors[lowest],
+        jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
+        jnp.concatenate([pairs.converged for pairs in solved])[lowest],
+        kept=jnp.ones(lowest.shape, bool),
+        part=jnp.asarray(np.repeat(np.arange(len(solved)), [pairs.k for pairs in solved]))[lowest],
+        next_eigenvalue=jnp.asarray(jnp.inf, values.dtype),
+        multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
+        pencil=pencil,
+        solver_name=name,
+    )

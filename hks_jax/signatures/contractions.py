@@ -1,0 +1,83 @@
+"""How the kernel Φ C Φᵀ of a spectral function, C (k, k), is read: its diagonal, its columns, its distances."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hks_jax.domain.static_array import StaticArray
+from hks_jax.fem.space import FunctionSpace
+
+
+class Contraction(ABC):
+    """A reading of Φ C Φᵀ: static and hashable."""
+
+    @abstractmethod
+    def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m *s n"]:
+        """Return the reading for each diagonal C = diag(weights)."""
+
+    @abstractmethod
+    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "*s n"]:
+        """Return the reading for one symmetric C."""
+
+
+@dataclass(frozen=True)
+class Diagonal(Contraction):
+    """(Φ C Φᵀ)(x, x)."""
+
+    def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m n"]:
+        """Return Σᵢ cᵢ φᵢ(x)²."""
+        return _matmul(weights, jnp.square(vectors))
+
+    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, " n"]:
+        """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x)."""
+        return jnp.sum(vectors * _matmul(matrix, vectors), axis=0)
+
+
+@dataclass(frozen=True)
+class _FromSources(Contraction):
+    space: FunctionSpace
+    sources: StaticArray
+
+    def at_sources(self, vectors: Float[Array, "k n"]) -> Float[Array, "k s"]:
+        """Return the functions' values at the source nodes (flat node indices): 0 at Dirichlet nodes."""
+        degrees = self.space.degrees_of_freedom[self.sources.value]
+        return jnp.where(degrees >= 0, vectors[:, degrees], 0)
+
+
+class Columns(_FromSources):
+    """(Φ C Φᵀ)(x_s, x) for source nodes x_s."""
+
+    def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
+        """Return Σᵢ cᵢ φᵢ(x_s) φᵢ(x)."""
+        return _matmul(weights[:, None, :] * self.at_sources(vectors).T, vectors)
+
+    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "s n"]:
+        """Return Σᵢⱼ Cᵢⱼ φᵢ(x_s) φⱼ(x)."""
+        return _matmul(_matmul(self.at_sources(vectors).T, matrix), vectors)
+
+
+class SquaredDistances(_FromSources):
+    """The squared distance that C induces from source nodes: C between φ(x) − φ(x_s) and itself, at all nodes x.
+
+    The sum of squared differences: expanded, its terms would cancel to nothing at large times.
+    """
+
+    def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s nodes"]:
+        """Return Σᵢ cᵢ (φᵢ(x) − φᵢ(x_s))²."""
+        return jnp.moveaxis(self._map(vectors, lambda apart: _matmul(weights, jnp.square(apart))), 0, 1)
+
+    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "s nodes"]:
+        """Return Σᵢⱼ Cᵢⱼ (φᵢ(x) − φᵢ(x_s)) (φⱼ(x) − φⱼ(x_s))."""
+        return self._map(vectors, lambda apart: jnp.sum(apart * _matmul(matrix, apart), axis=0))
+
+    def _map(self, vectors: Float[Array, "k n"], reading: Callable[[Array], Array]) -> Array:
+        nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], -1)
+        return jax.lax.map(lambda source: reading(nodal - source[:, None]), self.at_sources(vectors).T)
+
+
+def _matmul(a: Array, b: Array) -> Array:
+    return jnp.matmul(a, b, precision="highest")
