@@ -48,7 +48,8 @@ def solve_complement(
         x (k, n), and the relative energy errors (k,) that the iteration saw last, in units of the tolerance asked of
         each row: above 1 it did not converge.
     """
-    phi, m_phi = vectors.T, M @ vectors.T
+    phi = np.ascontiguousarray(vectors.T)
+    m_phi = M @ phi
     x, errors = np.zeros_like(rhs), np.zeros(len(rhs))
     rhs = rhs - (rhs @ phi) @ m_phi.T
     # Small rows need fewer digits: their share in what is summed over all rows is small. Where the operator amplifies

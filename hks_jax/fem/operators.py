@@ -16,6 +16,10 @@ from hks_jax.fem.space import FunctionSpace, GridSpace
 
 Pattern = tuple[np.ndarray, np.ndarray]
 
+_ROWS, _LARGE = 8, 1 << 20
+"""Large arrays are multiplied in blocks of so many rows, written out one by one: the transpose, which sums over the
+rows, is then a fused sum and not a reduction, which XLA does many times slower on CPUs."""
+
 
 class Operator(eqx.Module):
     """A symmetric matrix over the degrees of freedom, applied without being formed."""
@@ -78,15 +82,21 @@ class StencilOperator(Operator):
 
     def apply_nodal(self, x: Float[Array, "*leading_and_shape"]) -> Float[Array, "*leading_and_shape"]:
         """Apply the operator to nodal arrays; rows and columns of nodes that are not free are zero."""
-        shape, d = self.space.node_shape, self.space.dimension
-        leading = [(0, 0)] * (x.ndim - d)
-        for axis, wraps in enumerate(self.space.periodic):
-            widths = [*leading, *[(1, 1) if a == axis else (0, 0) for a in range(d)]]
-            x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
-        y = jnp.zeros((), x.dtype)
-        for c, start in zip(self.coefficients, product((0, 1, 2), repeat=d), strict=True):
-            y = y + c * x[(..., *[slice(s, s + n) for s, n in zip(start, shape, strict=True)])]
-        return y
+        shape = self.space.node_shape
+        rows, coefficients = x.reshape(-1, *shape), list(self.coefficients)
+
+        def product_with(some: Float[Array, "*rows_and_shape"]) -> Float[Array, "*rows_and_shape"]:
+            y = jnp.zeros((), x.dtype)
+            for c, offset in zip(coefficients, product((-1, 0, 1), repeat=len(shape)), strict=True):
+                y = y + c * _neighbours(some, offset, self.space.periodic)
+            return y
+
+        whole = rows.shape[0] - rows.shape[0] % _ROWS
+        if rows.size < _LARGE or whole == 0:
+            return product_with(rows).reshape(x.shape)
+        blocks = rows[:whole].reshape(-1, _ROWS, *shape)
+        done = jax.lax.map(lambda block: jnp.stack([product_with(row) for row in block]), blocks)
+        return jnp.concatenate([done.reshape(whole, *shape), product_with(rows[whole:])]).reshape(x.shape)
 
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""
@@ -100,6 +110,28 @@ class StencilOperator(Operator):
     def diagonal(self) -> Float[Array, " n_dof"]:
         """Return the main diagonal."""
         return self.space.restrict(self.coefficients[self.coefficients.shape[0] // 2])
+
+
+def _neighbours(x: Array, offset: tuple[int, ...], periodic: tuple[bool, ...]) -> Array:
+    """Return the neighbours' values, y[i] = x[i + offset], over the last axes; 0 beyond the grid's sides."""
+    first = x.ndim - len(offset)
+    for axis, (o, wraps) in enumerate(zip(offset, periodic, strict=True), start=first):
+        if o == 0:
+            continue
+        # Padding by −1 on one side and 1 on the other is a shift that XLA fuses with the product.
+        y = _placed(x, axis, -o, o)
+        if wraps:
+            n = x.shape[axis]
+            edge = jax.lax.slice_in_dim(x, 0, 1, axis=axis) if o > 0 else jax.lax.slice_in_dim(x, n - 1, n, axis=axis)
+            y = y + (_placed(edge, axis, n - 1, 0) if o > 0 else _placed(edge, axis, 0, n - 1))
+        x = y
+    return x
+
+
+def _placed(x: Array, axis: int, before: int, after: int) -> Array:
+    return jax.lax.pad(
+        x, jnp.zeros((), x.dtype), [(before, after, 0) if a == axis else (0, 0, 0) for a in range(x.ndim)]
+    )
 
 
 @lru_cache(maxsize=16)
