@@ -28,6 +28,7 @@ from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import reflect as reflect
 from hks_jax.fem.pencil import MirrorPencil as MirrorPencil
 from hks_jax.fem.pencil import Pencil as Pencil
+from hks_jax.signatures.custom import spectral_signature as spectral_signature
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance
 from hks_jax.signatures.distances import diffusion_distance as diffusion_distance
 from hks_jax.signatures.distances import global_point_signature as global_point_signature

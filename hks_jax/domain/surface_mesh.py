@@ -11,7 +11,9 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from hks_jax.domain import spd
 from hks_jax.domain.static_array import StaticArray
+from hks_jax.domain.tensor_field import check_spd
 
 
 @jax.tree_util.register_static
@@ -54,22 +56,26 @@ class Triangulation:
 
 
 class SurfaceMesh(eqx.Module):
-    """A triangle mesh in space, with the metric that space induces on it.
+    """A triangle mesh in space, with the metric that space induces on it, or another.
 
-    A pytree: the vertex positions are its leaf, the connectivity is structure.
+    A pytree: the vertex positions and the given metric, if any, are its leaves, the connectivity is structure.
 
     Args:
         vertices: positions (V, 3).
         faces: vertex indices (F, 3).
+        metric: (F, 2, 2), the metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀, in place of the
+            induced one.
 
     Raises:
-        ValueError: wrong shapes, indices out of range, vertices without a face, triangles without area, NaN.
+        ValueError: wrong shapes, indices out of range, vertices without a face, triangles without area, NaN, a metric
+            that is not positive definite.
     """
 
     vertices: Float[Array, "V 3"]
     triangulation: Triangulation = eqx.field(static=True)
+    _metric: Float[Array, "F 2 2"] | None
 
-    def __init__(self, vertices: Any, faces: Any) -> None:
+    def __init__(self, vertices: Any, faces: Any, metric: Any = None) -> None:
         positions = jnp.asarray(vertices)
         if not jnp.issubdtype(positions.dtype, jnp.floating):
             positions = positions.astype(jnp.result_type(float))
@@ -91,11 +97,32 @@ class SurfaceMesh(eqx.Module):
             _check_triangles(np.asarray(positions, dtype=np.float64), indices)
         self.vertices = positions
         self.triangulation = Triangulation(indices, n)
+        self._metric = None if metric is None else _checked_metric(metric, len(indices))
+
+    @property
+    def metric(self) -> Float[Array, "F 2 2"]:
+        """The metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀."""
+        if self._metric is not None:
+            return self._metric
+        corners = self.vertices[self.faces]
+        edges = jnp.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
+        return jnp.einsum("fxa,fxb->fab", edges, edges, precision="highest")
 
     @property
     def faces(self) -> Int[np.ndarray, "F 3"]:
         """Vertex indices, one row per triangle."""
         return self.triangulation.faces
+
+
+def _checked_metric(metric: Any, n_faces: int) -> Float[Array, "F 2 2"]:
+    array = jnp.asarray(metric)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(jnp.result_type(float))
+    if array.shape != (n_faces, 2, 2):
+        raise ValueError(f"metric: got shape {array.shape}; expected (F, 2, 2) = {(n_faces, 2, 2)}, one per triangle")
+    if not isinstance(array, jax.core.Tracer):
+        check_spd("metric", np.asarray(array), np.ones(n_faces, dtype=bool), place="face")
+    return spd.symmetrise(array)
 
 
 def _check_triangles(vertices: np.ndarray, faces: np.ndarray) -> None:

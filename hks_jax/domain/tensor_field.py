@@ -126,14 +126,14 @@ def _checked_tensors(name: str, grid: Grid, tensors: Any) -> Float[Array, "*shap
     return array
 
 
-def check_spd(name: str, tensors: Float[np.ndarray, "*shape d d"], inside: np.ndarray) -> None:
+def check_spd(name: str, tensors: Float[np.ndarray, "*shape d d"], inside: np.ndarray, place: str = "node") -> None:
     """Raise ValueError unless the tensors are finite, symmetric and positive definite inside."""
     total = int(inside.sum())
 
     def fail(bad: np.ndarray, what: str, remedy: str) -> None:
         first = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"{name}: {int(bad.sum())} of {total} tensors are {what} (the first at node {first}); "
+            f"{name}: {int(bad.sum())} of {total} tensors are {what} (the first at {place} {first}); "
             f"expected symmetric positive definite tensors. {remedy}"
         )
 

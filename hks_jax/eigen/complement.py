@@ -93,20 +93,21 @@ def _conjugate_gradients(
     x, errors = np.zeros_like(b), np.zeros(b.shape[1])
     left = np.arange(b.shape[1])
     r = np.ascontiguousarray(b)
-    z = precondition(r)
+    p = z = precondition(r)
     first = energy = np.einsum("nb,nb->b", r, z)
-    p = z
     steps = 0
     while left.size and steps < _MAX_ITERATIONS:
         steps += 1
         a_p = K @ p - (M @ p) * eigenvalues[left]
-        length = energy / np.einsum("nb,nb->b", p, a_p)
+        curvature = np.einsum("nb,nb->b", p, a_p)
+        length = energy / np.where(curvature > 0, curvature, np.inf)
         x[:, left] += length * p
         r = r - length * a_p
         z = precondition(r)
         before, energy = energy, np.einsum("nb,nb->b", r, z)
-        errors[left] = np.sqrt(np.maximum(energy, 0) / first[left]) / wanted[left]
-        open_ = ~(errors[left] <= 1)
+        # Not positive definite: an eigenvalue equal to λᵢ is left on the complement, and the iteration is hopeless.
+        errors[left] = np.where(curvature > 0, np.sqrt(np.abs(energy) / first[left]) / wanted[left], np.inf)
+        open_ = (errors[left] > 1) & (curvature > 0)
         p = z + (energy / before) * p
         if not open_.all():  # go on with the others alone
             left, r, p, energy = left[open_], r[:, open_], p[:, open_], energy[open_]

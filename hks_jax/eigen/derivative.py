@@ -11,11 +11,18 @@ from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.pencil import Pencil
 
+Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
+
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3))
-def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> RawPairs:
-    """Return the k + extra lowest eigenpairs; the derivatives of the last ``extra`` are set to zero."""
-    return _exact_null_modes(pencil, *solver.lowest(pencil, k + extra))
+def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Lowest:
+    """Return the k + extra lowest eigenvalues, their eigenvectors, and these once more as the frame.
+
+    The derivative of the frame is that of the eigenvectors without what rotates them among the first k. The derivatives
+    of the last ``extra`` are set to zero.
+    """
+    values, vectors = _exact_null_modes(pencil, *solver.lowest(pencil, k + extra))
+    return values, vectors, vectors
 
 
 # From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ, with the force fᵢ = (dK − λᵢ dM) φᵢ,
@@ -34,19 +41,20 @@ def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> RawPairs:
 # there. The rule takes −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN; and so it does where the gap is
 # below √ε λ, because dividing by it would leave no digits. So dφᵢ is the derivative of an eigenvector only where λᵢ is
 # simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What does not depend on the basis, such
-# as every spectral function, must not be computed from that gauge: hks_jax/signatures/spectral.py takes from dφᵢ only
-# what is outside of the span of Φ.
+# as every spectral function, must not be computed from that gauge. For it there is the frame: its derivative has the
+# sum over j > k alone, which no basis of the first k changes (hks_jax/signatures/spectral.py).
 @lowest.defjvp
 def _lowest_jvp(
     solver: Eigensolver, k: int, extra: int, primals: tuple[Pencil], tangents: tuple[Pencil]
-) -> tuple[RawPairs, RawPairs]:
+) -> tuple[Lowest, Lowest]:
     pencil, (change,) = first_order_only(primals[0]), tangents
     n_dof = pencil.space.n_dof
     total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
     values, vectors = _exact_null_modes(pencil, *solver.lowest(pencil, total))
-    d_values, d_vectors = _tangents(solver, k, pencil, change, values, vectors)
-    primal = values[: k + extra], vectors[: k + extra]
-    return primal, (jnp.pad(d_values, (0, extra)), jnp.pad(d_vectors, ((0, extra), (0, 0))))
+    d_values, d_vectors, d_frame = _tangents(solver, k, pencil, change, values, vectors)
+    d_vectors, d_frame = (jnp.pad(d, ((0, extra), (0, 0))) for d in (d_vectors, d_frame))
+    values, vectors = values[: k + extra], vectors[: k + extra]
+    return (values, vectors, vectors), (jnp.pad(d_values, (0, extra)), d_vectors, d_frame)
 
 
 @partial(jax.jit, static_argnames=("solver", "k"))
@@ -57,8 +65,8 @@ def _tangents(
     change: Pencil,
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
-) -> RawPairs:
-    """Return dλ and dφ of the first k of p computed pairs."""
+) -> Lowest:
+    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs."""
     eigenvalues, functions = values[:k], vectors[:k]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
@@ -66,10 +74,12 @@ def _tangents(
     gap = eigenvalues[:, None] - values
     least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(eigenvalues[:, None], values)
     apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
-    gauge = -jnp.matmul(moved, vectors.T, precision="highest") / 2
-    rotation = jnp.where(apart, into / jnp.where(apart, gap, 1), gauge)
-    inside = jnp.matmul(rotation, vectors, precision="highest")
-    return jnp.diagonal(into), inside + _outside(solver, pencil, values, vectors, -force)
+    rotation = jnp.where(apart, into / jnp.where(apart, gap, 1), 0)
+    gauge = -jnp.matmul(moved, functions.T, precision="highest") / 2
+    within = jnp.where(apart[:, :k], rotation[:, :k], gauge)
+    frame = jnp.matmul(rotation[:, k:], vectors[k:], precision="highest")
+    frame = frame + _outside(solver, pencil, values, vectors, -force)
+    return jnp.diagonal(into), jnp.matmul(within, functions, precision="highest") + frame, frame
 
 
 def _outside(

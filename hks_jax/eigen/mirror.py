@@ -5,9 +5,11 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.part import solve_part
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import MirrorPencil
@@ -54,15 +56,34 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, name: s
     vectors = jnp.concatenate(
         [pencil.space.restrict(pairs.space.extend(pairs.vectors, outside=0.0)) for pairs in solved]
     ) / math.sqrt(len(solved))
+    vectors, part = vectors[lowest], jnp.asarray(np.repeat(np.arange(len(solved)), [p.k for p in solved]))[lowest]
     return Eigenpairs(
         values[lowest],
-        vectors[lowest],
+        vectors,
+        _frame(vectors, pencil, part),
         jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
         jnp.concatenate([pairs.converged for pairs in solved])[lowest],
         kept=jnp.ones(lowest.shape, bool),
-        part=jnp.asarray(np.repeat(np.arange(len(solved)), [pairs.k for pairs in solved]))[lowest],
+        part=part,
         next_eigenvalue=jnp.asarray(jnp.inf, values.dtype),
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         pencil=pencil,
         solver_name=name,
     )
+
+
+@jax.custom_jvp
+def _frame(vectors: Float[Array, "k n_dof"], pencil: MirrorPencil, part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
+    """Return the vectors; their derivative, without what rotates them among themselves.
+
+    The parts' own frames do not serve: they leave out rotations among more pairs than the merged spectrum has.
+    """
+    return vectors
+
+
+@_frame.defjvp
+def _frame_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    vectors, pencil, part = first_order_only(primals)
+    change = tangents[0]
+    inside = pencil.among(pencil.apply_mass(change, part), vectors, part)
+    return vectors, change - jnp.matmul(inside, vectors, precision="highest")

@@ -46,7 +46,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
         count = jnp.where(count > 0, count, k)
 
     def leading(p: Eigenpairs) -> tuple:
-        return p.eigenvalues, p.vectors, p.residuals, p.converged, p.part
+        return p.eigenvalues, p.vectors, p.frame, p.residuals, p.converged, p.part
 
     shorter = eqx.tree_at(leading, pairs, tuple(leaf[:size] for leaf in leading(pairs)))
     return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), shorter, (index < count, sequence[count]))

@@ -20,11 +20,12 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
             f"k: the {solver.name} solver gives at most {solver.max_pairs(n_dof)} of {n_dof} pairs, and {k + extra} "
             "are needed (one beyond k, to see where the spectrum is cut). Use a smaller k or the dense solver"
         )
-    values, vectors = lowest(solver, pencil, k, extra)
+    values, vectors, frame = lowest(solver, pencil, k, extra)
     residuals, converged, rounding = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)
     return Eigenpairs(
         values,
         vectors,
+        frame,
         residuals,
         converged,
         kept=jnp.ones(values.shape, bool),

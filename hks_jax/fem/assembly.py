@@ -169,10 +169,7 @@ def _free_couplings(space: GridSpace) -> np.ndarray:
 @partial(jax.jit, static_argnames=("space", "mass"))
 def _assemble_mesh(mesh: SurfaceMesh, space: MeshSpace, mass: MassKind) -> Pencil:
     element = triangle_element()
-    corners = mesh.vertices[mesh.faces]
-    edges = jnp.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
-    metric = jnp.einsum("fxa,fxb->fab", edges, edges, precision="highest")
-    points = element.weights.size
+    metric, points = mesh.metric, element.weights.size
 
     def integrals(triangle_metric: Float[Array, "2 2"]) -> tuple[Array, Array]:
         return element_matrices(jnp.broadcast_to(triangle_metric, (points, 2, 2)), element)

@@ -41,6 +41,12 @@ class Pencil(eqx.Module):
         """Apply M to each row."""
         return self.mass.apply(x)
 
+    def among(
+        self, images: Float[Array, "k n_dof"], vectors: Float[Array, "k n_dof"], part: Int[Array, " k"]
+    ) -> Float[Array, "k k"]:
+        """Return the products of images under K, M or their derivatives (rows) with vectors (columns)."""
+        return jnp.matmul(images, vectors.T, precision="highest")
+
 
 class MirrorPencil(eqx.Module):
     """The 2^m mixed Neumann/Dirichlet pencils of a domain reflected along m axes.
@@ -73,6 +79,13 @@ class MirrorPencil(eqx.Module):
     def apply_mass(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
         """Apply to each row the mass of its part."""
         return self._apply([piece.mass for piece in self.parts], x, part)
+
+    def among(
+        self, images: Float[Array, "k n_dof"], vectors: Float[Array, "k n_dof"], part: Int[Array, " k"]
+    ) -> Float[Array, "k k"]:
+        """Return the products of images with vectors on the reflected domain: parts do not mix."""
+        products = len(self.parts) * jnp.matmul(images, vectors.T, precision="highest")
+        return jnp.where(part[:, None] == part, products, 0)
 
     def _apply(self, operators: list[Operator], x: Array, part: Array) -> Array:
         total = jnp.zeros_like(x)

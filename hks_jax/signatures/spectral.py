@@ -14,7 +14,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.signatures.contractions import Columns, Contraction, Diagonal, SquaredDistances
-from hks_jax.signatures.filters import Filter
+from hks_jax.signatures.filters import Derivative, Filter
 
 
 def spectral_diagonal(pairs: Eigenpairs, filters: Filter) -> Float[Array, "m *shape"]:
@@ -43,6 +43,8 @@ def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
     """Read the kernels Φ f(Λ) Φᵀ of m filters."""
+    # Where JAX differentiates this body and not the rule (the outer of two derivatives), it must not.
+    pairs = first_order_only(pairs)
     return contraction.weighted(_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
 
 
@@ -57,51 +59,40 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
-# the part of dφᵢ outside of the span of Φ, which the eigenvectors' own rule supplies (hks_jax/eigen/derivative.py), by
-# a linear solve and without any gauge. Pairs in the arrays that are not kept count as pairs with f = 0. Under
-# "mirror" pairs of different parts do not mix, and φᵢᵀMφⱼ is δᵢⱼ divided by the number of parts.
+# xᵢ the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept count as pairs with
+# f = 0. Under "mirror" pairs of different parts do not mix.
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(contraction: Contraction, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    filters, pairs = primals
-    d_filters, d_pairs = tangents
-    d_filters = _instantiated(d_filters)
-    fixed = jax.tree.leaves(d_pairs.pencil, is_leaf=_is_zero)
-    if all(isinstance(leaf, SymbolicZero) for leaf in fixed):
-        # Nothing moves but the filters, or the arrays of the pairs themselves: plain differentiation.
-        return jax.jvp(
-            lambda f, v, x: contraction.weighted(_weights(f, v, pairs.kept), x),
-            (filters, pairs.eigenvalues, pairs.vectors),
-            (d_filters, _instantiated(d_pairs.eigenvalues), _instantiated(d_pairs.vectors)),
-        )
+    (filters, pairs), (d_filters, d_pairs) = primals, tangents
+    value = _kernel(contraction, filters, pairs)
+    tangent = jnp.zeros_like(value)
+    if not _is_constant(d_filters):
+        tangent += _kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs)
     pairs = first_order_only(pairs)
-    value = contraction.weighted(_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
-    d_pencil, d_vectors = _instantiated((d_pairs.pencil, d_pairs.vectors))
-    return value, _tangent(contraction, filters, d_filters, pairs, d_pencil, d_vectors)
+    if not _is_constant(d_pairs.pencil):
+        tangent += _tangent(contraction, filters, pairs, *_instantiated((d_pairs.pencil, d_pairs.frame)))
+    elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
+        tangent += jax.jvp(
+            lambda values, vectors: contraction.weighted(_weights(filters, values, pairs.kept), vectors),
+            (pairs.eigenvalues, pairs.vectors),
+            _instantiated((d_pairs.eigenvalues, d_pairs.vectors)),
+        )[1]
+    return value, tangent
 
 
 @partial(jax.jit, static_argnums=0)
 def _tangent(
     contraction: Contraction,
     filters: Filter,
-    d_filters: Filter,
     pairs: Eigenpairs,
     d_pencil: Pencil | MirrorPencil,
-    d_vectors: Float[Array, "k n_dof"],
+    d_frame: Float[Array, "k n_dof"],
 ) -> Array:
     pencil, values, vectors, kept, part = pairs.pencil, pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
-    together, copies = part[:, None] == part, len(pencil.parts)
-
-    def among(images: Float[Array, "k n_dof"]) -> Float[Array, "k k"]:
-        return jnp.where(together, copies * jnp.matmul(images, vectors.T, precision="highest"), 0)
-
-    stiffness = among(d_pencil.apply_stiffness(vectors, part))
-    mass = among(d_pencil.apply_mass(vectors, part))
-    inside = jnp.matmul(among(pencil.apply_mass(d_vectors, part)), vectors, precision="highest")
-    _, outer = jax.jvp(
-        lambda f, x: contraction.weighted(_weights(f, values, kept), x),
-        (filters, vectors),
-        (d_filters, d_vectors - inside),
-    )
+    stiffness = pencil.among(d_pencil.apply_stiffness(vectors, part), vectors, part)
+    mass = pencil.among(d_pencil.apply_mass(vectors, part), vectors, part)
+    weights = _weights(filters, values, kept)
+    _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (vectors,), (d_frame,))
 
     def inner(one: Filter) -> Array:
         of_f, of_lambda_f = _divided_differences(one, values, kept)
@@ -132,9 +123,13 @@ def _is_zero(leaf: Any) -> bool:
     return isinstance(leaf, SymbolicZero)
 
 
+def _is_constant(tangents: Any) -> bool:
+    return all(_is_zero(leaf) for leaf in jax.tree.leaves(tangents, is_leaf=_is_zero))
+
+
 def _instantiated(tree: Any) -> Any:
     def instantiate(leaf: Any) -> Array:
-        return jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf
+        return jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf
 
     return jax.tree.map(instantiate, tree, is_leaf=_is_zero)
 

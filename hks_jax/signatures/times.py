@@ -41,6 +41,8 @@ def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     """Return the first positive and the last eigenvalue.
 
+    Of a multiple one, the mean over its copies: the same number, and a differentiable one.
+
     Raises:
         ValueError: if all k eigenvalues belong to constants.
     """
@@ -48,7 +50,13 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
         raise ValueError(
             f"pairs: all k = {pairs.k} eigenvalues are zero (one per natural component); compute more eigenpairs"
         )
-    return pairs.eigenvalues[pairs.n_null], pairs.last_eigenvalue
+    values = pairs.eigenvalues
+
+    def mean_of_copies(value: Array) -> Array:
+        copies = pairs.kept & (jnp.abs(values - value) <= pairs.multiplet_tolerance * value)
+        return jnp.sum(jnp.where(copies, values, 0)) / jnp.sum(copies)
+
+    return mean_of_copies(values[pairs.n_null]), mean_of_copies(pairs.last_eigenvalue)
 
 
 def default_times(pairs: Eigenpairs, n: int = 16) -> Float[Array, " n"]:

@@ -1,0 +1,389 @@
+"""Exact derivatives of signatures and eigenpairs against differences, and against paths without an eigensolver."""
+
+import warnings
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from differences import directional, heat_kernel_by_contour
+from fields import random_spd
+
+import hks_jax as hj
+
+SHAPE = (10, 10)
+GRID = hj.Grid(SHAPE, 0.1)
+TIMES = jnp.array([0.003, 0.03, 0.3])  # under-resolved by the grid and by k; resolved; large
+SOLVERS = ["dense", "shift-invert"]
+
+pytestmark = pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
+
+
+def symmetric(rng, shape):
+    a = rng.standard_normal((*shape, len(shape), len(shape)))
+    return jnp.asarray(a + np.swapaxes(a, -1, -2)) / 2
+
+
+def identity(shape):
+    return jnp.broadcast_to(jnp.eye(len(shape)), (*shape, len(shape), len(shape)))
+
+
+def rotationally_symmetric():
+    squared = np.sum((GRID.nodes - 0.45) ** 2, axis=-1)
+    return jnp.asarray((1 + 2 * np.exp(-10 * squared))[..., None, None] * np.eye(2))
+
+
+FIELDS = {
+    "generic": lambda rng: jnp.asarray(random_spd(rng, SHAPE)),
+    "identity": lambda rng: identity(SHAPE),
+    "noise 1e-6": lambda rng: identity(SHAPE) + 1e-6 * symmetric(rng, SHAPE),
+    "noise 1e-9": lambda rng: identity(SHAPE) + 1e-9 * symmetric(rng, SHAPE),
+    "noise 1e-12": lambda rng: identity(SHAPE) + 1e-12 * symmetric(rng, SHAPE),
+    "rotational": lambda rng: rotationally_symmetric(),
+}
+
+
+def check(f, x, direction, rtol=1e-7, adjoint=1e-12, step=4e-3, atol=0.0):
+    """Forward and reverse mode of f (any output, NaN where it likes) along one direction, against differences."""
+    probe = jnp.asarray(np.random.default_rng(1).standard_normal(jax.eval_shape(f, x).shape))
+
+    def scalar(x):
+        return jnp.nansum(probe * f(x))
+
+    forward = jax.jvp(scalar, (x,), (direction,))[1]
+    reverse = jnp.vdot(jax.grad(scalar)(x), direction)
+    size = float(jnp.nansum(jnp.abs(probe * jax.jvp(f, (x,), (direction,))[1])))
+    assert float(forward) == pytest.approx(float(reverse), abs=adjoint * size)
+    assert float(reverse) == pytest.approx(float(directional(scalar, x, direction, step)), rel=rtol, abs=atol)
+
+
+def hks_of(tensors, k=20, solver="dense", boundary="neumann", mass="consistent", grid=GRID, times=TIMES):
+    pairs = hj.eigenpairs(hj.TensorField(grid, tensors), k, boundary, solver, mass)
+    return jnp.sqrt(times).reshape(-1, *[1] * len(grid.shape)) * hj.hks(pairs, times)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("k", [20, 30, 60])
+def test_hks_against_differences(rng, name, solver, k):
+    if k != 20 and name not in ("generic", "identity"):
+        pytest.skip("the truncation is varied on two fields")
+    tensors = FIELDS[name](rng)
+    if name != "generic" and k == 60:
+        k = 58  # 60 cuts a multiple eigenvalue of the square
+    assert hj.eigenpairs(hj.TensorField(GRID, tensors), k, solver="dense").cut_multiplet == 0
+    adjoint = 1e-12 if solver == "dense" else 1e-11
+    check(partial(hks_of, k=k, solver=solver), tensors, 0.1 * symmetric(rng, SHAPE), adjoint=adjoint)
+
+
+@pytest.mark.parametrize("name", ["generic", "identity", "noise 1e-9"])
+def test_truncated_hks_against_contour_integrals(rng, name):
+    """The gradient at every node, from linear solves differentiated by JAX itself: no eigensolver anywhere."""
+    tensors, k, times = FIELDS[name](rng), 20, TIMES[1:]
+    pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), k)
+    ends = float(pairs.eigenvalues[-1]), float(pairs.next_eigenvalue)
+    probe = jnp.asarray(rng.standard_normal((2, *SHAPE)))
+
+    def reference(tensors):
+        pencil = hj.assemble(hj.TensorField(GRID, tensors))
+        kernel = heat_kernel_by_contour(pencil.stiffness.to_dense(), pencil.mass.to_dense(), times, *ends)
+        return jnp.sum(probe * jnp.diagonal(kernel, axis1=1, axis2=2).reshape(2, *SHAPE))
+
+    value, expected = jax.value_and_grad(reference)(tensors)
+    for solver in SOLVERS:
+
+        def loss(tensors, solver=solver):
+            return jnp.sum(probe * hj.hks(hj.eigenpairs(hj.TensorField(GRID, tensors), k, solver=solver), times))
+
+        ours, gradient = jax.value_and_grad(loss)(tensors)
+        assert ours == pytest.approx(float(value), rel=1e-9)
+        assert jnp.linalg.norm(gradient - expected) < 1e-8 * jnp.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("name", ["identity", "noise 1e-9"])
+def test_full_spectrum_against_the_matrix_exponential(rng, name):
+    tensors, shape, times = FIELDS[name](rng)[:6, :6], (6, 6), TIMES
+    grid, probe = hj.Grid(shape, 0.1), jnp.asarray(rng.standard_normal((3, 6, 6)))
+
+    def reference(tensors):
+        pencil = hj.assemble(hj.TensorField(grid, tensors))
+        K, M = pencil.stiffness.to_dense(), pencil.mass.to_dense()
+        generator = jnp.linalg.solve(M, K)
+        kernels = [jax.scipy.linalg.expm(-t * generator) @ jnp.linalg.inv(M) for t in times]
+        return jnp.sum(probe * jnp.stack([jnp.diagonal(kernel).reshape(shape) for kernel in kernels]))
+
+    def loss(tensors):
+        return jnp.sum(probe * hj.hks(hj.eigenpairs(hj.TensorField(grid, tensors), 36), times))
+
+    expected, gradient = jax.grad(reference)(tensors), jax.grad(loss)(tensors)
+    assert jnp.linalg.norm(gradient - expected) < 1e-9 * jnp.linalg.norm(expected)
+
+
+@pytest.mark.parametrize(
+    ("boundary", "mass", "solver"),
+    [
+        ("dirichlet", "consistent", "shift-invert"),
+        ("dirichlet", "lumped", "dense"),
+        (("periodic", ("neumann", "dirichlet")), "consistent", "dense"),
+        ("mirror", "consistent", "dense"),
+        ("mirror", "lumped", "shift-invert"),
+        (("mirror", "periodic"), "consistent", "shift-invert"),
+    ],
+)
+def test_every_boundary_and_mask(rng, boundary, mass, solver):
+    mask = np.ones((8, 9), dtype=bool)
+    mask[:3, 5:] = False
+    grid = hj.Grid((8, 9), 0.15, mask=mask)
+    f = partial(hks_of, k=14, solver=solver, boundary=boundary, mass=mass, grid=grid)
+    check(f, jnp.asarray(random_spd(rng, (8, 9), 0.5)), 0.1 * symmetric(rng, (8, 9)), adjoint=1e-11, step=2e-3)
+
+
+@pytest.mark.parametrize("boundary", ["neumann", "mirror"])
+def test_the_cube(rng, boundary):
+    grid, solver = hj.Grid((5, 5, 5), 0.2), "dense" if boundary == "mirror" else "shift-invert"
+    pairs = hj.eigenpairs(hj.TensorField(grid, identity(grid.shape)), 40, boundary, "dense", multiplet="complete")
+    k = int(pairs.kept.sum())  # a cube's eigenvalues have up to six copies
+    f = partial(hks_of, k=k, solver=solver, boundary=boundary, grid=grid)
+    check(f, identity(grid.shape), 0.1 * symmetric(rng, grid.shape), adjoint=1e-11)
+
+
+def octahedron_sphere(levels=2):
+    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    for _ in range(levels):
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+        middle = len(vertices) + inverse.reshape(-1, 3)
+        a, b, c = faces.T
+        ab, bc, ca = middle.T
+        faces = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+        vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, faces
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_mesh_by_vertices_and_by_face_metrics(rng, solver):
+    """A sphere with the octahedron's symmetry: nearly every eigenvalue is multiple."""
+    vertices, faces = octahedron_sphere()
+    times = jnp.array([0.1, 1.0])
+
+    def by_vertices(vertices):
+        return hj.hks(hj.eigenpairs(hj.SurfaceMesh(vertices, faces), 16, solver=solver), times)
+
+    def by_metric(metric):
+        mesh = hj.SurfaceMesh(vertices, faces, metric)
+        return hj.hks(hj.eigenpairs(mesh, 16, solver=solver), times)
+
+    direction = jnp.asarray(rng.standard_normal(vertices.shape))
+    check(by_vertices, jnp.asarray(vertices), 0.02 * direction, adjoint=1e-11)
+    metric = hj.SurfaceMesh(vertices, faces).metric
+    noise = 0.05 * metric * jnp.asarray(rng.standard_normal((len(faces), 1, 1)))
+    check(by_metric, metric, noise, adjoint=1e-11)
+    np.testing.assert_allclose(by_metric(metric), by_vertices(jnp.asarray(vertices)), rtol=1e-12)
+
+
+SIGNATURES = {
+    "hks by trace": lambda p: hj.hks(p, TIMES, "heat-trace"),
+    "heat kernel": lambda p: hj.heat_kernel(p, TIMES, [(2, 3), (7, 7)]),
+    "heat trace": lambda p: hj.heat_trace(p, TIMES),
+    "wks": lambda p: hj.wks(p, [2.5, 3.5], 0.4),
+    "wks by default": lambda p: hj.wks(p)[::20],
+    "scale-invariant": lambda p: hj.scale_invariant_hks(p, 4, 32),
+    "diffusion distance": lambda p: hj.diffusion_distance(p, TIMES, (2, 3)),
+    "biharmonic distance": lambda p: hj.biharmonic_distance(p, [(2, 3), (0, 0)]),
+    "shape DNA": lambda p: hj.shape_dna(p)[1:3].sum(),
+    "default times": lambda p: hj.hks(p, hj.default_times(p, 3)),
+    "custom": lambda p: hj.spectral_signature(p, lambda a, x: 1 / (a["shift"] + x) ** 2, {"shift": jnp.array([1.0, 9.0])}),
+    "custom columns": lambda p: hj.spectral_signature(p, lambda a, x: jnp.tanh(x / a), jnp.array([5.0, 50.0]), (1, 1)),
+}
+
+
+@pytest.mark.parametrize("name", SIGNATURES)
+@pytest.mark.parametrize("at", ["generic", "rotational"])
+def test_every_signature_against_differences(rng, name, at):
+    signature = SIGNATURES[name]
+
+    def f(tensors):
+        return signature(hj.eigenpairs(hj.TensorField(GRID, tensors), 24, solver="dense"))
+
+    tensors = FIELDS[at](rng)
+    assert hj.eigenpairs(hj.TensorField(GRID, tensors), 24, solver="dense").cut_multiplet == 0
+    check(f, tensors, 0.1 * symmetric(rng, SHAPE), step=2e-3)
+
+
+def test_parameters_of_the_filters(rng):
+    tensors = FIELDS["rotational"](rng)
+    pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 20)
+    check(lambda t: hj.hks(pairs, t), TIMES, 0.1 * TIMES)
+    check(lambda e: hj.wks(pairs, e, 0.4), jnp.array([2.5, 3.5]), jnp.array([1.0, -0.5]))
+    check(lambda s: hj.wks(pairs, [2.5, 3.5], s), jnp.asarray(0.4), jnp.asarray(0.1))
+    check(lambda t: hj.heat_kernel(pairs, t, (3, 3)), TIMES, 0.1 * TIMES)
+
+    def both(x):  # the tensors and the times move together
+        return hks_of(tensors + x * symmetric(np.random.default_rng(5), SHAPE), times=TIMES * jnp.exp(x))
+
+    check(both, jnp.asarray(0.0), jnp.asarray(0.1))
+
+
+def test_second_derivatives_are_right_or_refused(rng):
+    tensors, direction = FIELDS["rotational"](rng), 0.1 * symmetric(rng, SHAPE)
+
+    def loss(tensors, times):
+        return jnp.sum(hks_of(tensors, times=times) ** 2)
+
+    for second in (
+        lambda: jax.jvp(lambda T: jax.grad(loss)(T, TIMES), (tensors,), (direction,)),
+        lambda: jax.grad(lambda T: jnp.vdot(jax.grad(loss)(T, TIMES), direction))(tensors),
+        lambda: jax.jvp(lambda T: jax.jvp(lambda T: loss(T, TIMES), (T,), (direction,))[1], (tensors,), (direction,)),
+        lambda: jax.jit(jax.hessian(lambda x: loss(tensors + x * direction, TIMES)))(0.0),
+        lambda: jax.jvp(lambda T: jax.grad(loss, 1)(T, TIMES), (tensors,), (direction,)),
+    ):
+        with pytest.raises(NotImplementedError, match="second derivatives .* are not implemented"):
+            second()
+    # In the times, and in the times after the tensors, they are right.
+    check(lambda t: jax.jvp(lambda T: loss(T, t), (tensors,), (direction,))[1], TIMES, 0.1 * TIMES)
+    pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 20)
+    second = jax.hessian(lambda t: jnp.sum(hj.hks(pairs, t)[:, 2, 3]))(TIMES)
+    exact = jnp.sum(jnp.square(pairs.eigenvalues * pairs.eigenfunctions[:, 2, 3]) * jnp.exp(-TIMES[:, None] * pairs.eigenvalues), 1)
+    np.testing.assert_allclose(second, jnp.diag(exact), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_batched_equals_looped_and_jitted_equals_eager(rng, solver):
+    batch = jnp.stack([FIELDS["generic"](rng), FIELDS["identity"](rng)])
+    gradient = jax.grad(lambda T: jnp.sum(hks_of(T, solver=solver) ** 2))
+    looped = jnp.stack([gradient(T) for T in batch])
+    scale = float(jnp.max(jnp.abs(looped)))
+    np.testing.assert_allclose(jax.vmap(gradient)(batch), looped, atol=1e-9 * scale)
+    np.testing.assert_allclose(jax.jit(gradient)(batch[1]), looped[1], atol=1e-9 * scale)
+
+
+def test_sparse_derivatives_are_as_good_as_dense_ones(rng):
+    """64² nodes, k = 100, every solver setting at its default."""
+    grid, k = hj.Grid((64, 64), 1 / 63), 100
+    tensors, direction = jnp.asarray(random_spd(rng, (64, 64), 0.5)), 0.1 * symmetric(rng, (64, 64))
+    times = jnp.array([0.01, 0.1])
+    probe = jnp.asarray(rng.standard_normal((2, 64, 64)))
+
+    def loss(T):
+        return jnp.sum(probe * hj.hks(hj.eigenpairs(hj.TensorField(grid, T), k, solver="shift-invert"), times))
+
+    slope = jnp.vdot(jax.grad(loss)(tensors), direction)
+    assert float(slope) == pytest.approx(float(directional(loss, tensors, direction)), rel=1e-7)
+
+
+def test_eigenvalues_and_simple_eigenvectors(rng):
+    tensors, direction = FIELDS["generic"](rng), 0.1 * symmetric(rng, SHAPE)
+    for solver in SOLVERS:
+
+        def f(tensors, solver=solver):
+            pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 8, solver=solver)
+            fixed = pairs.vectors * jnp.sign(pairs.vectors[:, :1])
+            return jnp.concatenate([pairs.eigenvalues[:, None], fixed], axis=1)
+
+        check(f, tensors, direction, rtol=1e-6, adjoint=1e-10, step=2e-3)
+
+
+def test_eigenvalues_within_a_cluster_are_finite_and_right_in_sum(rng):
+    direction = 0.1 * symmetric(rng, SHAPE)
+
+    def pairs_at(T):
+        return hj.eigenpairs(hj.TensorField(GRID, T), 3)
+
+    def total(T):
+        return jnp.sum(pairs_at(T).eigenvalues)
+
+    check(total, identity(SHAPE), direction)
+    tangent = jax.jvp(lambda T: pairs_at(T).vectors, (identity(SHAPE),), (direction,))[1]
+    assert jnp.isfinite(tangent).all()
+    # Φ stays M-orthonormal to first order, whatever the gauge.
+    gram = jax.jvp(lambda T: (p := pairs_at(T)).vectors @ p.pencil.mass.apply(p.vectors).T, (identity(SHAPE),), (direction,))
+    np.testing.assert_allclose(gram[1], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_cut_cluster_is_completed_or_dropped(rng, solver):
+    tensors, direction = identity(SHAPE), 0.1 * symmetric(rng, SHAPE)
+
+    def signature(T, k, multiplet):
+        return hj.hks(hj.eigenpairs(hj.TensorField(GRID, T), k, solver=solver, multiplet=multiplet), TIMES)
+
+    expected = {"drop": 4, "complete": 6}  # k = 5 cuts λ = 4π²(1, 0), (0, 1)
+    for multiplet, k in expected.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 5, solver=solver, multiplet=multiplet)
+        assert pairs.kept.sum() == k
+        assert f"{k} of them kept" in pairs.summary()
+        assert hj.default_times(pairs, 2)[0] == pytest.approx(float(4 * np.log(10) / pairs.eigenvalues[k - 1]))
+        np.testing.assert_allclose(signature(tensors, 5, multiplet), signature(tensors, k, "report"), rtol=1e-9)
+        for mode in (jax.jvp, jax.jit(jax.jvp, static_argnums=0)):
+            got = mode(partial(signature, k=5, multiplet=multiplet), (tensors,), (direction,))[1]
+            truth = jax.jvp(partial(signature, k=k, multiplet="report"), (tensors,), (direction,))[1]
+            np.testing.assert_allclose(got, truth, rtol=1e-8, atol=1e-8)
+    with pytest.raises(ValueError, match='multiplet: got \'keep\'; expected "report", "drop" or "complete"'):
+        hj.eigenpairs(hj.TensorField(GRID, tensors), 5, multiplet="keep")
+
+
+def test_solves_that_do_not_converge_are_nan_and_reported():
+    """Twelve equal squares: twelve-fold eigenvalues, cut beyond what the guard pairs reach."""
+    mask = np.zeros((18, 24), dtype=bool)
+    for i, j in np.ndindex(3, 4):
+        mask[6 * i : 6 * i + 5, 6 * j : 6 * j + 5] = True
+    grid = hj.Grid(mask.shape, mask=mask, components="all")
+
+    def loss(T, multiplet):
+        pairs = hj.eigenpairs(hj.TensorField(grid, T), 13, solver="shift-invert", multiplet=multiplet)
+        return jnp.nansum(hj.hks(pairs, [4.0]) ** 2 * jnp.arange(18.0)[:, None])
+
+    tensors = identity(mask.shape)
+    with pytest.warns(hj.AccuracyWarning, match=r"solves for \d+ of 13 eigenpairs did not converge .*multiplet='drop'"):
+        gradient = jax.grad(loss)(tensors, "report")
+    assert jnp.isnan(gradient[mask]).any()
+    assert jnp.isfinite(jax.grad(loss)(tensors, "drop")).all()
+
+
+def test_progress_and_settings_of_the_solves(rng):
+    told = []
+    solver = hj.ShiftInvert(progress=told.append)
+    jax.grad(lambda T: jnp.sum(hks_of(T, solver=solver)))(FIELDS["generic"](rng))
+    assert any(text.startswith("derivative: error") for text in told)
+    with pytest.raises(ValueError, match="derivative_tolerance: got 0; expected between 0 and 1"):
+        hj.ShiftInvert(derivative_tolerance=0)
+
+
+def test_moving_the_pairs_themselves_is_plain_differentiation(rng):
+    pairs = hj.eigenpairs(hj.TensorField(GRID, FIELDS["generic"](rng)), 5)
+
+    def shifted(x):
+        import equinox as eqx
+
+        return hj.hks(eqx.tree_at(lambda p: p.eigenvalues, pairs, pairs.eigenvalues + x), TIMES)
+
+    check(shifted, jnp.asarray(0.0), jnp.asarray(1.0))
+
+
+def test_no_array_is_larger_than_the_eigenvectors_or_the_divided_differences(rng):
+    """Neither N × N, nor entries × k × times: the memory of a gradient, read off its jaxpr."""
+    shape, k, n_times = (24, 24), 20, 30
+    grid, nodes = hj.Grid(shape, 0.1), 24 * 24
+
+    def loss(T):
+        pairs = hj.eigenpairs(hj.TensorField(grid, T), k, solver="shift-invert")
+        return jnp.sum(hj.hks(pairs, jnp.linspace(0.1, 1, n_times)) ** 2)
+
+    def sizes(jaxpr):
+        for equation in jaxpr.eqns:
+            yield from (v.aval.size for v in equation.outvars if hasattr(v.aval, "size"))
+            for inner in jax.tree.leaves(equation.params, is_leaf=lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr")):
+                if hasattr(inner, "jaxpr"):
+                    yield from sizes(inner.jaxpr)
+                elif hasattr(inner, "eqns"):
+                    yield from sizes(inner)
+
+    jaxpr = jax.make_jaxpr(jax.grad(loss))(jnp.asarray(random_spd(rng, shape)))
+    guards = hj.ShiftInvert().guards(k, nodes)
+    assembly = 4 * 4 * 4 * 4 * nodes  # element matrices with their quadrature points, whatever k is
+    assert max(sizes(jaxpr.jaxpr)) <= max(nodes * (k + guards), n_times * max(nodes, k**2), assembly)
