@@ -195,7 +195,9 @@ SIGNATURES = {
     "biharmonic distance": lambda p: hj.biharmonic_distance(p, [(2, 3), (0, 0)]),
     "shape DNA": lambda p: hj.shape_dna(p)[1:3].sum(),
     "default times": lambda p: hj.hks(p, hj.default_times(p, 3)),
-    "custom": lambda p: hj.spectral_signature(p, lambda a, x: 1 / (a["shift"] + x) ** 2, {"shift": jnp.array([1.0, 9.0])}),
+    "custom": lambda p: hj.spectral_signature(
+        p, lambda a, x: 1 / (a["shift"] + x) ** 2, {"shift": jnp.array([1.0, 9.0])}
+    ),
     "custom columns": lambda p: hj.spectral_signature(p, lambda a, x: jnp.tanh(x / a), jnp.array([5.0, 50.0]), (1, 1)),
 }
 
@@ -210,7 +212,10 @@ def test_every_signature_against_differences(rng, name, at):
 
     tensors = FIELDS[at](rng)
     assert hj.eigenpairs(hj.TensorField(GRID, tensors), 24, solver="dense").cut_multiplet == 0
-    check(f, tensors, 0.1 * symmetric(rng, SHAPE), step=2e-3)
+    # Default times and energies follow λ₁, which has a kink where it is multiple: there the mean of the one-sided
+    # derivatives is meant, and extrapolation gains nothing.
+    kink = at == "rotational" and name in ("wks by default", "scale-invariant", "default times")
+    check(f, tensors, 0.1 * symmetric(rng, SHAPE), step=5e-4 if kink else 2e-3, rtol=1e-5 if kink else 1e-7)
 
 
 def test_parameters_of_the_filters(rng):
@@ -246,7 +251,9 @@ def test_second_derivatives_are_right_or_refused(rng):
     check(lambda t: jax.jvp(lambda T: loss(T, t), (tensors,), (direction,))[1], TIMES, 0.1 * TIMES)
     pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 20)
     second = jax.hessian(lambda t: jnp.sum(hj.hks(pairs, t)[:, 2, 3]))(TIMES)
-    exact = jnp.sum(jnp.square(pairs.eigenvalues * pairs.eigenfunctions[:, 2, 3]) * jnp.exp(-TIMES[:, None] * pairs.eigenvalues), 1)
+    exact = jnp.sum(
+        jnp.square(pairs.eigenvalues * pairs.eigenfunctions[:, 2, 3]) * jnp.exp(-TIMES[:, None] * pairs.eigenvalues), 1
+    )
     np.testing.assert_allclose(second, jnp.diag(exact), rtol=1e-10, atol=1e-10)
 
 
@@ -299,7 +306,9 @@ def test_eigenvalues_within_a_cluster_are_finite_and_right_in_sum(rng):
     tangent = jax.jvp(lambda T: pairs_at(T).vectors, (identity(SHAPE),), (direction,))[1]
     assert jnp.isfinite(tangent).all()
     # Φ stays M-orthonormal to first order, whatever the gauge.
-    gram = jax.jvp(lambda T: (p := pairs_at(T)).vectors @ p.pencil.mass.apply(p.vectors).T, (identity(SHAPE),), (direction,))
+    gram = jax.jvp(
+        lambda T: (p := pairs_at(T)).vectors @ p.pencil.mass.apply(p.vectors).T, (identity(SHAPE),), (direction,)
+    )
     np.testing.assert_allclose(gram[1], 0, atol=1e-12)
 
 

@@ -19,6 +19,8 @@ _BLOCK = 16
 _FACTORISATION = 100
 """What one factorisation costs, in solves of one column."""
 _MAX_ITERATIONS = 200
+_SINGULAR = 1e-8
+"""The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
 
 
 def solve_complement(
@@ -66,7 +68,7 @@ def solve_complement(
         for start in range(0, rows.size, _BLOCK):
             block = rows[start : start + _BLOCK]
             solution, errors[block], taken = _conjugate_gradients(
-                K, M, values[block], phi, m_phi, rhs[block].T, factor, wanted[block]
+                K, M, values[block], phi, m_phi, rhs[block].T, factor, wanted[block], beyond
             )
             x[block] = solution.T
             steps += taken * block.size
@@ -83,6 +85,7 @@ def _conjugate_gradients(
     b: np.ndarray,
     factor: SuperLU,
     wanted: np.ndarray,
+    beyond: float,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Solve a block of columns; return x (n, b), the errors over the wanted ones (b,), and the number of steps."""
 
@@ -98,16 +101,18 @@ def _conjugate_gradients(
     steps = 0
     while left.size and steps < _MAX_ITERATIONS:
         steps += 1
-        a_p = K @ p - (M @ p) * eigenvalues[left]
+        m_p = M @ p
+        a_p = K @ p - m_p * eigenvalues[left]
         curvature = np.einsum("nb,nb->b", p, a_p)
-        length = energy / np.where(curvature > 0, curvature, np.inf)
+        # Where it nearly vanishes, an eigenvalue equal to λᵢ is left on the complement: there is no solution.
+        regular = curvature > _SINGULAR * beyond * np.einsum("nb,nb->b", p, m_p)
+        length = energy / np.where(regular, curvature, np.inf)
         x[:, left] += length * p
         r = r - length * a_p
         z = precondition(r)
         before, energy = energy, np.einsum("nb,nb->b", r, z)
-        # Not positive definite: an eigenvalue equal to λᵢ is left on the complement, and the iteration is hopeless.
-        errors[left] = np.where(curvature > 0, np.sqrt(np.abs(energy) / first[left]) / wanted[left], np.inf)
-        open_ = (errors[left] > 1) & (curvature > 0)
+        errors[left] = np.where(regular, np.sqrt(np.abs(energy) / first[left]) / wanted[left], np.inf)
+        open_ = (errors[left] > 1) & regular
         p = z + (energy / before) * p
         if not open_.all():  # go on with the others alone
             left, r, p, energy = left[open_], r[:, open_], p[:, open_], energy[open_]

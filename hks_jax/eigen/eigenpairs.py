@@ -17,7 +17,7 @@ class Eigenpairs(eqx.Module):
         eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for the constant of each natural component.
         vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the reflected domain under "mirror").
         frame: (k, n_dof) the same numbers; only their derivative differs. It leaves out the rotations of the
-            eigenfunctions among themselves, which are singular at multiple eigenvalues and which signatures do not need.
+            eigenfunctions among themselves, which are singular at multiple eigenvalues and of no use to signatures.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁).
         converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
         kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was

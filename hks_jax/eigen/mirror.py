@@ -15,15 +15,15 @@ from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import MirrorPencil
 
 
-def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, name: str) -> Eigenpairs:
-    """Solve the mixed problems and return the k lowest pairs of all, or as many as there are.
+def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str) -> Eigenpairs:
+    """Solve the mixed problems and return the k + extra lowest pairs of all.
 
     How many come from each part is not known beforehand. Where values are concrete, ask for a fair share with a margin
-    and double it wherever the merged spectrum could still miss a pair; traced, ask every part for k.
+    and double it wherever the merged spectrum could still miss a pair; traced, ask every part for all.
     """
-    parts = pencil.parts
-    limits = [min(k, part.space.n_dof) for part in parts]
-    share = math.ceil(k / len(parts)) + 2 * math.isqrt(k) + 4
+    parts, total = pencil.parts, k + extra
+    limits = [min(total, part.space.n_dof) for part in parts]
+    share = math.ceil(total / len(parts)) + 2 * math.isqrt(total) + 4
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(jax.lax.stop_gradient(pencil)))
     wanted = limits if traced else [min(limit, share) for limit in limits]
     # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
@@ -35,23 +35,23 @@ def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, name:
     while not traced:
         spectra = [np.asarray(jax.lax.stop_gradient(pairs.eigenvalues)) for pairs in solved]
         merged = np.sort(np.concatenate(spectra))
-        reach = merged[k - 1] if merged.size >= k else np.inf
+        reach = merged[total - 1] if merged.size >= total else np.inf
         short = [
             i
             for i, spectrum in enumerate(spectra)
-            if wanted[i] < limits[i] and (merged.size < k or spectrum[-1] < reach)
+            if wanted[i] < limits[i] and (merged.size < total or spectrum[-1] < reach)
         ]
         if not short:
             break
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name)
-    return _merge(pencil, tuple(solved), k, name)
+    return _merge(pencil, tuple(solved), k, extra, name)
 
 
-def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, name: str) -> Eigenpairs:
+def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
     values = jnp.concatenate([pairs.eigenvalues for pairs in solved])
-    lowest = jnp.argsort(values)[:k]
+    lowest = jnp.argsort(values)[: k + extra]
     # An eigenfunction of the reflected domain has unit norm there, hence 1/√2^m of it here.
     vectors = jnp.concatenate(
         [pencil.space.restrict(pairs.space.extend(pairs.vectors, outside=0.0)) for pairs in solved]
@@ -60,7 +60,7 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, name: s
     return Eigenpairs(
         values[lowest],
         vectors,
-        _frame(vectors, pencil, part),
+        jnp.concatenate([_frame(vectors[:k], pencil, part[:k]), vectors[k:]]),
         jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
         jnp.concatenate([pairs.converged for pairs in solved])[lowest],
         kept=jnp.ones(lowest.shape, bool),

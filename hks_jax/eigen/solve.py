@@ -74,10 +74,11 @@ def eigenpairs(
     size = min(k + SPARE, total) if multiplet == "complete" else k
     choices = [choose_solver(solver, part, size) for part in pencil.parts]
     name = " + ".join(dict.fromkeys(choice.name for choice in choices))
+    extra = min(1, total - size)  # to see where the spectrum is cut
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_mirror(pencil, choices, min(size + 1, total), name)
+        pairs = solve_mirror(pencil, choices, size, extra, name)
     else:
-        pairs = solve_part(pencil, choices[0], size, min(1, total - size), name)
+        pairs = solve_part(pencil, choices[0], size, extra, name)
     pairs = truncate(pairs, k, multiplet)
     known = jax.lax.stop_gradient(pairs)
     if not isinstance(known.eigenvalues, jax.core.Tracer):

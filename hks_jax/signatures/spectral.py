@@ -59,8 +59,8 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
-# xᵢ the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept count as pairs with
-# f = 0. Under "mirror" pairs of different parts do not mix.
+# xᵢ the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept count as pairs
+# with f = 0. Under "mirror" pairs of different parts do not mix.
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(contraction: Contraction, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (filters, pairs), (d_filters, d_pairs) = primals, tangents
