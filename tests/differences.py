@@ -1,4 +1,4 @@
-"""Derivatives by differences, and spectral functions without an eigensolver: what exact derivatives are held against."""
+"""Derivatives by differences, and spectral functions without an eigensolver: the references of exact derivatives."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -44,7 +44,7 @@ FIELDS = {
 }
 
 
-def check(f, x, direction, rtol=1e-7, adjoint=1e-12, step=4e-3, atol=0.0):
+def check(f, x, direction, rtol=1e-7, adjoint=1e-12, step=4e-3):
     """Forward and reverse mode of f (any output, NaN where it likes) along one direction, against differences."""
     probe = jnp.asarray(np.random.default_rng(1).standard_normal(jax.eval_shape(f, x).shape))
 
@@ -55,7 +55,7 @@ def check(f, x, direction, rtol=1e-7, adjoint=1e-12, step=4e-3, atol=0.0):
     reverse = jnp.vdot(jax.grad(scalar)(x), direction)
     size = float(jnp.nansum(jnp.abs(probe * jax.jvp(f, (x,), (direction,))[1])))
     assert float(forward) == pytest.approx(float(reverse), abs=adjoint * size)
-    assert float(reverse) == pytest.approx(float(directional(scalar, x, direction, step)), rel=rtol, abs=atol)
+    assert float(reverse) == pytest.approx(float(directional(scalar, x, direction, step)), rel=rtol)
 
 
 def hks_of(tensors, k=20, solver="dense", boundary="neumann", mass="consistent", grid=GRID, times=TIMES):
@@ -63,18 +63,16 @@ def hks_of(tensors, k=20, solver="dense", boundary="neumann", mass="consistent",
     return jnp.sqrt(times).reshape(-1, *[1] * len(grid.shape)) * hj.hks(pairs, times)
 
 
+# 60 cuts a multiple eigenvalue of the square.
+TRUNCATIONS = [("generic", 30), ("generic", 60), ("identity", 30), ("identity", 58)]
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("name", FIELDS)
-@pytest.mark.parametrize("k", [20, 30, 60])
+@pytest.mark.parametrize(("name", "k"), [(name, 20) for name in FIELDS] + TRUNCATIONS)
 def test_hks_against_differences(rng, name, solver, k):
-    if k != 20 and name not in ("generic", "identity"):
-        pytest.skip("the truncation is varied on two fields")
     tensors = FIELDS[name](rng)
-    if name != "generic" and k == 60:
-        k = 58  # 60 cuts a multiple eigenvalue of the square
     assert hj.eigenpairs(hj.TensorField(GRID, tensors), k, solver="dense").cut_multiplet == 0
-    adjoint = 1e-12 if solver == "dense" else 1e-11
-    check(partial(hks_of, k=k, solver=solver), tensors, 0.1 * symmetric(rng, SHAPE), adjoint=adjoint)
+    check(partial(hks_of, k=k, solver=solver), tensors, 0.1 * symmetric(rng, SHAPE))
 
 
 @pytest.mark.parametrize("name", ["generic", "identity", "noise 1e-9"])
@@ -126,8 +124,7 @@ def test_full_spectrum_against_the_matrix_exponential(rng, name):
         ("dirichlet", "consistent", "shift-invert"),
         ("dirichlet", "lumped", "dense"),
         (("periodic", ("neumann", "dirichlet")), "consistent", "dense"),
-        ("mirror", "consistent", "dense"),
-        ("mirror", "lumped", "shift-invert"),
+        (("mirror", "neumann"), "lumped", "dense"),
         (("mirror", "periodic"), "consistent", "shift-invert"),
     ],
 )
@@ -136,16 +133,16 @@ def test_every_boundary_and_mask(rng, boundary, mass, solver):
     mask[:3, 5:] = False
     grid = hj.Grid((8, 9), 0.15, mask=mask)
     f = partial(hks_of, k=14, solver=solver, boundary=boundary, mass=mass, grid=grid)
-    check(f, jnp.asarray(random_spd(rng, (8, 9), 0.5)), 0.1 * symmetric(rng, (8, 9)), adjoint=1e-11, step=2e-3)
+    check(f, jnp.asarray(random_spd(rng, (8, 9), 0.5)), 0.1 * symmetric(rng, (8, 9)), step=2e-3)
 
 
-@pytest.mark.parametrize("boundary", ["neumann", "mirror"])
+@pytest.mark.parametrize("boundary", ["neumann", pytest.param("mirror", marks=pytest.mark.slow)])
 def test_the_cube(rng, boundary):
-    grid, solver = hj.Grid((5, 5, 5), 0.2), "dense" if boundary == "mirror" else "shift-invert"
-    pairs = hj.eigenpairs(hj.TensorField(grid, identity(grid.shape)), 40, boundary, "dense", multiplet="complete")
+    grid, solver = hj.Grid((4, 4, 4), 0.2), "dense" if boundary == "mirror" else "shift-invert"
+    pairs = hj.eigenpairs(hj.TensorField(grid, identity(grid.shape)), 25, boundary, "dense", multiplet="complete")
     k = int(pairs.kept.sum())  # a cube's eigenvalues have up to six copies
     f = partial(hks_of, k=k, solver=solver, boundary=boundary, grid=grid)
-    check(f, identity(grid.shape), 0.1 * symmetric(rng, grid.shape), adjoint=1e-11)
+    check(f, identity(grid.shape), 0.1 * symmetric(rng, grid.shape))
 
 
 def octahedron_sphere(levels=2):
@@ -177,10 +174,10 @@ def test_mesh_by_vertices_and_by_face_metrics(rng, solver):
         return hj.hks(hj.eigenpairs(mesh, 16, solver=solver), times)
 
     direction = jnp.asarray(rng.standard_normal(vertices.shape))
-    check(by_vertices, jnp.asarray(vertices), 0.02 * direction, adjoint=1e-11)
+    check(by_vertices, jnp.asarray(vertices), 0.02 * direction)
     metric = hj.SurfaceMesh(vertices, faces).metric
     noise = 0.05 * metric * jnp.asarray(rng.standard_normal((len(faces), 1, 1)))
-    check(by_metric, metric, noise, adjoint=1e-11)
+    check(by_metric, metric, noise)
     np.testing.assert_allclose(by_metric(metric), by_vertices(jnp.asarray(vertices)), rtol=1e-12)
 
 
@@ -245,7 +242,7 @@ def test_second_derivatives_are_right_or_refused(rng):
         lambda: jax.jit(jax.hessian(lambda x: loss(tensors + x * direction, TIMES)))(0.0),
         lambda: jax.jvp(lambda T: jax.grad(loss, 1)(T, TIMES), (tensors,), (direction,)),
     ):
-        with pytest.raises(NotImplementedError, match="second derivatives .* are not implemented"):
+        with pytest.raises(NotImplementedError, match=r"second derivatives .* are not implemented"):
             second()
     # In the times, and in the times after the tensors, they are right.
     check(lambda t: jax.jvp(lambda T: loss(T, t), (tensors,), (direction,))[1], TIMES, 0.1 * TIMES)
@@ -348,7 +345,7 @@ def test_solves_that_do_not_converge_are_nan_and_reported():
         return jnp.nansum(hj.hks(pairs, [4.0]) ** 2 * jnp.arange(18.0)[:, None])
 
     tensors = identity(mask.shape)
-    with pytest.warns(hj.AccuracyWarning, match=r"solves for \d+ of 13 eigenpairs did not converge .*multiplet='drop'"):
+    with pytest.warns(hj.AccuracyWarning, match=r"solves for \d+ of 13 eigenpairs did not converge.*multiplet='drop'"):
         gradient = jax.grad(loss)(tensors, "report")
     assert jnp.isnan(gradient[mask]).any()
     assert jnp.isfinite(jax.grad(loss)(tensors, "drop")).all()

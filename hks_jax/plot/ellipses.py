@@ -53,8 +53,8 @@ def ellipses(
         raise ValueError(f'sizes: got {sizes!r}; expected "common" or "fit"')
     if not 0 < fill <= 1:
         raise ValueError(f"fill: got {fill}; expected a number in (0, 1]; ellipses overlap beyond 1")
-    steps = _steps(grid.shape, grid.spacing, every)
-    pick = tuple(_centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
+    steps = node_steps(grid.shape, grid.spacing, every)
+    pick = tuple(centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
     inside = grid.inside[pick]
     if not inside.any():
         raise ValueError(f"every: got {every}; no node drawn lies inside the mask. Use a smaller step")
@@ -103,14 +103,17 @@ def ellipses(
     return collection
 
 
-def _centred(n: int, step: int) -> slice:
+def centred(n: int, step: int) -> slice:
     """Return every step-th of n nodes: as many as there is room for, in the middle."""
     count = max(1, n // step)
     first = (n - count * step) // 2 + step // 2
     return slice(first, first + (count - 1) * step + 1, step)
 
 
-def _steps(shape: tuple[int, ...], spacing: tuple[float, ...], every: int | Sequence[int] | None) -> tuple[int, ...]:
+def node_steps(
+    shape: tuple[int, ...], spacing: tuple[float, ...], every: int | Sequence[int] | None
+) -> tuple[int, ...]:
+    """Return the step along each axis: as given, or such that about 24 nodes are drawn along the longer side."""
     if every is None:
         cell = max(n * h for n, h in zip(shape, spacing, strict=True)) / 24
         return tuple(max(1, round(cell / h)) for h in spacing)

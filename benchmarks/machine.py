@@ -1,0 +1,47 @@
+"""What stands beside every measurement: the machine, the versions, and where the result is written."""
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import hks_jax as hj
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def timed(function: Callable[..., Any], *args: Any, repeats: int = 3, warm_up: bool = True) -> tuple[float, Any]:
+    """Return the shortest time of several runs after a warm-up, and the result."""
+    if warm_up:
+        jax.block_until_ready(function(*args))
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = jax.block_until_ready(function(*args))
+        times.append(time.perf_counter() - start)
+    return min(times), result
+
+
+def field(n: int) -> hj.TensorField:
+    """Anisotropic tensors of eigenvalues 1 … 4 and random directions, n² nodes on the unit square."""
+    rng = np.random.default_rng(n)
+    frames = np.linalg.qr(rng.standard_normal((n, n, 2, 2)))[0]
+    values = rng.uniform(1, 4, (n, n, 2))
+    return hj.TensorField(hj.Grid((n, n), 1 / (n - 1)), np.einsum("...ia,...a,...ja->...ij", frames, values, frames))
+
+
+def write(output: Path, rows: Any, **more: Any) -> None:
+    """Write rows with the machine and the versions beside them."""
+    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "device": jax.devices()[0].device_kind}
+    versions = {"python": platform.python_version(), "jax": jax.__version__, "hks_jax": hj.__version__}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = output.with_suffix(".part")
+    temporary.write_text(json.dumps({"machine": machine, "versions": versions, **more, "rows": rows}, indent=2) + "\n")
+    temporary.replace(output)
+    print(f"written to {output}")
