@@ -154,23 +154,6 @@ def test_jit_and_vmap_give_the_looped_result(rng, solver, boundary):
     np.testing.assert_allclose(jax.vmap(signature)(batch), looped, rtol=1e-8, atol=1e-12)
 
 
-def test_derivatives_are_refused_not_wrong(rng):
-    grid, tensors, times = hj.Grid((6, 7)), jnp.asarray(random_spd(rng, (6, 7))), jnp.array([10.0, 20.0])
-
-    def loss(T, times):
-        return jnp.sum(hj.hks(hj.eigenpairs(hj.TensorField(grid, T), 10), times))
-
-    with pytest.raises(NotImplementedError, match="derivatives with respect to the tensors"):
-        jax.grad(loss)(tensors, times)
-    with pytest.raises(NotImplementedError, match="derivatives with respect to the tensors"):
-        jax.jvp(loss, (tensors, times), (tensors, times))
-    slope, step = jax.grad(loss, argnums=1)(tensors, times), 1e-5
-    for i in range(2):
-        e = step * jnp.eye(2)[i]
-        difference = (loss(tensors, times + e) - loss(tensors, times - e)) / (2 * step)
-        assert slope[i] == pytest.approx(float(difference), rel=1e-6)
-
-
 def two_squares() -> hj.TensorField:
     mask = np.ones((4, 9), dtype=bool)
     mask[:, 4] = False

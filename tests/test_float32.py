@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from fields import random_spd
@@ -11,6 +13,7 @@ from fields import random_spd
 import hks_jax as hj
 
 SHAPE, K, TIMES = (16, 17), 40, [0.3, 1.0]
+PROBE = np.random.default_rng(3).standard_normal((2, *SHAPE)).astype(np.float32)
 CASES = [(b, s) for b in ("neumann", "dirichlet", "mirror") for s in ("dense", "shift-invert")]
 
 SCRIPT = """
@@ -23,7 +26,7 @@ field, out = hj.TensorField(hj.Grid({SHAPE}, 0.1), given["tensors"]), {{}}
 for boundary, solver in CASES:
     pairs = hj.eigenpairs(field, K, boundary, solver)
     name = f"{{boundary}} {{solver}} "
-    assert {{leaf.dtype for leaf in jax.tree.leaves(pairs)}} == {{jnp.dtype("float32"), jnp.dtype("bool")}}
+    assert {{leaf.dtype.name for leaf in jax.tree.leaves(pairs)}} == {{"float32", "bool", "int32"}}
     times = jnp.array([3.0, 9.0])
     others = [hj.default_times(pairs, 4), hj.wks(pairs), hj.scale_invariant_hks(pairs), hj.heat_trace(pairs, times),
               hj.truncation(pairs, times).tail, hj.shape_dna(pairs), hj.global_point_signature(pairs)]
@@ -32,10 +35,16 @@ for boundary, solver in CASES:
     assert all(x.dtype == jnp.float32 for x in others)
     assert all(np.isfinite(x[..., 1:-1, 1:-1] if x.ndim > 2 else x).all() for x in others)
     mass = pairs.pencil.parts[0].mass
+
+    def loss(tensors):
+        signature = hj.hks(hj.eigenpairs(hj.TensorField(field.grid, tensors), K, boundary, solver), TIMES)
+        return jnp.sum(given["probe"] * signature)
+
     out |= {{
         name + "values": pairs.eigenvalues,
         name + "converged": pairs.converged,
         name + "hks": hj.hks(pairs, TIMES),
+        name + "gradient": jax.grad(loss)(field.tensors),
         name + "gram": pairs.vectors @ mass.apply(pairs.vectors).T,
     }}
 np.savez(sys.argv[2], **out)
@@ -51,7 +60,7 @@ def tensors() -> np.ndarray:
 def single(tensors, tmp_path_factory) -> dict[str, np.ndarray]:
     """What a float32 process computes."""
     folder: Path = tmp_path_factory.mktemp("float32")
-    np.savez(folder / "in.npz", tensors=tensors)
+    np.savez(folder / "in.npz", tensors=tensors, probe=PROBE)
     script = SCRIPT.format(K=K, TIMES=TIMES, CASES=CASES, SHAPE=SHAPE)
     command = [sys.executable, "-c", script, folder / "in.npz", folder / "out.npz"]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -61,7 +70,7 @@ def single(tensors, tmp_path_factory) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(("boundary", "solver"), CASES)
 def test_float32_agrees_with_float64(tensors, single, boundary, solver):
-    got = {key: single[f"{boundary} {solver} {key}"] for key in ("values", "converged", "hks", "gram")}
+    got = {key: single[f"{boundary} {solver} {key}"] for key in ("values", "converged", "hks", "gradient", "gram")}
     pairs = hj.eigenpairs(hj.TensorField(hj.Grid(SHAPE, 0.1), tensors), K, boundary, "dense")
     assert got["converged"].all()
     assert (got["values"] >= 0).all()
@@ -71,5 +80,14 @@ def test_float32_agrees_with_float64(tensors, single, boundary, solver):
     np.testing.assert_allclose(got["values"], pairs.eigenvalues, rtol=1e-5, atol=atol)
     assert got["hks"].dtype == np.float32
     np.testing.assert_allclose(got["hks"], hj.hks(pairs, TIMES), rtol=1e-3, atol=1e-4)
+
+    def loss(T):
+        return (
+            PROBE * hj.hks(hj.eigenpairs(hj.TensorField(hj.Grid(SHAPE, 0.1), T), K, boundary, "dense"), TIMES)
+        ).sum()
+
+    gradient = jax.grad(loss)(jnp.asarray(tensors))
+    assert got["gradient"].dtype == np.float32
+    assert np.linalg.norm(got["gradient"] - gradient) < 1e-3 * np.linalg.norm(gradient)
     if boundary == "neumann":
         np.testing.assert_allclose(got["gram"], np.eye(K), atol=1e-4)

@@ -17,6 +17,7 @@ from hks_jax.plot import (
     new_figure,
     save_figure,
     scalar_image,
+    sensitivity,
     surface,
     trace,
 )
@@ -373,3 +374,34 @@ def test_surface_colours_triangles_by_their_vertices():
     assert mappable.get_clim() == (0.0, 3.0)
     with pytest.raises(ValueError, match=r"values: got shape \(3,\); expected \(4,\)"):
         surface(ax, SurfaceMesh(vertices, faces), values[:3])
+
+
+# --- sensitivity --------------------------------------------------------------------------------------------
+
+
+def test_sensitivity_draws_the_eigenvectors_of_either_sign():
+    grid = Grid((6, 6), 0.5)
+    gradient = np.zeros((6, 6, 2, 2))
+    gradient[2, 3] = [[4.0, 0.0], [0.0, -1.0]]
+    gradient[4, 4] = [[0.0, 1.0], [1.0, 0.0]]  # ±1 along the diagonals
+    ax = new_figure(3, 3).subplots()
+    bars = sensitivity(ax, grid, gradient, every=1, fill=1.0)
+    segments, colours = np.array(bars.get_segments()), bars.get_colors()
+    lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+    longest = np.argmax(lengths)
+    assert lengths[longest] == pytest.approx(0.5)  # one cell
+    np.testing.assert_allclose(np.sort(segments[longest], axis=0), [[0.75, 1.5], [1.25, 1.5]])
+    crossing = np.flatnonzero(np.isclose(lengths, 0.25) & np.isclose(segments.mean(axis=1), [1.0, 1.5]).all(axis=1))
+    assert len(crossing) == 1
+    assert not np.allclose(colours[longest], colours[crossing[0]])
+    diagonal = np.flatnonzero(np.isclose(segments.mean(axis=1), [2.0, 2.0]).all(axis=1))
+    np.testing.assert_allclose(lengths[diagonal], 0.25)
+    assert len({tuple(colour) for colour in colours[diagonal]}) == 2
+
+
+def test_sensitivity_refuses_what_it_cannot_draw():
+    ax = new_figure(3, 3).subplots()
+    with pytest.raises(ValueError, match=r"gradient: got shape \(6, 6\); expected \(6, 6, 2, 2\)"):
+        sensitivity(ax, Grid((6, 6)), np.zeros((6, 6)))
+    with pytest.raises(ValueError, match="gradient: 36 of 36 tensors drawn are NaN or infinite"):
+        sensitivity(ax, Grid((6, 6)), np.full((6, 6, 2, 2), np.nan), every=1)
