@@ -8,11 +8,15 @@ lies between 1 and (Λ − λᵢ)/(Λ − σ). So the columns are grouped by the
 and a few factorisations bring every column to convergence in a few steps.
 """
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 
 import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
+from threadpoolctl import threadpool_limits
 
 _BLOCK = 16
 """Columns solved at once: enough for fast products, few enough for the cache."""
@@ -62,17 +66,22 @@ def solve_complement(
     share = size / max(size.max(initial=0.0), np.finfo(float).tiny) * (beyond / distance)
     active = np.flatnonzero(share > tolerance * np.finfo(float).eps)
     wanted = np.minimum(tolerance / np.maximum(share, tolerance), 0.1)
-    steps = 0
-    for rows, shift in _groups(values, beyond, active, tolerance):
-        factor = factorise(K - shift * M)
-        for start in range(0, rows.size, _BLOCK):
-            block = rows[start : start + _BLOCK]
-            solution, errors[block], taken = _conjugate_gradients(
-                K, M, values[block], phi, m_phi, rhs[block].T, factor, wanted[block], beyond
-            )
-            x[block] = solution.T
-            steps += taken * block.size
-            report(f"derivative: {steps} solves")
+    done = 0
+
+    def solve(block: np.ndarray, factor: SuperLU) -> None:
+        nonlocal done
+        solution, errors[block] = _conjugate_gradients(
+            K, M, values[block], phi, m_phi, rhs[block].T, factor, wanted[block], beyond
+        )
+        x[block] = solution.T
+        done += block.size
+        report(f"derivative: {done} of {active.size} solves")
+
+    # Blocks are solved side by side, each with one BLAS thread: SuperLU's many small BLAS calls do not gain by more.
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
+        for rows, shift in _groups(values, beyond, active, tolerance):
+            blocks = [rows[start : start + _BLOCK] for start in range(0, rows.size, _BLOCK)]
+            list(threads.map(solve, blocks, repeat(factorise(K - shift * M))))
     return x, errors
 
 
@@ -86,8 +95,8 @@ def _conjugate_gradients(
     factor: SuperLU,
     wanted: np.ndarray,
     beyond: float,
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Solve a block of columns; return x (n, b), the errors over the wanted ones (b,), and the number of steps."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve a block of columns; return x (n, b) and the errors over the wanted ones (b,)."""
 
     def precondition(r: np.ndarray) -> np.ndarray:
         z = factor.solve(r)
@@ -98,9 +107,9 @@ def _conjugate_gradients(
     r = np.ascontiguousarray(b)
     p = z = precondition(r)
     first = energy = np.einsum("nb,nb->b", r, z)
-    steps = 0
-    while left.size and steps < _MAX_ITERATIONS:
-        steps += 1
+    for _ in range(_MAX_ITERATIONS):
+        if left.size == 0:
+            break
         m_p = M @ p
         a_p = K @ p - m_p * eigenvalues[left]
         curvature = np.einsum("nb,nb->b", p, a_p)
@@ -116,7 +125,7 @@ def _conjugate_gradients(
         p = z + (energy / before) * p
         if not open_.all():  # go on with the others alone
             left, r, p, energy = left[open_], r[:, open_], p[:, open_], energy[open_]
-    return x, errors, steps
+    return x, errors
 
 
 def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: float) -> list[tuple[np.ndarray, float]]:
