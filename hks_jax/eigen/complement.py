@@ -58,13 +58,13 @@ def solve_complement(
     m_phi = M @ phi
     x, errors = np.zeros_like(rhs), np.zeros(len(rhs))
     rhs = rhs - (rhs @ phi) @ m_phi.T
-    # Small rows need fewer digits: their share in what is summed over all rows is small. Where the operator amplifies
-    # more, because λᵢ is near Λ, they count for more.
+    # Small rows need fewer digits, or none: their share in what is summed over all rows is small. Where the operator
+    # amplifies more, because λᵢ is near Λ, they count for more.
     beyond = values[-1] * (1 + 1 / values.size) if values[-1] > 0 else 1.0
     distance = beyond - values[: len(rhs)]
     size = np.sqrt(np.einsum("in,in->i", rhs, rhs / M.diagonal()))
     share = size / max(size.max(initial=0.0), np.finfo(float).tiny) * (beyond / distance)
-    active = np.flatnonzero(share > tolerance * np.finfo(float).eps)
+    active = np.flatnonzero(share > tolerance)
     wanted = np.minimum(tolerance / np.maximum(share, tolerance), 0.1)
     done = 0
 

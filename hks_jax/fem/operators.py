@@ -85,6 +85,8 @@ class StencilOperator(Operator):
         shape = self.space.node_shape
         rows, coefficients = x.reshape(-1, *shape), list(self.coefficients)
 
+        # The shifted copies are made again in the transpose: kept, they would be 3^d arrays of the size of x.
+        @jax.checkpoint
         def product_with(some: Float[Array, "*rows_and_shape"]) -> Float[Array, "*rows_and_shape"]:
             y = jnp.zeros((), x.dtype)
             for c, offset in zip(coefficients, product((-1, 0, 1), repeat=len(shape)), strict=True):
