@@ -45,6 +45,7 @@ for boundary, solver in CASES:
         name + "converged": pairs.converged,
         name + "hks": hj.hks(pairs, TIMES),
         name + "gradient": jax.grad(loss)(field.tensors),
+        name + "slope": jax.jvp(loss, (field.tensors,), (field.tensors,))[1],
         name + "gram": pairs.vectors @ mass.apply(pairs.vectors).T,
     }}
 np.savez(sys.argv[2], **out)
@@ -70,7 +71,9 @@ def single(tensors, tmp_path_factory) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(("boundary", "solver"), CASES)
 def test_float32_agrees_with_float64(tensors, single, boundary, solver):
-    got = {key: single[f"{boundary} {solver} {key}"] for key in ("values", "converged", "hks", "gradient", "gram")}
+    got = {
+        key: single[f"{boundary} {solver} {key}"] for key in ("values", "converged", "hks", "gradient", "slope", "gram")
+    }
     pairs = hj.eigenpairs(hj.TensorField(hj.Grid(SHAPE, 0.1), tensors), K, boundary, "dense")
     assert got["converged"].all()
     assert (got["values"] >= 0).all()
@@ -89,5 +92,7 @@ def test_float32_agrees_with_float64(tensors, single, boundary, solver):
     gradient = jax.grad(loss)(jnp.asarray(tensors))
     assert got["gradient"].dtype == np.float32
     assert np.linalg.norm(got["gradient"] - gradient) < 1e-3 * np.linalg.norm(gradient)
+    size = np.sum(np.abs(gradient * tensors))
+    assert got["slope"] == pytest.approx(float(np.sum(gradient * tensors)), abs=1e-3 * size)
     if boundary == "neumann":
         np.testing.assert_allclose(got["gram"], np.eye(K), atol=1e-4)

@@ -396,7 +396,9 @@ def test_sensitivity_draws_the_eigenvectors_of_either_sign():
     assert not np.allclose(colours[longest], colours[crossing[0]])
     diagonal = np.flatnonzero(np.isclose(segments.mean(axis=1), [2.0, 2.0]).all(axis=1))
     np.testing.assert_allclose(lengths[diagonal], 0.25)
-    assert len({tuple(colour) for colour in colours[diagonal]}) == 2
+    rising = np.prod(segments[diagonal, 1] - segments[diagonal, 0], axis=1) > 0
+    np.testing.assert_array_equal(colours[diagonal][rising][0], colours[longest])  # both positive
+    np.testing.assert_array_equal(colours[diagonal][~rising][0], colours[crossing[0]])  # both negative
 
 
 def test_sensitivity_refuses_what_it_cannot_draw():

@@ -104,7 +104,7 @@ def _outside(
 
 
 def indistinct(pencil: Pencil, dtype: np.dtype) -> Float[Array, ""]:
-    """Return the distance below which rounding in K alone makes two eigenvalues one: about ε·λ_max, times 16.
+    """Return the distance below which rounding in K alone makes two eigenvalues one: 4 ε λ_max.
 
     4·max(Kᵢᵢ/Mᵢᵢ) is λ_max on a uniform grid in 2D and 3D.
     """

@@ -13,6 +13,10 @@ from hks_jax.fem.space import FunctionSpace
 class Eigenpairs(eqx.Module):
     """The k lowest eigenpairs of Kφ = λMφ; a pytree.
 
+    The derivatives of signatures with respect to tensors run through `pencil` and `frame`, not through `eigenvalues`
+    and `vectors`. Pairs whose arrays were replaced may be differentiated with respect to the replacement alone: rescale
+    times or the pencil instead.
+
     Attributes:
         eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for the constant of each natural component.
         vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the reflected domain under "mirror").
@@ -23,7 +27,7 @@ class Eigenpairs(eqx.Module):
         kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was
             dropped or completed: then signatures leave out the last pairs, those that are not kept.
         part: (k,) under "mirror", which of the mixed problems a pair comes from; else 0.
-        next_eigenvalue: the first eigenvalue not kept; infinite if there is none.
+        next_eigenvalue: the first eigenvalue not kept; infinite if there is none. Constant to derivatives.
         multiplet_tolerance: the relative gap below which neighbouring eigenvalues count as one multiple eigenvalue.
         pencil: the matrices.
         solver_name: the method that found them.

@@ -22,7 +22,7 @@ def first_order_only(tree: Tree) -> Tree:
 def _refuse(primals: tuple, tangents: tuple) -> NoReturn:
     raise NotImplementedError(
         "second derivatives of eigenpairs and of their signatures with respect to the tensors, the vertices or the "
-        "pencil are not implemented (first derivatives are, and so is differentiating these once more with respect to "
-        "times and other parameters of the filter). For a Hessian use Gauss-Newton products, jax.vjp after jax.jvp of "
-        "the signature, or central differences of jax.grad"
+        "pencil are not implemented. First derivatives are, and their derivatives with respect to times and other "
+        "parameters of the filter (in the other order, with jax.jvp for the inner one). For a Hessian use Gauss-Newton "
+        "products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
     )

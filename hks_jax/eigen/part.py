@@ -18,7 +18,8 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
     if k + extra > solver.max_pairs(n_dof):
         raise ValueError(
             f"k: the {solver.name} solver gives at most {solver.max_pairs(n_dof)} of {n_dof} pairs, and {k + extra} "
-            "are needed (one beyond k, to see where the spectrum is cut). Use a smaller k or the dense solver"
+            "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
+            "Use a smaller k or the dense solver"
         )
     values, vectors, frame = lowest(solver, pencil, k, extra)
     residuals, converged, rounding = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)

@@ -32,8 +32,9 @@ class ShiftInvert(Eigensolver):
     Attributes:
         tolerance: relative residual that counts as converged; ARPACK itself runs to machine precision.
         max_restarts: implicit restarts before giving up.
-        basis: size of the Lanczos basis, more than k; None takes 2k + 20.
-        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm.
+        basis: size of the Lanczos basis, more than k (for derivatives, than 9 + k + k/20); None takes 2k + 20.
+        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
+            below what the eigenvectors' dtype allows.
         progress: called with short texts such as ``"150 solves"`` while it runs; None is silent.
     """
 
@@ -85,10 +86,18 @@ class ShiftInvert(Eigensolver):
     ) -> Float[Array, "k n_dof"]:
         """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement`."""
         data, matrices = _host_matrices(pencil)
+        # What is left after deflation with eigenvectors rounded to their dtype is noise.
+        tolerance = max(self.derivative_tolerance, 8 * float(jnp.finfo(rhs.dtype).eps))
 
         def solve(data_k: np.ndarray, data_m: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
             values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
             if not all(np.isfinite(array).all() for array in (values, vectors, b)):
+                warnings.warn(
+                    f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
+                    "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
+                    AccuracyWarning,
+                    stacklevel=2,
+                )
                 return np.full(rhs.shape, np.nan, rhs.dtype)
             K, M = matrices(data_k, data_m)
             x, errors = solve_complement(
@@ -98,7 +107,7 @@ class ShiftInvert(Eigensolver):
                 vectors,
                 b,
                 factorise=_factorise,
-                tolerance=self.derivative_tolerance,
+                tolerance=tolerance,
                 report=self._report,
             )
             failed = ~(errors <= 1)
@@ -111,7 +120,7 @@ class ShiftInvert(Eigensolver):
                     stacklevel=2,
                 )
                 x[failed] = np.nan
-            self._report(f"derivative: error {np.max(errors, initial=0.0) * self.derivative_tolerance:.1e}")
+            self._report(f"derivative: error {np.max(errors, initial=0.0) * tolerance:.1e}")
             return x.astype(rhs.dtype)
 
         shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)

@@ -38,7 +38,8 @@ def eigenpairs(
     the eigenvalue is simple (docs/derivatives.md).
 
     Args:
-        domain: a tensor field, a surface mesh, or a pencil from `assemble`.
+        domain: a tensor field, a surface mesh, or a pencil from `assemble` (one whose stiffness annihilates the
+            constants of natural components, and so must its perturbations).
         k: how many pairs, 1 … number of degrees of freedom.
         boundary: see `assemble`; belongs to the pencil if one is given.
         solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, or a solver with its settings, such as

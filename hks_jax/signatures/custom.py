@@ -23,7 +23,8 @@ def spectral_signature(
 
     Args:
         pairs: from `eigenpairs`.
-        function: maps (θ, λ) to f, elementwise in λ (any shape), differentiable twice by JAX on λ ≥ 0.
+        function: maps (θ, λ) to f, elementwise in λ (any shape), differentiable by JAX on λ > 0. What is traced must
+            come in by θ and not by closure. Every new function object compiles anew: define it once.
         parameters: θ, a pytree of floating point arrays with a leading axis m.
         sources: None for the diagonal; else node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers.
 

@@ -58,14 +58,20 @@ def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, 
 
 
 def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
-    """Return the eigenvalues times volume^(2/d), which scaling the metric does not change (Reuter et al. 2006)."""
-    if not normalise:
-        return pairs.eigenvalues
-    return pairs.eigenvalues * pairs.pencil.volume ** (2 / pairs.space.dimension)
+    """Return the eigenvalues times volume^(2/d), which scaling the metric does not change (Reuter et al. 2006).
+
+    NaN for pairs that are not kept.
+    """
+    values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)
+    return values if not normalise else values * pairs.pencil.volume ** (2 / pairs.space.dimension)
 
 
 def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
-    """Return φᵢ(x)/√λᵢ for the positive λᵢ (Rustamov 2007); signs, and bases of multiple eigenvalues, are arbitrary."""
+    """Return φᵢ(x)/√λᵢ for the positive λᵢ (Rustamov 2007); signs, and bases of multiple eigenvalues, are arbitrary.
+
+    NaN for pairs that are not kept.
+    """
     positive_range(pairs)
     n = pairs.n_null
-    return pairs.space.extend(pairs.vectors[n:] / jnp.sqrt(pairs.eigenvalues[n:, None]))
+    values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)[n:]
+    return pairs.space.extend(pairs.vectors[n:] / jnp.sqrt(values[:, None]))

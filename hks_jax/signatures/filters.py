@@ -25,17 +25,19 @@ class Filter(eqx.Module):
         """Return (f(high) − f(low))/(high − low) for low ≤ high, and f'(low) where they are equal.
 
         The difference quotient loses digits where low and high are near; the mean of f' over the interval by Gauss
-        quadrature, which is the same number, does where they are far apart. The one with the smaller error estimate is
-        taken, elementwise.
+        quadrature, which is the same number, does where they are far apart. The mean is taken where two rules for it
+        and the quotient agree as far as each can.
         """
         gap = high - low
         slope = _derivative(self)
         coarse, fine = (_mean(slope, low, gap, n) for n in (6, 12))
         apart = gap > 0
-        quotient = (self(high) - self(low)) / jnp.where(apart, gap, 1)
-        rounding = jnp.finfo(gap.dtype).eps * (jnp.abs(self(high)) + jnp.abs(self(low)))
-        near = ~apart | (jnp.abs(fine - coarse) * gap <= rounding)
-        return jnp.where(near, fine, quotient)
+        change, size = self(high) - self(low), jnp.abs(self(high)) + jnp.abs(self(low))
+        eps = jnp.finfo(gap.dtype).eps
+        smooth = jnp.abs(fine - coarse) * gap <= eps * size
+        # Both rules may miss a sharp transition; the quotient does not.
+        smooth &= jnp.abs(fine * gap - change) <= jnp.sqrt(eps) * size
+        return jnp.where(~apart | smooth, fine, change / jnp.where(apart, gap, 1))
 
 
 class Heat(Filter):
@@ -111,6 +113,8 @@ class Derivative(Filter):
 
     def divided_difference(self, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return the directional derivative of the divided difference."""
+        if type(self.filter).divided_difference is Filter.divided_difference:
+            return super().divided_difference(low, high)
         return jax.jvp(lambda f: f.divided_difference(low, high), (self.filter,), (self.direction,))[1]
 
 

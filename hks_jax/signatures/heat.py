@@ -37,9 +37,7 @@ def hks(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> 
     """
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
-    signature = spectral_diagonal(pairs, Heat(times))
-    scale = _normaliser(pairs, times, normalisation)
-    return signature * scale.reshape(-1, *[1] * (signature.ndim - 1))
+    return spectral_diagonal(pairs, Heat(times), _normaliser(pairs, times, normalisation))
 
 
 def _normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:

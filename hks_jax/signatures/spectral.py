@@ -17,9 +17,13 @@ from hks_jax.signatures.contractions import Columns, Contraction, Diagonal, Squa
 from hks_jax.signatures.filters import Derivative, Filter
 
 
-def spectral_diagonal(pairs: Eigenpairs, filters: Filter) -> Float[Array, "m *shape"]:
-    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters; NaN outside the mask."""
-    return pairs.space.extend(_kernel(Diagonal(), filters, pairs))
+def spectral_diagonal(
+    pairs: Eigenpairs, filters: Filter, scale: Float[Array, " m"] | None = None
+) -> Float[Array, "m *shape"]:
+    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters, times its scale; NaN outside the mask."""
+    diagonal = _kernel(Diagonal(), filters, pairs)
+    # NaN comes last: as 0·NaN it would reach the derivatives of the scale.
+    return pairs.space.extend(diagonal if scale is None else scale[:, None] * diagonal)
 
 
 def spectral_columns(pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]) -> Float[Array, "m s *shape"]:
@@ -37,7 +41,7 @@ def spectral_squared_distances(
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
     """Return Σᵢ f(λᵢ) for each of m filters. Its derivative is f'(λᵢ) dλᵢ: no eigenvector enters."""
-    return jnp.sum(_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
+    return jnp.sum(_all_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -45,7 +49,7 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
     """Read the kernels Φ f(Λ) Φᵀ of m filters."""
     # Where JAX differentiates this body and not the rule (the outer of two derivatives), it must not.
     pairs = first_order_only(pairs)
-    return contraction.weighted(_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
+    return contraction.weighted(_all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
 
 
 # The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M where the eigenvectors are not. Of all n eigenpairs its
@@ -68,12 +72,13 @@ def _kernel_jvp(contraction: Contraction, primals: tuple, tangents: tuple) -> tu
     tangent = jnp.zeros_like(value)
     if not _is_constant(d_filters):
         tangent += _kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs)
-    pairs = first_order_only(pairs)
     if not _is_constant(d_pairs.pencil):
+        pairs = first_order_only(pairs)
         tangent += _tangent(contraction, filters, pairs, *_instantiated((d_pairs.pencil, d_pairs.frame)))
     elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
+        pairs = first_order_only(pairs)
         tangent += jax.jvp(
-            lambda values, vectors: contraction.weighted(_weights(filters, values, pairs.kept), vectors),
+            lambda values, vectors: contraction.weighted(_all_weights(filters, values, pairs.kept), vectors),
             (pairs.eigenvalues, pairs.vectors),
             _instantiated((d_pairs.eigenvalues, d_pairs.vectors)),
         )[1]
@@ -89,9 +94,10 @@ def _tangent(
     d_frame: Float[Array, "k n_dof"],
 ) -> Array:
     pencil, values, vectors, kept, part = pairs.pencil, pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
+    d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where it does not count
     stiffness = pencil.among(d_pencil.apply_stiffness(vectors, part), vectors, part)
     mass = pencil.among(d_pencil.apply_mass(vectors, part), vectors, part)
-    weights = _weights(filters, values, kept)
+    weights = _all_weights(filters, values, kept)
     _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (vectors,), (d_frame,))
 
     def inner(one: Filter) -> Array:
@@ -101,8 +107,13 @@ def _tangent(
     return outer + jax.lax.map(inner, filters)
 
 
-def _weights(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, "m k"]:
-    return jnp.where(kept, jax.vmap(lambda one: one(values))(filters), 0)
+def _weights(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
+    """Return f(λᵢ), zero where the pairs are not kept."""
+    return jnp.where(kept, jnp.broadcast_to(one(values), values.shape), 0)
+
+
+def _all_weights(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, "m k"]:
+    return jax.vmap(lambda one: _weights(one, values, kept))(filters)
 
 
 def _divided_differences(
@@ -110,11 +121,13 @@ def _divided_differences(
 ) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
     """Return the matrices [f] and [λf], f being zero where the pairs are not kept."""
     low, high = jnp.minimum(values[:, None], values), jnp.maximum(values[:, None], values)
-    f = jnp.where(kept, one(values), 0)
+    f = _weights(one, values, kept)
     gap = values[:, None] - values
     quotient = (f[:, None] - f) / jnp.where(gap == 0, 1, gap)
     both = kept[:, None] & kept
     of_f = jnp.where(both, one.divided_difference(low, high), quotient)
+    # Between constants G vanishes, and f need not have a derivative at 0.
+    of_f = jnp.where(high == 0, 0, of_f)
     # f at the larger eigenvalue, where it is small, and not the other way round: no cancellation.
     return of_f, jnp.where(gap >= 0, f[:, None], f) + low * of_f
 

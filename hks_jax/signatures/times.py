@@ -46,9 +46,9 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     Raises:
         ValueError: if all k eigenvalues belong to constants.
     """
-    if require_pairs(pairs).n_null >= pairs.k:
+    if _n_positive(require_pairs(pairs)) < 1:
         raise ValueError(
-            f"pairs: all k = {pairs.k} eigenvalues are zero (one per natural component); compute more eigenpairs"
+            f"pairs: all {pairs.n_null} eigenvalues kept are zero (one per natural component); compute more eigenpairs"
         )
     values = pairs.eigenvalues
 
@@ -57,6 +57,13 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
         return jnp.sum(jnp.where(copies, values, 0)) / jnp.sum(copies)
 
     return mean_of_copies(values[pairs.n_null]), mean_of_copies(pairs.last_eigenvalue)
+
+
+def _n_positive(pairs: Eigenpairs) -> int:
+    """Return how many positive eigenvalues are kept, as far as that is known."""
+    kept = jax.lax.stop_gradient(pairs.kept)
+    count = pairs.k if isinstance(kept, jax.core.Tracer) else int(kept.sum())
+    return count - pairs.n_null
 
 
 def default_times(pairs: Eigenpairs, n: int = 16) -> Float[Array, " n"]:
@@ -77,8 +84,8 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
     """
     if n < 29:
         raise ValueError(f"n: got {n}; expected at least 29, so that 2σ fits between the ends twice")
-    if pairs.k - pairs.n_null < 2:
-        raise ValueError(f"pairs: got {pairs.k - pairs.n_null} positive eigenvalue(s); expected two or more")
+    if _n_positive(pairs) < 2:
+        raise ValueError(f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected two or more")
     first, last = (jnp.log(value) for value in positive_range(pairs))
     sigma = 7 * (last - first) / n
     return jnp.linspace(first + 2 * sigma, last - 2 * sigma, n), sigma

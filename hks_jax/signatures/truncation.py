@@ -25,7 +25,7 @@ _BIAS = {"consistent": 0.06, "lumped": 0.44}
 
 
 class Truncation(eqx.Module):
-    """Error estimates for heat kernel signatures at given times.
+    """Error estimates for heat kernel signatures at given times: a diagnostic, constant to derivatives.
 
     Attributes:
         times: (n,).
@@ -68,8 +68,8 @@ def truncation(pairs: Eigenpairs, times: Float[Array, " n"]) -> Truncation:
     beyond the k), the trace beyond Λ is k Γ(d/2 + 1) (Λt)^(−d/2) Q(d/2, Λt), Q the regularised upper incomplete gamma
     function.
     """
-    values = require_pairs(pairs).eigenvalues
-    times = checked_times("times", times, values.dtype)
+    dtype = require_pairs(pairs).eigenvalues.dtype
+    pairs, times = jax.lax.stop_gradient((pairs, checked_times("times", times, dtype)))
     half_d, complete = pairs.space.dimension / 2, jnp.isinf(pairs.next_eigenvalue)
     following = jnp.where(complete, 1, pairs.next_eigenvalue)
     x = following * times

@@ -45,8 +45,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     exponents = jnp.where(positive, -jnp.square((energies[:, None] - logs) / sigma) / 2, -jnp.inf)
     offset = jax.lax.stop_gradient(jnp.max(exponents, axis=1))
     bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
-    signature = spectral_diagonal(pairs, bells)
-    return signature / spectral_trace(pairs, bells).reshape(-1, *[1] * (signature.ndim - 1))
+    return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
 
 
 def _known(array: Array) -> bool:
