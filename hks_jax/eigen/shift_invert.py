@@ -86,8 +86,8 @@ class ShiftInvert(Eigensolver):
     ) -> Float[Array, "k n_dof"]:
         """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement`."""
         data, matrices = _host_matrices(pencil)
-        # What is left after deflation with eigenvectors rounded to their dtype is noise.
-        tolerance = max(self.derivative_tolerance, 8 * float(jnp.finfo(rhs.dtype).eps))
+        # What rounded eigenvectors leave to be solved beyond their own accuracy is noise.
+        tolerance = max(self.derivative_tolerance, 100 * float(jnp.finfo(rhs.dtype).eps))
 
         def solve(data_k: np.ndarray, data_m: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
             values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
