@@ -18,6 +18,7 @@ from hks_jax.curvature import laplace_beltrami as laplace_beltrami
 from hks_jax.domain.grid import Grid as Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
+from hks_jax.eigen.block_lanczos import BlockLanczos as BlockLanczos
 from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
 from hks_jax.eigen.shift_invert import ShiftInvert as ShiftInvert

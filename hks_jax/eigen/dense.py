@@ -35,4 +35,4 @@ def _dense(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"], k: int) ->
     reduced = solve_triangular(factor, half.T, lower=True)
     values, vectors = jnp.linalg.eigh(reduced)
     vectors = solve_triangular(factor, vectors[:, :k], trans="T", lower=True)
-    return values[:k], vectors.T
+    return values[:k], vectors.T, jnp.asarray(jnp.inf, values.dtype)

@@ -8,21 +8,24 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.first_order import first_order_only
-from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.eigen.quality import indistinct
+from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import Pencil
 
 Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
+Certified = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3))
-def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Lowest:
-    """Return the k + extra lowest eigenvalues, their eigenvectors, and these once more as the frame.
+def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Certified:
+    """Return the k + extra lowest eigenvalues, their eigenvectors, these again as the frame, and the solver's bound.
 
     The derivative of the frame is that of the eigenvectors without what rotates them among the first k. The derivatives
     of the last ``extra`` are set to zero.
     """
-    values, vectors = _exact_null_modes(pencil, *solver.lowest(pencil, k + extra))
-    return values, vectors, vectors
+    values, vectors, complete_below = solver.lowest(pencil, k + extra)
+    values, vectors = _exact_null_modes(pencil, values, vectors)
+    return values, vectors, vectors, complete_below
 
 
 # From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ, with the force fᵢ = (dK − λᵢ dM) φᵢ,
@@ -45,16 +48,18 @@ def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Lowest:
 # sum over j > k alone, which no basis of the first k changes (hks_jax/signatures/spectral.py).
 @lowest.defjvp
 def _lowest_jvp(
-    solver: Eigensolver, k: int, extra: int, primals: tuple[Pencil], tangents: tuple[Pencil]
-) -> tuple[Lowest, Lowest]:
-    pencil, (change,) = first_order_only(primals[0]), tangents
+    solver: Eigensolver, k: int, extra: int, primals: tuple[Pencil], changes: tuple[Pencil]
+) -> tuple[Certified, Certified]:
+    pencil, change = first_order_only(primals[0]), changes[0]
     n_dof = pencil.space.n_dof
     total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
-    values, vectors = _exact_null_modes(pencil, *solver.lowest(pencil, total))
+    values, vectors, complete_below = solver.lowest(pencil, total)
+    values, vectors = _exact_null_modes(pencil, values, vectors)
     d_values, d_vectors, d_frame = _tangents(solver, k, pencil, change, values, vectors)
     d_vectors, d_frame = (jnp.pad(d, ((0, extra), (0, 0))) for d in (d_vectors, d_frame))
     values, vectors = values[: k + extra], vectors[: k + extra]
-    return (values, vectors, vectors), (jnp.pad(d_values, (0, extra)), d_vectors, d_frame)
+    tangents = jnp.pad(d_values, (0, extra)), d_vectors, d_frame, jnp.zeros_like(complete_below)
+    return (values, vectors, vectors, complete_below), tangents
 
 
 @partial(jax.jit, static_argnames=("solver", "k"))
@@ -103,16 +108,10 @@ def _outside(
     return jax.lax.custom_linear_solve(matvec, rhs, solve, symmetric=True)
 
 
-def indistinct(pencil: Pencil, dtype: np.dtype) -> Float[Array, ""]:
-    """Return the distance below which rounding in K alone makes two eigenvalues one: 4 ε λ_max.
-
-    4·max(Kᵢᵢ/Mᵢᵢ) is λ_max on a uniform grid in 2D and 3D.
-    """
-    return 4 * jnp.finfo(dtype).eps * 4 * jnp.max(pencil.stiffness.diagonal() / pencil.mass.diagonal())
-
-
 @jax.jit
-def _exact_null_modes(pencil: Pencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]) -> RawPairs:
+def _exact_null_modes(
+    pencil: Pencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
+) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
     """Put the constants, which the stiffness annihilates exactly, in place of the solver's approximations to them.
 
     Their eigenvalue is 0 and not the ±1e-13 of a solver; what rounding left of them in the other vectors is taken out.
@@ -121,7 +120,7 @@ def _exact_null_modes(pencil: Pencil, values: Float[Array, " k"], vectors: Float
     n_null = min(pencil.space.n_null, values.size)
     constants = jnp.asarray(pencil.space.null_labels == np.arange(n_null)[:, None], dtype)
     constants /= jnp.sqrt(jnp.sum(constants * mass.apply(constants), axis=1, keepdims=True))
-    rest = vectors[n_null:]
-    rest = rest - jnp.matmul(jnp.matmul(mass.apply(rest), constants.T, precision="highest"), constants)
-    rest /= jnp.sqrt(jnp.sum(rest * mass.apply(rest), axis=1, keepdims=True))
-    return jnp.concatenate([jnp.zeros(n_null, dtype), values[n_null:]]), jnp.concatenate([constants, rest])
+    share = jnp.matmul(vectors, mass.apply(constants).T, precision="highest")
+    vectors = vectors - jnp.matmul(share, constants, precision="highest")
+    vectors = vectors / jnp.sqrt(1 - jnp.sum(share * share, axis=1, keepdims=True))
+    return values.at[:n_null].set(0), vectors.at[:n_null].set(constants)

@@ -28,6 +28,8 @@ class Eigenpairs(eqx.Module):
             dropped or completed: then signatures leave out the last pairs, those that are not kept.
         part: (k,) under "mirror", which of the mixed problems a pair comes from; else 0.
         next_eigenvalue: the first eigenvalue not kept; infinite if there is none. Constant to derivatives.
+        complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
+            because all were computed. NaN where there is none. Constant to derivatives.
         multiplet_tolerance: the relative gap below which neighbouring eigenvalues count as one multiple eigenvalue.
         pencil: the matrices.
         solver_name: the method that found them.
@@ -41,6 +43,7 @@ class Eigenpairs(eqx.Module):
     kept: Bool[Array, " k"]
     part: Int[Array, " k"]
     next_eigenvalue: Float[Array, ""]
+    complete_below: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
     pencil: Pencil | MirrorPencil
     solver_name: str = eqx.field(static=True)
@@ -111,6 +114,9 @@ class Eigenpairs(eqx.Module):
             f"eigenvalues {values[0]:.6g} … {last:.6g} ({self.n_null} zero; the next is {following:.6g})",
             f"worst relative residual {np.max(residuals):.1e}; {int(np.sum(self.converged))} of {self.k} converged",
         ]
+        bound = float(self.complete_below)
+        if not np.isnan(bound):
+            lines.append("none missed" if bound > min(last, following) else f"none missed below {bound:.6g}")
         if kept < self.k:
             lines.append(f"{kept} of them kept, so that no multiple eigenvalue is cut")
         return "\n".join(lines + self.messages())

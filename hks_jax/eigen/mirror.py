@@ -66,10 +66,18 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: 
         kept=jnp.ones(lowest.shape, bool),
         part=part,
         next_eigenvalue=jnp.asarray(jnp.inf, values.dtype),
+        complete_below=jnp.min(jnp.stack([_complete_below(pairs) for pairs in solved])),
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         pencil=pencil,
         solver_name=name,
     )
+
+
+def _complete_below(pairs: Eigenpairs) -> Float[Array, ""]:
+    """Return the bound below which a part's pairs are complete: of those beyond its last, nothing is known here."""
+    if pairs.k == pairs.space.n_dof:
+        return pairs.complete_below
+    return jnp.minimum(pairs.complete_below, pairs.eigenvalues[-1])
 
 
 @jax.custom_jvp

@@ -48,5 +48,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
     def leading(p: Eigenpairs) -> tuple:
         return p.eigenvalues, p.vectors, p.frame, p.residuals, p.converged, p.part
 
-    shorter = eqx.tree_at(leading, pairs, tuple(leaf[:size] for leaf in leading(pairs)))
+    # Vectors and frame are the same array except to derivatives: to shorten it once saves memory.
+    shortened = {id(leaf): leaf[:size] for leaf in leading(pairs)}
+    shorter = eqx.tree_at(leading, pairs, tuple(shortened[id(leaf)] for leaf in leading(pairs)))
     return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), shorter, (index < count, sequence[count]))

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hks_jax.eigen.derivative import indistinct, lowest
+from hks_jax.eigen.derivative import lowest
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.quality import ROWS, indistinct, relative_defect
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import Pencil
 
@@ -21,7 +22,7 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
-    values, vectors, frame = lowest(solver, pencil, k, extra)
+    values, vectors, frame, complete_below = lowest(solver, pencil, k, extra)
     residuals, converged, rounding = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)
     return Eigenpairs(
         values,
@@ -32,6 +33,7 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
         kept=jnp.ones(values.shape, bool),
         part=jnp.zeros(values.shape, int),
         next_eigenvalue=jnp.asarray(jnp.inf, values.dtype),
+        complete_below=complete_below,
         multiplet_tolerance=jnp.clip(rounding[-1], 1e-6, 1e-3),
         pencil=pencil,
         solver_name=name,
@@ -44,11 +46,10 @@ def _quality(
 ) -> tuple[Array, Array, Array]:
     """Return residuals, whether they are small enough, and what rounding alone makes of them, each (k,)."""
     first = values[min(pencil.space.n_null, values.size - 1)]
-    m_vectors = pencil.mass.apply(vectors)
-    defect = jnp.linalg.norm(pencil.stiffness.apply(vectors) - values[:, None] * m_vectors, axis=1)
+    defect = jax.lax.map(lambda pair: relative_defect(pencil, *pair), (values, vectors), batch_size=ROWS)
     scale = jnp.maximum(jnp.abs(values), jnp.abs(first))
     scale = jnp.where(scale > 0, scale, 1)
-    residuals = defect / jnp.linalg.norm(m_vectors, axis=1) / scale
+    residuals = defect / scale
     # Rounding excuses a residual of a per cent at most: beyond that, the pair is not known, whatever the reason.
     rounding = indistinct(pencil, values.dtype) / scale
     converged = (residuals <= jnp.maximum(tolerance, jnp.minimum(rounding, 0.01))) & (values >= 0)

@@ -1,6 +1,5 @@
 """Large sparse pencils by SciPy's shift-invert Lanczos on the host."""
 
-import warnings
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -9,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.sparse import coo_matrix, csc_matrix, diags
-from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, SuperLU, eigsh, splu
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
 
-from hks_jax.accuracy import AccuracyWarning
-from hks_jax.eigen.complement import solve_complement
+from hks_jax.eigen.host import complement_on_host, factorise_on_host, host_matrices
 from hks_jax.eigen.solver import Eigensolver, RawPairs
-from hks_jax.fem.operators import Pattern
 from hks_jax.fem.pencil import Pencil
+
+Found = tuple[np.ndarray, np.ndarray, float]
 
 _ROUNDS = 20
 """How often to look for missed copies of a multiple eigenvalue; each round finds at least one."""
@@ -59,22 +58,21 @@ class ShiftInvert(Eigensolver):
             )
 
     def lowest(self, pencil: Pencil, k: int) -> RawPairs:
-        """Return the k lowest eigenpairs."""
+        """Return the k lowest eigenpairs, and the shift at which inertia confirmed them."""
         n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
-        (data_k, data_m), matrices = _host_matrices(pencil)
+        (data_k, data_m), matrices = host_matrices(pencil)
 
-        def solve(data_k: np.ndarray, data_m: np.ndarray, volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def solve(data_k: np.ndarray, data_m: np.ndarray, volume: np.ndarray) -> tuple[np.ndarray, ...]:
             # The shift keeps K + sM positive definite; Weyl's λ₁ is the scale on which it is small.
             shift = 0.1 * (2 * np.pi) ** 2 / float(volume) ** (2 / dimension)
             K, M = matrices(data_k, data_m)
-            values, vectors = self._lanczos(K, M, k, shift)
-            return values.astype(dtype), vectors.astype(dtype)
+            return tuple(np.asarray(found, dtype) for found in self._lanczos(K, M, k, shift))
 
         inputs = (data_k, data_m, pencil.volume)
         if not any(isinstance(x, jax.core.Tracer) for x in inputs):
-            values, vectors = solve(*map(np.asarray, inputs))
-            return jnp.asarray(values), jnp.asarray(vectors)
-        shapes = (jax.ShapeDtypeStruct((k,), dtype), jax.ShapeDtypeStruct((k, n), dtype))
+            values, vectors, complete_below = map(jnp.asarray, solve(*map(np.asarray, inputs)))
+            return values, vectors, complete_below
+        shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))
         return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
 
     def solve_complement(
@@ -85,54 +83,15 @@ class ShiftInvert(Eigensolver):
         rhs: Float[Array, "k n_dof"],
     ) -> Float[Array, "k n_dof"]:
         """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement`."""
-        data, matrices = _host_matrices(pencil)
-        # What rounded eigenvectors leave to be solved beyond their own accuracy is noise.
-        tolerance = max(self.derivative_tolerance, 100 * float(jnp.finfo(rhs.dtype).eps))
+        return complement_on_host(pencil, values, vectors, rhs, self.derivative_tolerance, self._report)
 
-        def solve(data_k: np.ndarray, data_m: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
-            values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
-            if not all(np.isfinite(array).all() for array in (values, vectors, b)):
-                warnings.warn(
-                    f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
-                    "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
-                    AccuracyWarning,
-                    stacklevel=2,
-                )
-                return np.full(rhs.shape, np.nan, rhs.dtype)
-            K, M = matrices(data_k, data_m)
-            x, errors = solve_complement(
-                K,
-                M,
-                values,
-                vectors,
-                b,
-                factorise=_factorise,
-                tolerance=tolerance,
-                report=self._report,
-            )
-            failed = ~(errors <= 1)
-            if failed.any():
-                warnings.warn(
-                    f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
-                    f"converge, and their part is NaN. k may cut a cluster of eigenvalues: take another k, or set "
-                    "multiplet='drop' in `eigenpairs`",
-                    AccuracyWarning,
-                    stacklevel=2,
-                )
-                x[failed] = np.nan
-            self._report(f"derivative: error {np.max(errors, initial=0.0) * tolerance:.1e}")
-            return x.astype(rhs.dtype)
-
-        shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
-        return jax.pure_callback(solve, shape, *data, values, vectors, rhs, vmap_method="sequential")
-
-    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float) -> tuple[np.ndarray, np.ndarray]:
+    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float) -> Found:
         n = K.shape[0]
-        nothing = np.full(k, np.nan), np.full((k, n), np.nan)
+        nothing = np.full(k, np.nan), np.full((k, n), np.nan), np.nan
         if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
             return nothing
         self._report("factorising")
-        factor = _factorise(K + shift * M)
+        factor = factorise_on_host(K + shift * M)
         values, vectors = np.empty(0), np.empty((n, 0))
         solves, wanted = 0, k
 
@@ -151,7 +110,7 @@ class ShiftInvert(Eigensolver):
             try:
                 more, found = eigsh(K, wanted, M, -shift, OPinv=inverse, v0=start, ncv=basis, maxiter=self.max_restarts)
             except ArpackNoConvergence as stopped:
-                return _padded(stopped.eigenvalues, stopped.eigenvectors, k) if seed == 0 else nothing
+                return _padded(stopped.eigenvalues, stopped.eigenvectors, k, np.nan) if seed == 0 else nothing
             except ArpackError:
                 return nothing
             order = np.argsort(np.concatenate([values, more]))[:k]
@@ -161,10 +120,10 @@ class ShiftInvert(Eigensolver):
             # negative pivots of K − σM count the eigenvalues below σ: look again, past what is found, for the missing.
             below = values[-1] - 1e-6 * max(values[-1], shift)
             if below <= 0:  # nothing but constants
-                return _padded(values, vectors, k)
-            missing = int((_factorise(K - below * M).U.diagonal() < 0).sum()) - int((values < below).sum())
+                return _padded(values, vectors, k, max(below, 0.0))
+            missing = int((factorise_on_host(K - below * M).U.diagonal() < 0).sum()) - int((values < below).sum())
             if missing <= 0:
-                return _padded(values, vectors, k)
+                return _padded(values, vectors, k, max(below, 0.0))
             self._report(f"{missing} missed: looking again")
             wanted = min(missing + 2, n - 1)
         return nothing
@@ -174,34 +133,11 @@ class ShiftInvert(Eigensolver):
             self.progress(text)
 
 
-def _factorise(matrix: csc_matrix) -> SuperLU:
-    """Factorise a symmetric matrix without pivoting, under a symmetric ordering, which fills in least."""
-    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-
-def _padded(values: np.ndarray, vectors: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> Found:
     """Return eigenvalues ascending and eigenvectors as rows, NaN where there are fewer than k."""
     order, missing = np.argsort(values), k - values.size
     return (
         np.pad(values[order], (0, missing), constant_values=np.nan),
         np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
+        complete_below,
     )
-
-
-def _host_matrices(pencil: Pencil) -> tuple[tuple[Array, Array], Callable[..., tuple[csc_matrix, csc_matrix]]]:
-    """Return the entries of K and M, and the function that makes float64 SciPy matrices of them on the host."""
-    (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
-    n = pencil.space.n_dof
-    natural = bool((pencil.space.free == pencil.space.domain).all())
-
-    def matrices(data_k: np.ndarray, data_m: np.ndarray) -> tuple[csc_matrix, csc_matrix]:
-        K, M = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n)
-        if natural:  # the rows add up to zero; what float32 entries leave would act as a potential
-            K = K - diags(np.asarray(K.sum(axis=1)).ravel())
-        return K, M
-
-    return (data_k, data_m), matrices
-
-
-def _csc(data: np.ndarray, pattern: Pattern, n: int) -> csc_matrix:
-    return coo_matrix((np.asarray(data, np.float64), pattern), shape=(n, n)).tocsc()

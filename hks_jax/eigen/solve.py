@@ -9,6 +9,7 @@ import numpy as np
 from hks_jax.accuracy import AccuracyWarning
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.block_lanczos import BlockLanczos
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.mirror import solve_mirror
@@ -18,9 +19,13 @@ from hks_jax.eigen.shift_invert import ShiftInvert
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 
-SOLVERS: dict[str, Callable[[], Eigensolver]] = {Dense.name: Dense, ShiftInvert.name: ShiftInvert}
+SOLVERS: dict[str, Callable[[], Eigensolver]] = {solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos)}
+
+_LARGE = 4_000_000
+"""Unknowns times pairs from which on block Lanczos wins even if it has to be compiled first."""
 
 
 def eigenpairs(
@@ -42,8 +47,8 @@ def eigenpairs(
             constants of natural components, and so must its perturbations).
         k: how many pairs, 1 … number of degrees of freedom.
         boundary: see `assemble`; belongs to the pencil if one is given.
-        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, or a solver with its settings, such as
-            ``hks_jax.ShiftInvert(progress=print)``. The choice made is in ``.solver_name``.
+        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (grids), or a solver with
+            its settings, such as ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts. ``"report"`` warns; ``"drop"`` leaves its copies
             out of every signature; ``"complete"`` computes 8 pairs more and takes the missing copies in (or drops
@@ -95,7 +100,16 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
     if solver == "auto":
         # Dense costs n³ whatever k is; a Lanczos basis of twice k vectors needs room in n.
         n = pencil.space.n_dof
-        return Dense() if n <= 1500 or 4 * k > n else ShiftInvert()
+        if n <= 1500 or 4 * k > n:
+            return Dense()
+        # Block Lanczos is faster from about 60² nodes on, but takes some ten seconds to compile. In float32 matrices
+        # it has float32 factors, where the host's solver has float64.
+        grid, precise = isinstance(pencil.stiffness, StencilOperator), pencil.stiffness.dtype == np.float64
+        return (
+            BlockLanczos()
+            if grid and precise and n * k >= _LARGE and k <= BlockLanczos().max_pairs(n)
+            else ShiftInvert()
+        )
     if solver not in SOLVERS:
         raise ValueError(
             f'solver: got {solver!r}; expected "auto", {", ".join(f"{name!r}" for name in SOLVERS)} or a solver object'

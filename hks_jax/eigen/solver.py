@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.fem.pencil import Pencil
 
-RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
+RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 
 class Eigensolver(eqx.Module):
@@ -25,9 +25,10 @@ class Eigensolver(eqx.Module):
 
     @abstractmethod
     def lowest(self, pencil: Pencil, k: int) -> RawPairs:
-        """Return the k lowest eigenvalues, ascending, and M-orthonormal eigenvectors as rows.
+        """Return the k lowest eigenvalues, ascending, M-orthonormal eigenvectors as rows, and a bound.
 
-        What was not found is NaN. Traceable: works under `jit` and `vmap`.
+        Every eigenvalue below the bound is certainly among the k, or beyond them. What was not found is NaN, and so is
+        the bound where nothing is certain. Traceable: works under `jit` and `vmap`.
         """
 
     def solve_complement(

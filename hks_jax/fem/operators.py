@@ -16,7 +16,7 @@ from hks_jax.fem.space import FunctionSpace, GridSpace
 
 Pattern = tuple[np.ndarray, np.ndarray]
 
-_ROWS, _LARGE = 8, 1 << 20
+_ROWS, _LARGE = 8, 1 << 21
 """Large arrays are multiplied in blocks of so many rows, written out one by one: the transpose, which sums over the
 rows, is then a fused sum and not a reduction, which XLA does many times slower on CPUs."""
 
@@ -106,7 +106,7 @@ class StencilOperator(Operator):
 
     def triplets(self) -> tuple[Float[Array, " nnz"], Pattern]:
         """Return the entries and their static (rows, columns)."""
-        where, pattern = _stencil_pattern(self.space)
+        where, pattern = stencil_pattern(self.space)
         return self.coefficients.reshape(-1)[where], pattern
 
     def diagonal(self) -> Float[Array, " n_dof"]:
@@ -137,7 +137,7 @@ def _placed(x: Array, axis: int, before: int, after: int) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _stencil_pattern(space: GridSpace) -> tuple[np.ndarray, Pattern]:
+def stencil_pattern(space: GridSpace) -> tuple[np.ndarray, Pattern]:
     """Where in the coefficients each entry lies, and its (row, column), for the couplings between free nodes."""
     shape, d = space.node_shape, space.dimension
     number = space.degrees_of_freedom.reshape(shape)

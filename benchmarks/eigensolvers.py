@@ -1,0 +1,239 @@
+"""The eigensolver for grids beside its peers: the same matrices, the same tolerance, the same threads, one run.
+
+    python benchmarks/eigensolvers.py [--cases 64/100 256/500 ...] [--solvers NAME ...] [-o FILE]
+
+Every measurement is a process of its own, so that its peak memory is its own too. Peers that are not installed are left
+out, and named: `pip install scikit-sparse lapy`; SLEPc for Python (Debian: python3-slepc4py) may live in an interpreter of
+its own, given by --slepc-python.
+
+Timed is the eigensolver alone, from assembled matrices to eigenpairs: factorisation included, compilation apart. LaPy
+assembles its own matrices, on a flat triangulation with as many nodes. The residual is ‖Kφ − λMφ‖/‖Mφ‖/max(λ, λ₁).
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+CASES = ["64/100", "64/200", "128/100", "128/200", "128/500", "256/100", "256/200", "256/500", "512/100"]
+TOLERANCE = 1e-8
+Pairs = tuple[np.ndarray, np.ndarray]
+
+
+def ours(n: int, k: int) -> tuple[Pairs, dict]:
+    """Block Lanczos of this package."""
+    import jax
+    from machine import field
+
+    import hks_jax as hj
+
+    jax.config.update("jax_enable_x64", True)
+    pencil = hj.assemble(field(n))
+    solver = hj.BlockLanczos(tolerance=TOLERANCE)
+    start = time.perf_counter()
+    jax.block_until_ready(solver.lowest(pencil, k))
+    first = time.perf_counter() - start
+    best = np.inf
+    for _ in range(2):
+        start = time.perf_counter()
+        values, vectors, complete_below = jax.block_until_ready(solver.lowest(pencil, k))
+        best = min(best, time.perf_counter() - start)
+    found = {"seconds": best, "first_call_s": first, "complete_below": float(complete_below)}
+    return (np.asarray(values), np.asarray(vectors)), found
+
+
+def eigsh(n: int, k: int, cholmod: bool = False) -> tuple[Pairs, dict]:
+    """SciPy's ARPACK in shift-invert mode, with SuperLU or CHOLMOD."""
+    from scipy.sparse.linalg import LinearOperator, splu
+    from scipy.sparse.linalg import eigsh as arpack
+
+    K, M = matrices(n)
+    start = time.perf_counter()
+    if cholmod:
+        from sksparse.cholmod import cholesky
+
+        factor = cholesky((K + 0.05 * M).tocsc())
+        solve: Callable[[np.ndarray], np.ndarray] = factor
+    else:
+        options = {"SymmetricMode": True}
+        solve = splu((K + 0.05 * M).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
+    inverse = LinearOperator(K.shape, matvec=solve, dtype=float)
+    values, vectors = arpack(K, k, M, -0.05, OPinv=inverse, v0=np.random.default_rng(0).standard_normal(n * n))
+    return (values, vectors.T), {"seconds": time.perf_counter() - start}
+
+
+def lapy(n: int, k: int) -> tuple[Pairs, dict]:
+    """LaPy on a flat triangulation with as many nodes."""
+    from lapy import Solver, TriaMesh
+
+    x = np.linspace(0, 1, n)
+    vertices = np.stack([*map(np.ravel, np.meshgrid(x, x)), np.zeros(n * n)], axis=1)
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, n], corner[:, None] + [1, n + 1, n]])
+    solver = Solver(TriaMesh(vertices, faces))
+    start = time.perf_counter()
+    values, vectors = solver.eigs(k)
+    found = {"seconds": time.perf_counter() - start, "other_matrices": True}
+    return (values, vectors.T), found
+
+
+SOLVERS: dict[str, Callable[[int, int], tuple[Pairs, dict]]] = {
+    "hks_jax": ours,
+    "eigsh, SuperLU": eigsh,
+    "eigsh, CHOLMOD": lambda n, k: eigsh(n, k, cholmod=True),
+    "LaPy": lapy,
+}
+SLEPC = {
+    "SLEPc, slicing, PETSc Cholesky": ("slicing", "petsc"),
+    "SLEPc, slicing, MUMPS": ("slicing", "mumps"),
+    "SLEPc, Krylov-Schur, PETSc Cholesky": ("krylov", "petsc"),
+    "SLEPc, Krylov-Schur, MUMPS": ("krylov", "mumps"),
+}
+
+
+def matrices(n: int) -> tuple:
+    """Return the stiffness and mass of the benchmark's field as SciPy matrices."""
+    from scipy.sparse import load_npz
+
+    folder = Path(os.environ["EIGENSOLVERS_MATRICES"])
+    return load_npz(folder / f"K{n}.npz"), load_npz(folder / f"M{n}.npz")
+
+
+def quality(n: int, pairs: Pairs) -> dict:
+    """Return the worst residual and the eigenvalues."""
+    K, M = matrices(n)
+    values, vectors = pairs
+    order = np.argsort(values)
+    values, worst = values[order], 0.0
+    for value, vector in zip(values, vectors[order], strict=True):
+        image = M @ vector
+        scale = np.linalg.norm(image) * max(value, values[1])
+        worst = max(worst, float(np.linalg.norm(K @ vector - value * image) / scale))
+    return {"worst_residual": worst, "eigenvalues": values.tolist()}
+
+
+def peak_memory() -> float:
+    """Return this process's peak memory in GB (Linux). What `resource` tells is inherited from the parent."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1e6
+
+
+def measure_here(name: str, n: int, k: int) -> None:
+    """Run one solver in this process and print what it took as JSON."""
+    pairs, found = SOLVERS[name](n, k)
+    found["peak_GB"] = peak_memory()
+    found |= {"eigenvalues": pairs[0].tolist()} if found.pop("other_matrices", False) else quality(n, pairs)
+    print(json.dumps(found))
+
+
+def measure(name: str, n: int, k: int, reference: list[float], slepc_python: str, limit: float) -> dict | str:
+    """Run one solver in a process of its own; return what it took, or why it did not run."""
+    if name in SLEPC:
+        if not reference:
+            return "needs the interval's end, from another solver"
+        method, package = SLEPC[name]
+        end = (reference[k - 1] + reference[k]) / 2
+        command = [slepc_python, str(HERE / "slepc.py"), method, package, str(n), str(k), repr(end), str(TOLERANCE)]
+    else:
+        command = [sys.executable, __file__, "--here", name, str(n), str(k)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+    except subprocess.TimeoutExpired:
+        return f"more than {limit:.0f} s"
+    if done.returncode != 0:
+        return (done.stderr.strip().splitlines() or ["failed"])[-1]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main() -> None:
+    """Measure every case, print a table, write the results and their plot."""
+    if sys.argv[1:2] == ["--here"]:
+        measure_here(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+        return
+    import jax
+    from machine import RESULTS, field, write
+    from scipy.sparse import save_npz
+
+    import hks_jax as hj
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", nargs="+", default=CASES, metavar="N/K", help="N² nodes, K pairs")
+    parser.add_argument("--solvers", nargs="+", default=[*SOLVERS, *SLEPC], metavar="NAME")
+    parser.add_argument("--slepc-python", default=sys.executable, help="an interpreter that can import slepc4py")
+    parser.add_argument("--limit", type=float, default=900, help="seconds for each measurement")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "eigensolvers.json")
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    rows: list[dict] = []
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["EIGENSOLVERS_MATRICES"] = folder
+        for case in arguments.cases:
+            n, k = map(int, case.split("/"))
+            if not (Path(folder) / f"K{n}.npz").exists():
+                pencil = hj.assemble(field(n))
+                for letter, matrix in (("K", pencil.stiffness.to_scipy()), ("M", pencil.mass.to_scipy())):
+                    save_npz(Path(folder) / f"{letter}{n}.npz", matrix)
+                    matrix = matrix.tocsr()
+                    arrays = {"indptr": matrix.indptr, "indices": matrix.indices, "data": matrix.data}
+                    np.savez(Path(folder) / f"{letter}{n}_csr.npz", **arrays)
+            reference: list[float] = []
+            print(f"{n}² nodes, {k} pairs", flush=True)
+            for name in arguments.solvers:
+                more = 1 if name == "hks_jax" else 0  # one more, for the end of the interval that slicing needs
+                found = measure(name, n, k + more, reference, arguments.slepc_python, arguments.limit)
+                if isinstance(found, str):
+                    print(f"  {name:38s} {found}", flush=True)
+                    rows.append({"nodes": n * n, "k": k, "solver": name, "not_run": found})
+                    continue
+                values = found.pop("eigenvalues")
+                reference = reference or values
+                if name != "LaPy":
+                    scale = np.maximum(reference[:k], reference[1])
+                    found["eigenvalue_difference"] = float(
+                        np.max(np.abs(np.subtract(values[:k], reference[:k])) / scale)
+                    )
+                rows.append({"nodes": n * n, "k": k, "solver": name, **found})
+                shown = " ".join(f"{key} {value:.3g}" for key, value in found.items())
+                print(f"  {name:38s} {shown}", flush=True)
+            write(arguments.output, rows, tolerance=TOLERANCE)
+    draw(rows, arguments.output.with_suffix(".png"))
+
+
+def draw(rows: list[dict], path: Path) -> None:
+    """Draw time against nodes for each solver and k, with the fitted exponent."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
+    names = list(dict.fromkeys(row["solver"] for row in rows if "seconds" in row))
+    for k, style in zip(sorted({row["k"] for row in rows}), ("-o", "--s", ":^", "-.d"), strict=False):
+        for colour, name in enumerate(names):
+            points = [
+                (r["nodes"], r["seconds"]) for r in rows if r["solver"] == name and r["k"] == k and "seconds" in r
+            ]
+            if len(points) < 2:
+                continue
+            nodes, seconds = np.transpose(sorted(points))
+            exponent = np.polyfit(np.log(nodes), np.log(seconds), 1)[0]
+            axes.loglog(nodes, seconds, style, color=f"C{colour}", label=f"{name}, k = {k}: $N^{{{exponent:.2f}}}$")
+    axes.set_xlabel("nodes")
+    axes.set_ylabel("seconds, compilation apart")
+    axes.grid(alpha=0.3, which="both")
+    if axes.lines:
+        axes.legend(fontsize=7)
+    figure.savefig(path, dpi=150)
+    print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Pencils as SciPy matrices: what the host computes for solvers in JAX, through callbacks where they are traced."""
+
+import warnings
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.linalg import SuperLU, splu
+
+from hks_jax.accuracy import AccuracyWarning
+from hks_jax.eigen.complement import solve_complement
+from hks_jax.fem.operators import Pattern
+from hks_jax.fem.pencil import Pencil
+
+
+def complement_on_host(
+    pencil: Pencil,
+    values: Float[Array, " p"],
+    vectors: Float[Array, "p n_dof"],
+    rhs: Float[Array, "k n_dof"],
+    tolerance: float,
+    report: Callable[[str], None],
+) -> Float[Array, "k n_dof"]:
+    """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement`.
+
+    What does not converge is NaN, with a warning.
+    """
+    data, matrices = host_matrices(pencil)
+    # What rounded eigenvectors leave to be solved beyond their own accuracy is noise.
+    tolerance = max(tolerance, 100 * float(jnp.finfo(rhs.dtype).eps))
+
+    def solve(data_k: np.ndarray, data_m: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+        values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
+        if not all(np.isfinite(array).all() for array in (values, vectors, b)):
+            warnings.warn(
+                f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
+                "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
+                AccuracyWarning,
+                stacklevel=2,
+            )
+            return np.full(rhs.shape, np.nan, rhs.dtype)
+        K, M = matrices(data_k, data_m)
+        x, errors = solve_complement(
+            K,
+            M,
+            values,
+            vectors,
+            b,
+            factorise=factorise_on_host,
+            tolerance=tolerance,
+            report=report,
+        )
+        failed = ~(errors <= 1)
+        if failed.any():
+            warnings.warn(
+                f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
+                f"converge, and their part is NaN. k may cut a cluster of eigenvalues: take another k, or set "
+                "multiplet='drop' in `eigenpairs`",
+                AccuracyWarning,
+                stacklevel=2,
+            )
+            x[failed] = np.nan
+        report(f"derivative: error {np.max(errors, initial=0.0) * tolerance:.1e}")
+        return x.astype(rhs.dtype)
+
+    shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
+    return jax.pure_callback(solve, shape, *data, values, vectors, rhs, vmap_method="sequential")
+
+
+def factorise_on_host(matrix: csc_matrix) -> SuperLU:
+    """Factorise a symmetric matrix without pivoting, under a symmetric ordering, which fills in least."""
+    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def host_matrices(pencil: Pencil) -> tuple[tuple[Array, Array], Callable[..., tuple[csc_matrix, csc_matrix]]]:
+    """Return the entries of K and M, and the function that makes float64 SciPy matrices of them on the host."""
+    (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
+    n = pencil.space.n_dof
+    natural = bool((pencil.space.free == pencil.space.domain).all())
+
+    def matrices(data_k: np.ndarray, data_m: np.ndarray) -> tuple[csc_matrix, csc_matrix]:
+        K, M = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n)
+        if natural:  # the rows add up to zero; what float32 entries leave would act as a potential
+            K = K - diags(np.asarray(K.sum(axis=1)).ravel())
+        return K, M
+
+    return (data_k, data_m), matrices
+
+
+def _csc(data: np.ndarray, pattern: Pattern, n: int) -> csc_matrix:
+    return coo_matrix((np.asarray(data, np.float64), pattern), shape=(n, n)).tocsc()

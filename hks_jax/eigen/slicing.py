@@ -1,0 +1,197 @@
+"""Spectrum slicing: the lowest eigenpairs of a pencil, interval by interval, none missed.
+
+Each slice factorises K − σM at a shift σ a little above what is known already. The inertia says how many eigenvalues
+lie below σ; block Lanczos, kept orthogonal to the known eigenvectors near by, finds them and about as many above. What
+converged is known from then on. A last factorisation above the last eigenvalue wanted is the certificate: as many
+eigenvalues as are known lie below it. Few vectors at a time keep orthogonalisation cheap, however many are wanted.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.eigen.dissection import Dissection
+from hks_jax.eigen.lanczos import block_lanczos
+from hks_jax.eigen.multifrontal import Factorisation, factorise
+from hks_jax.eigen.quality import ROWS, indistinct, rayleigh_quotient, relative_defect
+from hks_jax.fem.pencil import Pencil
+
+
+class Plan(NamedTuple):
+    """The sizes of a computation; static.
+
+    Attributes:
+        wanted: how many eigenpairs.
+        block: vectors per Lanczos block.
+        steps: blocks per slice.
+        slice_size: eigenvalues that a slice is expected to find, half of them below its shift.
+        max_slices: factorisations before giving up.
+    """
+
+    wanted: int
+    block: int
+    steps: int
+    slice_size: int
+    max_slices: int
+
+    @property
+    def ritz(self) -> int:
+        """Ritz pairs looked at in each slice."""
+        return min(self.block * self.steps, self.slice_size * 4 // 3)
+
+    @property
+    def window(self) -> int:
+        """Known eigenvectors that a slice stays orthogonal to, so as not to find them again."""
+        return self.slice_size // 2
+
+    @property
+    def capacity(self) -> int:
+        """Room for eigenpairs."""
+        return self.wanted + 2 * self.ritz
+
+
+class State(NamedTuple):
+    """What is known between two slices.
+
+    Attributes:
+        values: (capacity,) known eigenvalues in the order found; infinite where there is none.
+        vectors: (capacity, n_dof) their M-orthonormal eigenvectors.
+        known: how many there are.
+        shift: where to cut next.
+        front: known up to here without a gap, as far as is known.
+        complete_below: every eigenvalue below it is known, by the inertia of a factorisation.
+        start: (block, n_dof) where Lanczos starts next.
+        basis: (window + block · steps, n_dof) room for Lanczos vectors.
+        slices: factorisations so far.
+        finished: whether all is found and certified.
+    """
+
+    values: Float[Array, " capacity"]
+    vectors: Float[Array, "capacity n_dof"]
+    known: Int[Array, ""]
+    shift: Float[Array, ""]
+    front: Float[Array, ""]
+    complete_below: Float[Array, ""]
+    start: Float[Array, "block n_dof"]
+    basis: Float[Array, "rows n_dof"]
+    slices: Int[Array, ""]
+    finished: Bool[Array, ""]
+
+
+def first_state(pencil: Pencil, plan: Plan) -> State:
+    """Return the state in which nothing is known, the first shift chosen by Weyl's law."""
+    n, d, dtype = pencil.space.n_dof, pencil.space.dimension, pencil.stiffness.dtype
+    # Weyl's law counts (λ/4π)·area in 2D, λ^(3/2)/6π²·volume in 3D.
+    target = min(plan.wanted, plan.slice_size) / 2 + 1
+    constant = 4 * jnp.pi if d == 2 else (6 * jnp.pi**2) ** (2 / 3)
+    shift = constant * (target / pencil.volume) ** (2 / d)
+    return State(
+        values=jnp.full(plan.capacity, jnp.inf, dtype),
+        vectors=jnp.zeros((plan.capacity, n), dtype),
+        known=jnp.zeros((), int),
+        shift=shift.astype(dtype),
+        front=jnp.zeros((), dtype),
+        complete_below=jnp.zeros((), dtype),
+        start=jax.random.normal(jax.random.key(0), (plan.block, n), dtype),
+        basis=jnp.zeros((plan.window + plan.block * plan.steps, n), dtype),
+        slices=jnp.zeros((), int),
+        finished=jnp.zeros((), bool),
+    )
+
+
+def cut(
+    pencil: Pencil, dissection: Dissection, plan: Plan, state: State
+) -> tuple[Factorisation, Bool[Array, ""], State]:
+    """Factorise at the state's shift; return with it whether to search there, and the state if not."""
+    factor = factorise(dissection, pencil, state.shift)
+    below = jnp.sum(state.values < state.shift)
+    missing = factor.negative - below
+    finished = (missing == 0) & (below >= plan.wanted)
+    too_many = missing > plan.slice_size
+    nearer = state.front + (state.shift - state.front) * plan.slice_size / (2.5 * jnp.maximum(missing, 1))
+    state = state._replace(
+        slices=state.slices + 1,
+        finished=finished,
+        complete_below=jnp.where(missing == 0, state.shift, state.complete_below),
+        shift=jnp.where(too_many, nearer, state.shift),
+    )
+    return factor, ~(finished | too_many), state
+
+
+def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State) -> State:
+    """Find the eigenpairs around the shift."""
+    shift, index = state.shift, jnp.arange(plan.capacity)
+    nearest = jnp.argsort(jnp.abs(state.values - shift))
+    window = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
+    # What is known but outside the window may be found again: nothing out there is taken.
+    others = jnp.where(jnp.isin(index, nearest[: plan.window]), jnp.nan, state.values)
+    low = jnp.nanmax(jnp.where(others < shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf)
+    high = jnp.nanmin(jnp.where(others > shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
+
+    basis = jnp.zeros_like(state.basis).at[: plan.window].set(window)
+    theta, vectors, basis = block_lanczos(pencil, factor, state.start, basis, plan.steps, plan.ritz)
+    near = shift + 1 / theta
+
+    def measure(vector: Float[Array, " n_dof"]) -> tuple[Array, Array]:
+        value = rayleigh_quotient(pencil, vector)
+        return value, relative_defect(pencil, value, vector)
+
+    values, residuals = jax.lax.map(measure, vectors, batch_size=ROWS)
+    first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[pencil.space.n_null]
+    scale = jnp.maximum(jnp.abs(values), first_nonzero)
+    rounding = jnp.minimum(indistinct(pencil, values.dtype) / scale, 0.01)
+    converged = (residuals <= jnp.maximum(tolerance, rounding) * scale) & (theta != 0)
+    # Above the first that did not converge, or farther away than those looked at, some are missing.
+    above = near > shift
+    limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
+    reach = shift + 1 / jnp.min(jnp.abs(theta))
+    accepted = converged & (values > low) & (values < jnp.minimum(jnp.minimum(limit, reach), high))
+
+    order = jnp.argsort(jnp.where(accepted, values, jnp.inf))
+    count = jnp.sum(accepted)
+    found = jnp.where(jnp.arange(plan.ritz) < count, values[order], jnp.inf)
+    all_values = jax.lax.dynamic_update_slice_in_dim(state.values, found, state.known, 0)
+    all_vectors = jax.lax.dynamic_update_slice_in_dim(state.vectors, vectors[order], state.known, 0)
+    known = state.known + count
+    complete = factor.negative == jnp.sum(all_values < shift)
+    top = jnp.max(jnp.where(index < known, all_values, -jnp.inf), initial=0)
+
+    # Where some below the shift are missing, go to where the lowest that did not converge seems to be.
+    lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
+    again = jnp.where(lowest < shift, lowest + (shift - lowest) / 4, state.front + (shift - state.front) / 2)
+    following = jnp.where(complete, _next_shift(plan, all_values, known, top), again)
+    leftover = jnp.argsort(jnp.where(above & ~accepted, near, jnp.inf))[: plan.block]
+    noise = jax.random.normal(jax.random.key(state.slices), state.start.shape, state.start.dtype)
+    start = vectors[leftover] + 0.01 * jnp.std(vectors) * noise
+    return State(
+        all_values,
+        all_vectors,
+        known,
+        following,
+        jnp.where(complete, top, state.front),
+        jnp.where(complete, shift, state.complete_below),
+        start,
+        basis,
+        state.slices,
+        state.finished,
+    )
+
+
+def _next_shift(plan: Plan, values: Float[Array, " capacity"], known: Int[Array, ""], top: Float[Array, ""]) -> Array:
+    """Return where to cut next: within the next slice, or in a gap above the last eigenvalue wanted."""
+    ordered = jnp.sort(values)
+    index = jnp.arange(plan.capacity)
+    # The mean distance of the last few eigenvalues.
+    few = jnp.minimum(known, plan.slice_size)
+    spacing = (top - ordered[known - few]) / jnp.maximum(few - 1, 1)
+    left = plan.wanted - known
+    slices = jnp.ceil(left / plan.slice_size)
+    ahead = top + spacing * (left / jnp.maximum(slices, 1) / 2 + 1)
+    # The widest gap among the next few is safest, and nothing is known above the last.
+    gaps = jnp.where(index < known - 1, jnp.roll(ordered, -1) - ordered, spacing)
+    there = (index >= plan.wanted - 1) & (index < plan.wanted + 7) & (index < known)
+    widest = jnp.argmax(jnp.where(there, gaps, -1))
+    certificate = ordered[widest] + gaps[widest] / 2
+    return jnp.where(left > 0, ahead, certificate)

@@ -1,0 +1,225 @@
+"""The eigensolver for grids against dense linear algebra: factorisation, inertia, slices, certificate."""
+
+import warnings
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from fields import flat, random_spd
+
+import hks_jax as hj
+from hks_jax.eigen.dissection import dissect
+from hks_jax.eigen.multifrontal import factorise
+from hks_jax.eigen.symmetric_inverse import by_eigenvalues, by_elimination
+
+
+def mask(shape):
+    """Two components, one with a hole."""
+    inside = np.ones(shape, bool)
+    inside[:4, :5] = False
+    inside[shape[0] // 2, :] = False
+    inside[4:6, 8:10] = False
+    return inside
+
+
+CASES = {
+    "neumann": ((26, 21), "neumann", "consistent"),
+    "dirichlet lumped": ((19, 26), "dirichlet", "lumped"),
+    "torus": ((24, 22), "periodic", "consistent"),
+    "periodic, neumann": ((24, 20), ("periodic", "neumann"), "consistent"),
+    "dirichlet, periodic": ((20, 24), (("neumann", "dirichlet"), "periodic"), "consistent"),
+    "mask": ((25, 27), "neumann", "consistent"),
+    "3d": ((6, 9, 10), ("periodic", "dirichlet", "neumann"), "lumped"),
+}
+
+
+def problem(rng, name, spread=1.0):
+    shape, boundary, mass = CASES[name]
+    grid = hj.Grid(shape, 0.1, mask=mask(shape), components="all") if name == "mask" else hj.Grid(shape, 0.1)
+    return hj.assemble(hj.TensorField(grid, random_spd(rng, shape, spread)), boundary, mass)
+
+
+def dense_matrices(pencil):
+    return np.asarray(pencil.stiffness.to_dense()), np.asarray(pencil.mass.to_dense())
+
+
+@pytest.mark.parametrize("inverse", [by_eigenvalues, by_elimination])
+@pytest.mark.parametrize("n", [1, 7, 32, 75])
+def test_inverse_and_inertia_of_an_indefinite_matrix(rng, inverse, n):
+    a = rng.standard_normal((3, n, n))
+    a = a + np.swapaxes(a, 1, 2)
+    inverted, negative = jax.vmap(inverse)(jnp.asarray(a))
+    np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-9)
+    np.testing.assert_array_equal(negative, (np.linalg.eigvalsh(a) < 0).sum(axis=1))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_factorisation_solves_and_counts(rng, name):
+    pencil = problem(rng, name)
+    K, M = dense_matrices(pencil)
+    spectrum = scipy.linalg.eigh(K, M, eigvals_only=True)
+    run = jax.jit(factorise)
+    for below in (0, 3, 40, K.shape[0]):
+        ends = np.concatenate([[-1.0], spectrum, [2 * spectrum[-1]]])[below : below + 2]
+        shift = 0.7 * ends[0] + 0.3 * ends[1]
+        factor = run(dissect(pencil.space), pencil, shift)
+        assert int(factor.negative) == below
+        rhs = rng.standard_normal((3, K.shape[0]))
+        reference = np.linalg.solve(K - shift * M, rhs.T).T
+        np.testing.assert_allclose(factor.solve(jnp.asarray(rhs)), reference, atol=1e-9 * np.abs(reference).max())
+
+
+def check_against_dense(pencil, pairs):
+    """Same spectrum, M-orthonormal eigenvectors, and a certificate that counts right."""
+    K, M = dense_matrices(pencil)
+    spectrum = scipy.linalg.eigh(K, M, eigvals_only=True)
+    values, vectors = np.asarray(pairs.eigenvalues), np.asarray(pairs.vectors)
+    np.testing.assert_allclose(values, spectrum[: pairs.k], atol=1e-9 * spectrum[pairs.n_null])
+    np.testing.assert_allclose(vectors @ M @ vectors.T, np.eye(pairs.k), atol=1e-7)
+    assert pairs.converged.all()
+    bound = float(pairs.complete_below)
+    assert bound > values[-1]
+    assert np.sum(spectrum < bound) >= pairs.k
+    # The kernel does not depend on the basis within multiplets.
+    first = np.flatnonzero(np.diff(spectrum) > 1e-6 * spectrum[pairs.n_null])
+    whole = first[first < pairs.k][-1] + 1
+    exact = scipy.linalg.eigh(K, M)[1][:, :whole]
+    atol = 1e-5 * np.abs(exact).max() ** 2
+    np.testing.assert_allclose(vectors[:whole].T @ vectors[:whole], exact @ exact.T, atol=atol)
+
+
+@pytest.mark.parametrize("name", ["torus", "mask", "3d"])
+def test_pairs_agree_with_dense_ones(rng, name):
+    pencil = problem(rng, name)
+    # Slices so small that several are needed.
+    check_against_dense(pencil, hj.eigenpairs(pencil, 60, solver=hj.BlockLanczos(block=4, slice_size=20)))
+
+
+def test_multiplicities_beyond_the_block_are_complete():
+    # Twelve equal squares: every eigenvalue at least twelvefold, those of symmetric pairs of modes 24-fold.
+    inside = np.zeros((27, 36), bool)
+    for i in range(3):
+        for j in range(4):
+            inside[9 * i : 9 * i + 8, 9 * j : 9 * j + 8] = True
+    grid = hj.Grid((27, 36), 0.1, mask=inside, components="all")
+    pencil = hj.assemble(hj.TensorField(grid, np.broadcast_to(np.eye(2), (27, 36, 2, 2))))
+    pairs = hj.eigenpairs(pencil, 72, solver=hj.BlockLanczos(block=4, slice_size=30))
+    assert pairs.n_null == 12
+    check_against_dense(pencil, pairs)
+    multiplicities = np.diff(np.flatnonzero(np.diff(np.asarray(pairs.eigenvalues), prepend=-1, append=1e9) > 1e-6))
+    np.testing.assert_array_equal(multiplicities, [12, 24, 12, 24])
+
+
+def test_torus_multiplets_and_certificate():
+    pencil = hj.assemble(flat((32, 32), (1.0, 1.0), (True, True)), "periodic")
+    pairs = hj.eigenpairs(pencil, 57, solver="block-lanczos")
+    check_against_dense(pencil, pairs)
+    assert pairs.solver_name == "block-lanczos"
+    assert "none missed" in pairs.summary()
+
+
+def test_traced_batched_and_mirrored(rng):
+    field = hj.TensorField(hj.Grid((26, 22), 0.1), random_spd(rng, (26, 22)))
+    solve = partial(hj.eigenpairs, k=20, solver=hj.BlockLanczos(block=4, slice_size=14))
+    said = []
+    plain = hj.eigenpairs(field, 20, solver=hj.BlockLanczos(block=4, slice_size=14, progress=said.append))
+    assert len(said) >= 2
+    assert "of 21 eigenpairs" in said[-1]
+    tensors = jnp.stack([field.tensors, 1.1 * field.tensors])
+    batched = jax.jit(jax.vmap(lambda T: solve(hj.TensorField(field.grid, T))))(tensors)
+    np.testing.assert_allclose(batched.eigenvalues[0], plain.eigenvalues, atol=1e-9)
+    assert batched.converged.all()
+    assert (batched.complete_below > batched.eigenvalues[:, -1]).all()
+    mirrored = solve(field, boundary="mirror")
+    reference = hj.eigenpairs(field, 20, "mirror", "dense")
+    np.testing.assert_allclose(mirrored.eigenvalues, reference.eigenvalues, atol=1e-9)
+
+
+def test_gradient_equals_the_dense_one(rng):
+    grid = hj.Grid((24, 22), 0.1)
+    tensors = jnp.asarray(random_spd(rng, grid.shape))
+
+    def loss(tensors, solver):
+        return jnp.sum(hj.hks(hj.eigenpairs(hj.TensorField(grid, tensors), 15, solver=solver), [0.2, 0.5]) ** 2)
+
+    dense = jax.grad(loss)(tensors, "dense")
+    np.testing.assert_allclose(jax.grad(loss)(tensors, "block-lanczos"), dense, atol=1e-8 * np.abs(dense).max())
+
+
+def test_float32_finds_what_rounding_allows(rng):
+    grid = hj.Grid((24, 22), 0.1)
+    tensors = random_spd(rng, grid.shape)
+    with jax.enable_x64(False):
+        field = hj.TensorField(grid, jnp.asarray(tensors, jnp.float32))
+        values = hj.eigenpairs(field, 15, solver="block-lanczos").eigenvalues
+        assert values.dtype == jnp.float32
+    reference = hj.eigenpairs(hj.TensorField(grid, tensors), 15, solver="dense").eigenvalues
+    np.testing.assert_allclose(values, reference, atol=1e-3 * reference[1])
+
+
+def test_what_it_cannot_do_is_said(rng):
+    pencil = problem(rng, "neumann")
+    with pytest.raises(ValueError, match=r"k: the block-lanczos solver gives at most \d+ of 546 pairs"):
+        hj.eigenpairs(pencil, 200, solver="block-lanczos")
+    with pytest.raises(ValueError, match="block, slice_size: got 0"):
+        hj.BlockLanczos(block=0)
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    mesh = hj.SurfaceMesh(vertices, np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]))
+    with pytest.raises(ValueError, match="block-lanczos"):
+        hj.eigenpairs(mesh, 2, solver="block-lanczos")
+    broken = eqx.tree_at(lambda p: p.stiffness.coefficients, pencil, jnp.nan * pencil.stiffness.coefficients)
+    with pytest.warns(hj.AccuracyWarning, match="did not converge"):
+        hj.eigenpairs(broken, 5, solver="block-lanczos")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["neumann", "dirichlet lumped", "torus", "mask", "3d"])
+def test_random_small_problems_miss_no_eigenvalue(rng, name):
+    """200 problems in all, traced."""
+    shape, boundary, mass = CASES[name]
+    grid = problem(rng, name).space.grid
+    tensors = jnp.asarray([random_spd(rng, shape, spread) for spread in np.linspace(0.01, 2, 40)])
+
+    def spectrum(tensors, solver):
+        return hj.eigenpairs(hj.TensorField(grid, tensors), 40, boundary, solver, mass).eigenvalues
+
+    def compare(tensors):
+        return spectrum(tensors, hj.BlockLanczos(slice_size=20)), spectrum(tensors, "dense")
+
+    values, reference = jax.jit(lambda T: jax.lax.map(compare, T))(tensors)
+    n_null = 2 if name == "mask" else int(boundary in ("neumann", "periodic"))
+    np.testing.assert_allclose(values / reference[:, n_null, None], reference / reference[:, n_null, None], atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["neumann", "dirichlet", "periodic", ("periodic", "neumann"), "mask"])
+def test_varied_fields_agree_with_eigsh(rng, boundary):
+    """20 problems: anisotropy 1 to 1000, discontinuous, noise; every boundary, a mask."""
+    shape = (48, 44)
+    angle = rng.uniform(0, np.pi, shape) if boundary == "dirichlet" else np.full(shape, 0.3)
+    frames = np.stack([np.stack([np.cos(angle), np.sin(angle)], -1), np.stack([-np.sin(angle), np.cos(angle)], -1)], -1)
+    jump = np.where(np.arange(shape[0])[:, None] < 20, 1.0, 50.0) * np.ones(shape)
+    diagonals = [
+        np.stack([np.ones(shape), np.ones(shape)], -1),
+        np.stack([np.full(shape, 30.0), np.ones(shape)], -1),
+        np.stack([np.full(shape, 1000.0), np.ones(shape)], -1),
+        np.stack([jump, 1 / jump], -1),
+    ]
+    for diagonal in diagonals:
+        tensors = np.einsum("...ia,...a,...ja->...ij", frames, diagonal, frames)
+        if boundary == "mask":
+            grid = hj.Grid(shape, 0.02, mask=mask(shape), components="all")
+            pencil = hj.assemble(hj.TensorField(grid, tensors))
+        else:
+            pencil = hj.assemble(hj.TensorField(hj.Grid(shape, 0.02), tensors), boundary)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", hj.AccuracyWarning)  # a cut multiplet
+            ours, reference = (hj.eigenpairs(pencil, 60, solver=s) for s in ("block-lanczos", "shift-invert"))
+        scale = np.maximum(reference.eigenvalues, reference.eigenvalues[reference.n_null])
+        np.testing.assert_allclose(ours.eigenvalues / scale, reference.eigenvalues / scale, atol=1e-9)
+        assert ours.converged.all()
+        assert ours.complete_below > ours.eigenvalues[-1]
