@@ -14,6 +14,7 @@ from fields import flat, random_spd
 import hks_jax as hj
 from hks_jax.eigen.dissection import dissect
 from hks_jax.eigen.multifrontal import factorise
+from hks_jax.eigen.slicing import Plan, crowded, first_state, make_room
 from hks_jax.eigen.symmetric_inverse import by_eigenvalues, by_elimination
 
 
@@ -120,6 +121,38 @@ def test_torus_multiplets_and_certificate():
     check_against_dense(pencil, pairs)
     assert pairs.solver_name == "block-lanczos"
     assert "none missed" in pairs.summary()
+
+
+@pytest.mark.parametrize("domain", ["torus", "mirror", "mesh"])
+def test_eigenvalues_are_counted_without_being_computed(rng, domain):
+    if domain == "torus":
+        pencil = hj.assemble(flat((20, 20), (1.0, 1.0), (True, True)), "periodic")
+    elif domain == "mirror":
+        pencil = hj.assemble(hj.TensorField(hj.Grid((14, 13), 0.1), random_spd(rng, (14, 13))), "mirror")
+    else:
+        pencil = hj.assemble(hj.examples.bumpy_torus_mesh(12))
+    spectrum = np.sort(
+        np.concatenate([scipy.linalg.eigh(*dense_matrices(part), eigvals_only=True) for part in pencil.parts])
+    )
+    for count in (0, 1, 5, 25):
+        shift = np.concatenate([[-1e-3 * spectrum[-1]], spectrum])[count : count + 2].mean()
+        assert int(hj.count_eigenvalues(pencil, shift)) == np.sum(spectrum < shift)
+
+
+def test_eigenvalues_found_beyond_those_wanted_are_forgotten():
+    plan = Plan(wanted=5, block=2, steps=4, slice_size=5, max_slices=9)
+    values = jnp.asarray(np.random.default_rng(0).permutation(plan.capacity).astype(float))
+    state = jax.eval_shape(partial(first_state, plan=plan), hj.assemble(flat((12, 12), (1.0, 1.0))))
+    state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state)
+    state = state._replace(
+        values=values, vectors=values[:, None] * jnp.ones((1, 144)), known=jnp.asarray(plan.capacity)
+    )
+    assert crowded(plan, state)
+    state = make_room(plan, state)
+    assert not crowded(plan, state)
+    np.testing.assert_array_equal(state.values[: int(state.known)], np.arange(int(state.known)))
+    np.testing.assert_array_equal(state.vectors[:, 0][: int(state.known)], np.arange(int(state.known)))
+    assert np.isinf(state.values[int(state.known) :]).all()
 
 
 def test_traced_batched_and_mirrored(rng):

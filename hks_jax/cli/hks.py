@@ -69,7 +69,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     add("-k", type=int, help="number of eigenpairs (default 200, or a quarter of the unknowns if that is less)")
     add("--order", choices=tuple(ORDERS), help="order of the six components, where a NIfTI file does not declare it")
-    add("--solver", choices=("auto", "dense", "shift-invert"), default="auto", help="eigensolver (default auto)")
+    add(
+        "--solver",
+        choices=("auto", "dense", "shift-invert", "block-lanczos"),
+        default="auto",
+        help="eigensolver (default auto)",
+    )
     add(
         "--normalisation",
         choices=("raw", "heat-trace", "volume", "flat"),

@@ -10,6 +10,7 @@ import numpy as np
 from hks_jax.cli.arguments import DEFAULT_TIMES, Times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_field import MetricChoice, TensorField
+from hks_jax.eigen.block_lanczos import BlockLanczos
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.shift_invert import ShiftInvert
 from hks_jax.eigen.solve import choose_solver, eigenpairs
@@ -113,7 +114,7 @@ def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
 def _reporting(solver: str, pencil: Pencil | MirrorPencil, k: int, callback: Callable[[str], None]) -> Eigensolver:
     """Return the solver, with progress if it has any to show."""
     chosen = choose_solver(solver, pencil.parts[0], k)
-    return ShiftInvert(progress=callback) if isinstance(chosen, ShiftInvert) else chosen
+    return type(chosen)(progress=callback) if isinstance(chosen, ShiftInvert | BlockLanczos) else chosen
 
 
 def _report(

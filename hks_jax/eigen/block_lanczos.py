@@ -12,13 +12,14 @@ from jaxtyping import Array, Float
 
 from hks_jax.eigen.dissection import dissect
 from hks_jax.eigen.host import complement_on_host
-from hks_jax.eigen.slicing import Plan, State, cut, first_state, search
+from hks_jax.eigen.multifrontal import Factorisation
+from hks_jax.eigen.slicing import Plan, State, crowded, cut, first_state, make_room, search, unfinished
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
 
-_SLICE = 120
+_SLICE = 90
 """Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
 
 
@@ -58,7 +59,9 @@ class BlockLanczos(Eigensolver):
         plan = self.plan(k, pencil.space.n_dof)
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(pencil))
         state = (_slice_traced if traced else self._slice)(pencil, plan, self.tolerance)
-        return _lowest(pencil, state, k)
+        values, vectors, complete_below = state.values, state.vectors, state.complete_below
+        del state  # and the room that the Lanczos vectors took
+        return (*_lowest(values, vectors, k), complete_below)
 
     def solve_complement(
         self,
@@ -85,10 +88,13 @@ class BlockLanczos(Eigensolver):
     def _slice(self, pencil: Pencil, plan: Plan, tolerance: float) -> State:
         dissection = jax.tree.map(jnp.asarray, dissect(_grid(pencil)))
         state = _first_state(pencil, plan)
-        while not state.finished and state.slices < plan.max_slices:
+        while unfinished(plan, state):
             factor, here, state = _cut(pencil, dissection, plan, state)
             if here:
-                state = _search(pencil, factor, plan, tolerance, state)
+                state = _make_room(plan, state) if crowded(plan, state) else state
+                vectors, basis = state.vectors, state.basis
+                state = state._replace(vectors=None, basis=None)
+                state = _search(pencil, factor, plan, tolerance, state, vectors, basis)
             self._report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
         return state
 
@@ -98,30 +104,38 @@ class BlockLanczos(Eigensolver):
 
 
 _first_state = jax.jit(first_state, static_argnames="plan")
-_cut = jax.jit(cut, static_argnames="plan", donate_argnames="state")
-_search = jax.jit(search, static_argnames=("plan", "tolerance"), donate_argnames="state")
+_make_room = jax.jit(make_room, static_argnames="plan")
+_cut = jax.jit(cut, static_argnames="plan")
+
+
+@partial(jax.jit, static_argnames=("plan", "tolerance"), donate_argnames=("vectors", "basis"))
+def _search(
+    pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State, vectors: Array, basis: Array
+) -> State:
+    """Search in place: the large arrays of the state are given apart, and given up."""
+    return search(pencil, factor, plan, tolerance, state._replace(vectors=vectors, basis=basis))
 
 
 def _slice_traced(pencil: Pencil, plan: Plan, tolerance: float) -> State:
     dissection = dissect(_grid(pencil))
 
-    def again(state: State) -> Array:
-        return ~state.finished & (state.slices < plan.max_slices)
-
     def body(state: State) -> State:
         factor, here, state = cut(pencil, dissection, plan, state)
+        state = jax.lax.cond(here & crowded(plan, state), partial(make_room, plan), lambda state: state, state)
         return jax.lax.cond(here, partial(search, pencil, factor, plan, tolerance), lambda state: state, state)
 
-    return jax.lax.while_loop(again, body, first_state(pencil, plan))
+    return jax.lax.while_loop(partial(unfinished, plan), body, first_state(pencil, plan))
 
 
 @partial(jax.jit, static_argnames="k")
-def _lowest(pencil: Pencil, state: State, k: int) -> RawPairs:
+def _lowest(
+    values: Float[Array, " capacity"], vectors: Float[Array, "capacity n_dof"], k: int
+) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
     """Return the lowest known pairs; NaN where there are fewer than k."""
-    order = jnp.argsort(state.values)[:k]
-    values, vectors = state.values[order], state.vectors[order]
+    order = jnp.argsort(values)[:k]
+    values, vectors = values[order], vectors[order]
     found = jnp.isfinite(values)
-    return jnp.where(found, values, jnp.nan), jnp.where(found[:, None], vectors, jnp.nan), state.complete_below
+    return jnp.where(found, values, jnp.nan), jnp.where(found[:, None], vectors, jnp.nan)
 
 
 def _grid(pencil: Pencil) -> GridSpace:

@@ -94,6 +94,12 @@ class Eigenpairs(eqx.Module):
                 f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
                 f"Use float64, fewer pairs, or {remedy}"
             )
+        bound, last = float(self.complete_below), float(self.last_eigenvalue)
+        if bound < last * (1 - 2 * float(self.multiplet_tolerance)):
+            found.append(
+                f"the {self.solver_name} solver could not confirm that it missed no eigenvalue between {bound:.6g} and "
+                f"{last:.6g}. Use another solver, or a slightly different k"
+            )
         cut, kept = int(self.cut_multiplet), int(self.kept.sum())
         if cut:
             remedy = f"Take k = {kept - cut} or a larger one" if cut < kept else "Take a larger k"

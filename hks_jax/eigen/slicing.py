@@ -39,7 +39,7 @@ class Plan(NamedTuple):
     @property
     def ritz(self) -> int:
         """Ritz pairs looked at in each slice."""
-        return min(self.block * self.steps, self.slice_size * 4 // 3)
+        return min(self.block * self.steps, self.slice_size * 6 // 5)
 
     @property
     def window(self) -> int:
@@ -49,7 +49,7 @@ class Plan(NamedTuple):
     @property
     def capacity(self) -> int:
         """Room for eigenpairs."""
-        return self.wanted + 2 * self.ritz
+        return self.wanted + self.block + self.ritz
 
 
 class State(NamedTuple):
@@ -98,6 +98,27 @@ def first_state(pencil: Pencil, plan: Plan) -> State:
         basis=jnp.zeros((plan.window + plan.block * plan.steps, n), dtype),
         slices=jnp.zeros((), int),
         finished=jnp.zeros((), bool),
+    )
+
+
+def unfinished(plan: Plan, state: State) -> Bool[Array, ""]:
+    """Return whether to go on: not all is found, and there are tries left."""
+    return ~state.finished & (state.slices < plan.max_slices)
+
+
+def crowded(plan: Plan, state: State) -> Bool[Array, ""]:
+    """Return whether there is no room for what a search may find."""
+    return state.known > plan.capacity - plan.ritz
+
+
+def make_room(plan: Plan, state: State) -> State:
+    """Forget the highest of the known eigenpairs, which are more than wanted."""
+    order = jnp.argsort(state.values)
+    kept = jnp.arange(plan.capacity) < plan.capacity - plan.ritz
+    return state._replace(
+        values=jnp.where(kept, state.values[order], jnp.inf),
+        vectors=jnp.where(kept[:, None], state.vectors[order], 0),
+        known=jnp.minimum(state.known, plan.capacity - plan.ritz),
     )
 
 

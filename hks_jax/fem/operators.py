@@ -16,7 +16,7 @@ from hks_jax.fem.space import FunctionSpace, GridSpace
 
 Pattern = tuple[np.ndarray, np.ndarray]
 
-_ROWS, _LARGE = 8, 1 << 21
+_ROWS, _LARGE = 8, 1 << 22
 """Large arrays are multiplied in blocks of so many rows, written out one by one: the transpose, which sums over the
 rows, is then a fused sum and not a reduction, which XLA does many times slower on CPUs."""
 
