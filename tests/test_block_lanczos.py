@@ -155,7 +155,7 @@ def test_eigenvalues_found_beyond_those_wanted_are_forgotten():
     assert np.isinf(state.values[int(state.known) :]).all()
 
 
-def test_traced_batched_and_mirrored(rng):
+def test_traced_and_batched(rng):
     field = hj.TensorField(hj.Grid((26, 22), 0.1), random_spd(rng, (26, 22)))
     solve = partial(hj.eigenpairs, k=20, solver=hj.BlockLanczos(block=4, slice_size=14))
     said = []
@@ -167,9 +167,15 @@ def test_traced_batched_and_mirrored(rng):
     np.testing.assert_allclose(batched.eigenvalues[0], plain.eigenvalues, atol=1e-9)
     assert batched.converged.all()
     assert (batched.complete_below > batched.eigenvalues[:, -1]).all()
-    mirrored = solve(field, boundary="mirror")
+
+
+@pytest.mark.slow
+def test_mirrored_domain(rng):
+    field = hj.TensorField(hj.Grid((26, 22), 0.1), random_spd(rng, (26, 22)))
+    mirrored = hj.eigenpairs(field, 20, "mirror", hj.BlockLanczos(block=4, slice_size=14))
     reference = hj.eigenpairs(field, 20, "mirror", "dense")
     np.testing.assert_allclose(mirrored.eigenvalues, reference.eigenvalues, atol=1e-9)
+    assert mirrored.complete_below > mirrored.eigenvalues[-1]
 
 
 def test_gradient_equals_the_dense_one(rng):
