@@ -60,7 +60,7 @@ class BlockLanczos(Eigensolver):
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(pencil))
         state = (_slice_traced if traced else self._slice)(pencil, plan, self.tolerance)
         values, vectors, complete_below = state.values, state.vectors, state.complete_below
-        del state  # and the room that the Lanczos vectors took
+        del state
         return (*_lowest(values, vectors, k), complete_below)
 
     def solve_complement(
@@ -92,9 +92,7 @@ class BlockLanczos(Eigensolver):
             factor, here, state = _cut(pencil, dissection, plan, state)
             if here:
                 state = _make_room(plan, state) if crowded(plan, state) else state
-                vectors, basis = state.vectors, state.basis
-                state = state._replace(vectors=None, basis=None)
-                state = _search(pencil, factor, plan, tolerance, state, vectors, basis)
+                state = search(pencil, factor, plan, tolerance, state)
             self._report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
         return state
 
@@ -106,14 +104,6 @@ class BlockLanczos(Eigensolver):
 _first_state = jax.jit(first_state, static_argnames="plan")
 _make_room = jax.jit(make_room, static_argnames="plan")
 _cut = jax.jit(cut, static_argnames="plan")
-
-
-@partial(jax.jit, static_argnames=("plan", "tolerance"), donate_argnames=("vectors", "basis"))
-def _search(
-    pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State, vectors: Array, basis: Array
-) -> State:
-    """Search in place: the large arrays of the state are given apart, and given up."""
-    return search(pencil, factor, plan, tolerance, state._replace(vectors=vectors, basis=basis))
 
 
 def _slice_traced(pencil: Pencil, plan: Plan, tolerance: float) -> State:

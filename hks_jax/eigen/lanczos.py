@@ -1,89 +1,184 @@
 """Block Lanczos for the eigenvalues nearest to a shift."""
 
+from functools import partial
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.multifrontal import Factorisation
 from hks_jax.fem.pencil import Pencil
+
+_CHUNK = 128
+"""Called plainly, the basis grows by so many rows at a time: projecting on rows that are still empty costs as much."""
+
+
+class _Blocks(NamedTuple):
+    """Two neighbouring blocks of the basis, and the image under M of the latter."""
+
+    before: Float[Array, "b n_dof"]
+    block: Float[Array, "b n_dof"]
+    image: Float[Array, "b n_dof"]
+    coupling: Float[Array, "b b"]
+
+
+class _Projected(NamedTuple):
+    """Blocks of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, two on the diagonal and two below it."""
+
+    diagonal: Float[Array, "2 b b"]
+    below: Float[Array, "2 b b"]
 
 
 def block_lanczos(
     pencil: Pencil,
     factor: Factorisation,
     start: Float[Array, "b n_dof"],
-    basis: Float[Array, "rows n_dof"],
+    known: Float[Array, "w n_dof"],
     steps: int,
     wanted: int,
-) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"], Float[Array, "rows n_dof"]]:
+) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     Neighbouring blocks are kept orthogonal by the recurrence, and two at a time by one pass against the whole basis,
-    which reads it from memory half as often and leaves it M-orthonormal to rounding.
+    which reads it from memory half as often and leaves it M-orthonormal to rounding. Traced, the steps are a loop of
+    XLA's over a basis of fixed size; called plainly, a loop here, over one that grows.
 
     Args:
         pencil: K and M.
         factor: the factorisation of K − σM.
         start: the first block, any vectors.
-        basis: known M-orthonormal eigenvectors in its first rows, zero rows for all Lanczos vectors after them.
+        known: M-orthonormal eigenvectors, or zero rows.
         steps: how many blocks; even.
         wanted: how many Ritz pairs to return.
 
     Returns:
-        The Ritz values θ = 1/(λ − σ), largest magnitude first, M-orthonormal Ritz vectors, and the basis used up.
+        The Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors.
     """
     b = start.shape[0]
-    w = basis.shape[0] - steps * b
+    pairs = steps // 2
+    blocks = _begin(pencil, start, known)
+    if isinstance(factor.negative, jax.core.Tracer):
+        empty = jnp.zeros((pairs, 2, b, b), start.dtype)
 
-    def project(x: Array, basis: Array) -> Array:
-        return x - jnp.matmul(_products(basis, pencil.mass.apply(x)), basis, precision="highest")
+        def body(j: int, state: tuple[Array, _Blocks, _Projected]) -> tuple[Array, _Blocks, _Projected]:
+            rows, blocks, matrix = state
+            (rows,), blocks, part = _two_steps(pencil, factor, [known], [rows], blocks, 2 * j * b)
+            return rows, blocks, _Projected(*(all_.at[j].set(one) for all_, one in zip(matrix, part, strict=True)))
 
-    def apply(block: Array, before: Array, coupling: Array) -> tuple[Array, Array]:
-        image = factor.solve(pencil.mass.apply(block))
-        diagonal = _products(block, pencil.mass.apply(image))
-        diagonal = (diagonal + diagonal.T) / 2
-        image = image - jnp.matmul(diagonal, block, precision="highest")
-        return diagonal, image - jnp.matmul(coupling.T, before, precision="highest")
-
-    def step(j: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        basis, block, before, coupling, diagonals, couplings = state
-        basis = jax.lax.dynamic_update_slice_in_dim(basis, block, w + 2 * j * b, axis=0)
-        diagonal, rest = apply(block, before, coupling)
-        middle, coupling = _orthonormal(pencil, rest)
-        diagonal_2, rest = apply(middle, block, coupling)
-        both = project(jnp.concatenate([middle, rest]), basis)
-        middle, rest = both[:b], both[b:]
-        rest = project(rest, middle)
-        basis = jax.lax.dynamic_update_slice_in_dim(basis, middle, w + (2 * j + 1) * b, axis=0)
-        following, coupling_2 = _orthonormal(pencil, rest)
-        diagonals = diagonals.at[2 * j].set(diagonal).at[2 * j + 1].set(diagonal_2)
-        couplings = couplings.at[2 * j].set(coupling).at[2 * j + 1].set(coupling_2)
-        return basis, following, middle, coupling_2, diagonals, couplings
-
-    block, _ = _orthonormal(pencil, project(start, basis))
-    block, _ = _orthonormal(pencil, project(block, basis))
-    blocks = jnp.zeros((steps, b, b), start.dtype)
-    basis, _, _, _, diagonals, couplings = jax.lax.fori_loop(
-        0, steps // 2, step, (basis, block, jnp.zeros_like(block), jnp.zeros_like(blocks[0]), blocks, blocks)
-    )
-    theta, modes = jnp.linalg.eigh(_projected(diagonals, couplings))
-    order = jnp.argsort(-jnp.abs(theta))[:wanted]
-    mix = jnp.pad(modes[:, order].T, ((0, 0), (w, 0)))
-    return theta[order], jnp.matmul(mix, basis, precision="highest"), basis
+        state = jnp.zeros((steps * b, start.shape[1]), start.dtype), blocks, _Projected(empty, empty)
+        rows, _, matrix = jax.lax.fori_loop(0, pairs, body, state)
+        basis = [rows]
+    else:
+        basis, parts = [], []
+        size = max(_CHUNK // (2 * b), 1) * 2 * b
+        for row in range(0, steps * b, 2 * b):
+            if row % size == 0:
+                basis.append(jnp.zeros((min(size, steps * b - row), start.shape[1]), start.dtype))
+            basis, blocks, part = _two_steps(pencil, factor, [known], basis, blocks, row % size)
+            parts.append(part)
+        matrix = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+    return _ritz_pairs(matrix, basis, wanted)
 
 
-def _orthonormal(pencil: Pencil, x: Float[Array, "b n_dof"]) -> tuple[Float[Array, "b n_dof"], Float[Array, "b b"]]:
-    """Return M-orthonormal rows y and the factor R of x = Ry."""
-    total = jnp.eye(x.shape[0], dtype=x.dtype)
+def _two_steps(
+    pencil: Pencil, factor: Factorisation, known: list[Array], basis: list[Array], blocks: _Blocks, row: int | Array
+) -> tuple[list[Array], _Blocks, _Projected]:
+    """Write the last block and one more into the basis, and return the block that follows these."""
+    b = blocks.block.shape[0]
+    diagonal, rest = _apply(factor, blocks)
+    middle, image, coupling = _orthonormal(pencil, rest)
+    diagonal_2, rest = _apply(factor, _Blocks(blocks.block, middle, image, coupling))
+    basis = [*basis[:-1], _write(basis[-1], blocks.block, row)]
+    both, images = _join(pencil, middle, image, rest)
+    for rows in [*known, *basis]:
+        both = _project(rows, both, images)
+    middle, rest = _part(both, image)
+    basis = [*basis[:-1], _write(basis[-1], middle, row + b)]
+    following, image, coupling_2 = _orthonormal(pencil, rest)
+    part = _Projected(jnp.stack([diagonal, diagonal_2]), jnp.stack([coupling, coupling_2]))
+    return basis, _Blocks(middle, following, image, coupling_2), part
+
+
+@jax.jit
+def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "w n_dof"]) -> _Blocks:
+    """Return the first block."""
+    block = image = start
     for _ in range(2):
-        gram = _products(x, pencil.mass.apply(x))
+        block, image, _ = _orthonormal(pencil, _project(known, block, pencil.mass.apply(block)))
+    return _Blocks(jnp.zeros_like(block), block, image, jnp.zeros((len(start), len(start)), start.dtype))
+
+
+@jax.jit
+def _apply(factor: Factorisation, blocks: _Blocks) -> tuple[Float[Array, "b b"], Float[Array, "b n_dof"]]:
+    """Apply (K − σM)⁻¹M to the last block; return its diagonal block, and what is left of the image."""
+    before, block, image, coupling = blocks
+    rest = factor.solve(image)
+    diagonal = _products(image, rest)
+    diagonal = (diagonal + diagonal.T) / 2
+    return diagonal, rest - _combine(diagonal, block) - _combine(coupling.T, before)
+
+
+@jax.jit
+def _orthonormal(pencil: Pencil, x: Float[Array, "b n_dof"]) -> tuple[Array, Array, Float[Array, "b b"]]:
+    """Return M-orthonormal rows y, My, and the factor R of x = Ry."""
+    total = jnp.eye(x.shape[0], dtype=x.dtype)
+    image = x
+    for _ in range(2):
+        image = pencil.mass.apply(x)
+        gram = _products(x, image)
         norms = jnp.sqrt(jnp.diagonal(gram))
         norms = jnp.where(norms > 0, norms, 1)
         sizes, mix = jnp.linalg.eigh(gram / norms / norms[:, None])
         sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(x.dtype).eps * sizes[-1]))
-        x = jnp.matmul((mix / sizes / norms[:, None]).T, x, precision="highest")
+        change = (mix / sizes / norms[:, None]).T
+        x, image = _combine(change, x), _combine(change, image)
         total = jnp.matmul(total, norms[:, None] * mix * sizes, precision="highest")
-    return x, total
+    return x, image, total
+
+
+@jax.jit
+def _project(basis: Float[Array, "rows n_dof"], x: Array, image: Array) -> Array:
+    """Return x, whose image under M is given, orthogonal to the basis."""
+    return x - _combine(_products(basis, image), basis)
+
+
+@jax.jit
+def _join(pencil: Pencil, middle: Array, image: Array, rest: Array) -> tuple[Array, Array]:
+    """Return two blocks as one, and their images under M."""
+    return jnp.concatenate([middle, rest]), jnp.concatenate([image, pencil.mass.apply(rest)])
+
+
+@jax.jit
+def _part(both: Array, image: Array) -> tuple[Array, Array]:
+    """Return two blocks apart, the latter orthogonal to the former, whose image under M is given."""
+    middle, rest = jnp.split(both, 2)
+    return middle, rest - _combine(_products(image, rest), middle)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _write(basis: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], row: int | Array) -> Array:
+    return jax.lax.dynamic_update_slice_in_dim(basis, block, row, axis=0)
+
+
+@partial(jax.jit, static_argnames="wanted")
+def _ritz_pairs(
+    matrix: _Projected, basis: list[Float[Array, "rows n_dof"]], wanted: int
+) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
+    pairs, _, b, _ = matrix.diagonal.shape
+    steps = 2 * pairs
+    diagonal, below = matrix.diagonal.reshape(steps, b, b), matrix.below.reshape(steps, b, b)[:-1]
+    full = jnp.zeros((steps, b, steps, b), diagonal.dtype)
+    i = jnp.arange(steps)
+    full = full.at[i, :, i, :].set(diagonal)
+    full = full.at[i[:-1], :, i[1:], :].set(below)
+    full = full.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
+    theta, modes = jnp.linalg.eigh(full.reshape(steps * b, steps * b))
+    order = jnp.argsort(-jnp.abs(theta))[:wanted]
+    ends = np.cumsum([len(rows) for rows in basis])[:-1]
+    mixes = jnp.split(modes[:, order].T, ends, axis=1)
+    return theta[order], sum(_combine(mix, rows) for mix, rows in zip(mixes, basis, strict=True))
 
 
 def _products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
@@ -96,12 +191,6 @@ def _products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[A
     return jax.lax.optimization_barrier(products.T)
 
 
-def _projected(diagonal: Float[Array, "q b b"], couplings: Float[Array, "q b b"]) -> Float[Array, "m m"]:
-    """Return the block tridiagonal matrix."""
-    steps, b, _ = diagonal.shape
-    matrix = jnp.zeros((steps, b, steps, b), diagonal.dtype)
-    i, below = jnp.arange(steps), couplings[:-1]
-    matrix = matrix.at[i, :, i, :].set(diagonal)
-    matrix = matrix.at[i[:-1], :, i[1:], :].set(below)
-    matrix = matrix.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
-    return matrix.reshape(steps * b, steps * b)
+def _combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array, "q n"]:
+    """Return linear combinations of the basis."""
+    return jnp.matmul(mix, basis, precision="highest")

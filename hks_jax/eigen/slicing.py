@@ -6,6 +6,7 @@ converged is known from then on. A last factorisation above the last eigenvalue 
 eigenvalues as are known lie below it. Few vectors at a time keep orthogonalisation cheap, however many are wanted.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,9 @@ from hks_jax.eigen.lanczos import block_lanczos
 from hks_jax.eigen.multifrontal import Factorisation, factorise
 from hks_jax.eigen.quality import ROWS, indistinct, rayleigh_quotient, relative_defect
 from hks_jax.fem.pencil import Pencil
+
+_MOVES = 3
+"""How often in a row to move a shift at which the factorisation is inaccurate, before it must do."""
 
 
 class Plan(NamedTuple):
@@ -63,8 +67,8 @@ class State(NamedTuple):
         front: known up to here without a gap, as far as is known.
         complete_below: every eigenvalue below it is known, by the inertia of a factorisation.
         start: (block, n_dof) where Lanczos starts next.
-        basis: (window + block · steps, n_dof) room for Lanczos vectors.
         slices: factorisations so far.
+        moved: how often in a row the shift was moved instead of searched.
         finished: whether all is found and certified.
     """
 
@@ -75,8 +79,8 @@ class State(NamedTuple):
     front: Float[Array, ""]
     complete_below: Float[Array, ""]
     start: Float[Array, "block n_dof"]
-    basis: Float[Array, "rows n_dof"]
     slices: Int[Array, ""]
+    moved: Int[Array, ""]
     finished: Bool[Array, ""]
 
 
@@ -95,8 +99,8 @@ def first_state(pencil: Pencil, plan: Plan) -> State:
         front=jnp.zeros((), dtype),
         complete_below=jnp.zeros((), dtype),
         start=jax.random.normal(jax.random.key(0), (plan.block, n), dtype),
-        basis=jnp.zeros((plan.window + plan.block * plan.steps, n), dtype),
         slices=jnp.zeros((), int),
+        moved=jnp.zeros((), int),
         finished=jnp.zeros((), bool),
     )
 
@@ -131,28 +135,59 @@ def cut(
     missing = factor.negative - below
     finished = (missing == 0) & (below >= plan.wanted)
     too_many = missing > plan.slice_size
-    nearer = state.front + (state.shift - state.front) * plan.slice_size / (2.5 * jnp.maximum(missing, 1))
+    # Fronts are not pivoted: where a part of the domain has an eigenvalue very near to the shift, rounding grows.
+    solved = factor.solve(state.start)
+    defect = pencil.stiffness.apply(solved) - state.shift * pencil.mass.apply(solved) - state.start
+    accurate = jnp.linalg.norm(defect) <= 1e5 * jnp.finfo(defect.dtype).eps * jnp.linalg.norm(state.start)
+    elsewhere = too_many | ~(accurate | (state.moved >= _MOVES))
+    nearer = jnp.where(too_many, plan.slice_size / (2.5 * jnp.maximum(missing, 1)), 0.97)
     state = state._replace(
         slices=state.slices + 1,
         finished=finished,
         complete_below=jnp.where(missing == 0, state.shift, state.complete_below),
-        shift=jnp.where(too_many, nearer, state.shift),
+        shift=jnp.where(elsewhere, state.front + nearer * (state.shift - state.front), state.shift),
+        moved=jnp.where(elsewhere, state.moved + 1, 0),
     )
-    return factor, ~(finished | too_many), state
+    return factor, ~(finished | elsewhere), state
 
 
 def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State) -> State:
     """Find the eigenpairs around the shift."""
-    shift, index = state.shift, jnp.arange(plan.capacity)
-    nearest = jnp.argsort(jnp.abs(state.values - shift))
-    window = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
-    # What is known but outside the window may be found again: nothing out there is taken.
-    others = jnp.where(jnp.isin(index, nearest[: plan.window]), jnp.nan, state.values)
-    low = jnp.nanmax(jnp.where(others < shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf)
-    high = jnp.nanmin(jnp.where(others > shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
+    window, low, high = _window(plan, state)
+    theta, vectors = block_lanczos(pencil, factor, state.start, window, plan.steps, plan.ritz)
+    known = state.vectors
+    return _accept(pencil, factor.negative, plan, tolerance, theta, vectors, low, high, known, state._replace(vectors=()))
 
-    basis = jnp.zeros_like(state.basis).at[: plan.window].set(window)
-    theta, vectors, basis = block_lanczos(pencil, factor, state.start, basis, plan.steps, plan.ritz)
+
+@partial(jax.jit, static_argnames="plan")
+def _window(plan: Plan, state: State) -> tuple[Float[Array, "window n_dof"], Float[Array, ""], Float[Array, ""]]:
+    """Return the known eigenvectors nearest to the shift, and the interval in which nothing else is known."""
+    nearest = jnp.argsort(jnp.abs(state.values - state.shift))
+    window = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
+    others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest[: plan.window]), jnp.nan, state.values)
+    low = jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf)
+    high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
+    return window, low, high
+
+
+@partial(jax.jit, static_argnames=("plan", "tolerance"), donate_argnames="known_vectors")
+def _accept(
+    pencil: Pencil,
+    negative: Int[Array, ""],
+    plan: Plan,
+    tolerance: float,
+    theta: Float[Array, " ritz"],
+    vectors: Float[Array, "ritz n_dof"],
+    low: Float[Array, ""],
+    high: Float[Array, ""],
+    known_vectors: Float[Array, "capacity n_dof"],
+    state: State,
+) -> State:
+    """Take what converged between low and high, and choose the next shift; the state's vectors come apart, to be donated.
+
+    What is known outside that interval may have been found again: nothing out there is taken.
+    """
+    shift, index = state.shift, jnp.arange(plan.capacity)
     near = shift + 1 / theta
 
     def measure(vector: Float[Array, " n_dof"]) -> tuple[Array, Array]:
@@ -174,9 +209,9 @@ def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, 
     count = jnp.sum(accepted)
     found = jnp.where(jnp.arange(plan.ritz) < count, values[order], jnp.inf)
     all_values = jax.lax.dynamic_update_slice_in_dim(state.values, found, state.known, 0)
-    all_vectors = jax.lax.dynamic_update_slice_in_dim(state.vectors, vectors[order], state.known, 0)
+    all_vectors = jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], state.known, 0)
     known = state.known + count
-    complete = factor.negative == jnp.sum(all_values < shift)
+    complete = negative == jnp.sum(all_values < shift)
     top = jnp.max(jnp.where(index < known, all_values, -jnp.inf), initial=0)
 
     # Where some below the shift are missing, go to where the lowest that did not converge seems to be.
@@ -194,8 +229,8 @@ def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, 
         jnp.where(complete, top, state.front),
         jnp.where(complete, shift, state.complete_below),
         start,
-        basis,
         state.slices,
+        state.moved,
         state.finished,
     )
 

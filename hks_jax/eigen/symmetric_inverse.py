@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int
 Inverse = tuple[Float[Array, "n n"], Int[Array, ""]]
 
 _BLOCK = 32
+_SMALL = 32
 
 
 def symmetric_inverse(matrix: Float[Array, "n n"]) -> Inverse:
@@ -19,9 +20,19 @@ def symmetric_inverse(matrix: Float[Array, "n n"]) -> Inverse:
 
 
 def by_eigenvalues(matrix: Float[Array, "n n"]) -> Inverse:
-    """Invert the eigenvalues."""
-    values, vectors = jnp.linalg.eigh(matrix)
-    return jnp.matmul(vectors / values, vectors.T, precision="highest"), jnp.sum(values < 0)
+    """Invert the eigenvalues; of the many small matrices, those of two halves and the Schur complement between them."""
+    n = matrix.shape[0]
+    if n != _SMALL:
+        values, vectors = jnp.linalg.eigh(matrix)
+        return jnp.matmul(vectors / values, vectors.T, precision="highest"), jnp.sum(values < 0)
+    half = n // 2
+    first, negative = by_eigenvalues(matrix[:half, :half])
+    coupling = jnp.matmul(matrix[half:, :half], first, precision="highest")
+    schur = matrix[half:, half:] - jnp.matmul(coupling, matrix[:half, half:], precision="highest")
+    last, more = by_eigenvalues((schur + schur.T) / 2)
+    beside = -jnp.matmul(last, coupling, precision="highest")
+    first = first - jnp.matmul(coupling.T, beside, precision="highest")
+    return jnp.block([[first, beside.T], [beside, last]]), negative + more
 
 
 def by_elimination(matrix: Float[Array, "n n"]) -> Inverse:
