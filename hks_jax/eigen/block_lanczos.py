@@ -89,7 +89,9 @@ class BlockLanczos(Eigensolver):
         dissection = jax.tree.map(jnp.asarray, dissect(_grid(pencil)))
         state = _first_state(pencil, plan)
         while unfinished(plan, state):
-            factor, here, state = _cut(pencil, dissection, plan, state)
+            # What a jitted function hands through is copied: the eigenvectors stay outside.
+            factor, here, rest = _cut(pencil, dissection, plan, state._replace(vectors=None))
+            state = rest._replace(vectors=state.vectors)
             if here:
                 state = _make_room(plan, state) if crowded(plan, state) else state
                 state = search(pencil, factor, plan, tolerance, state)

@@ -71,7 +71,8 @@ def factorise(dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]) -
         blocks = blocks.at[level.padding].set(1, unique_indices=True).reshape(fronts, s + r, s)
         rest = jnp.zeros((fronts, r, r), coefficients.dtype)
         if schur is not None:
-            added = _gather_symmetric(schur, level.children[0]) + _gather_symmetric(schur, level.children[1])
+            first, second = _gather_symmetric(schur, jnp.asarray(level.children))
+            added = first + second
             blocks, rest = blocks + added[:, :, :s], added[:, s:, s:]
         inverse, below = jax.vmap(symmetric_inverse)(blocks[:, :s])
         coupling = jnp.matmul(blocks[:, s:], inverse, precision="highest")
@@ -100,11 +101,11 @@ def _gather(x: Float[Array, "n b"], index: Int[ArrayLike, "fronts m"]) -> Float[
 
 
 def _gather_symmetric(
-    blocks: Float[Array, "children r r"], index: Int[Array, "fronts m"]
-) -> Float[Array, "fronts m m"]:
-    """Return the entries of symmetric blocks at pairs of places (child · r + i, child · r + j); zero for padding."""
-    fronts, r = index.shape[0], blocks.shape[1]
-    within = jnp.where(index < blocks.shape[0] * r, jnp.arange(fronts)[:, None] * r + index % r, fronts * r)
+    blocks: Float[Array, "blocks r r"], index: Int[Array, "children fronts m"]
+) -> Float[Array, "children fronts m m"]:
+    """Return the entries of symmetric blocks at pairs of places (block · r + i, block · r + j); zero for padding."""
+    (n, r), (children, fronts, m) = blocks.shape[:2], index.shape
+    within = jnp.where(index < n * r, jnp.arange(children * fronts).reshape(children, fronts, 1) * r + index % r, -1)
     # Whole rows, and once more after transposition: many times faster than entry by entry.
-    rows = jnp.swapaxes(_gather(blocks.reshape(-1, r), index), 1, 2)
-    return _gather(rows.reshape(fronts * r, -1), within)
+    rows = jnp.swapaxes(_gather(blocks.reshape(-1, r), index), 2, 3)
+    return _gather(rows.reshape(-1, m), jnp.where(within < 0, children * fronts * r, within))
