@@ -14,7 +14,7 @@ from fields import flat, random_spd
 import hks_jax as hj
 from hks_jax.eigen.dissection import dissect
 from hks_jax.eigen.multifrontal import factorise
-from hks_jax.eigen.slicing import Plan, crowded, first_state, make_room
+from hks_jax.eigen.slicing import Plan, crowded, cut, first_state, make_room
 from hks_jax.eigen.symmetric_inverse import by_eigenvalues, by_elimination
 
 
@@ -153,6 +153,25 @@ def test_eigenvalues_found_beyond_those_wanted_are_forgotten():
     np.testing.assert_array_equal(state.values[: int(state.known)], np.arange(int(state.known)))
     np.testing.assert_array_equal(state.vectors[:, 0][: int(state.known)], np.arange(int(state.known)))
     assert np.isinf(state.values[int(state.known) :]).all()
+
+
+def test_a_shift_where_a_front_is_singular_is_moved(rng):
+    pencil = problem(rng, "neumann")
+    dissection = dissect(pencil.space)
+    # The own nodes of one half of all fronts below the first separator are the nodes on one side of it.
+    half = np.concatenate([level.own[: len(level.own) // 2].ravel() for level in dissection.levels[1:]])
+    half = half[half < pencil.space.n_dof]
+    K, M = (matrix[np.ix_(half, half)] for matrix in dense_matrices(pencil))
+    singular = scipy.linalg.eigh(K, M, eigvals_only=True)[5]
+    plan = hj.BlockLanczos(block=4).plan(20, pencil.space.n_dof)
+    state = first_state(pencil, plan)._replace(shift=jnp.asarray(singular))
+    _, here, moved = cut(pencil, dissection, plan, state)
+    assert not here
+    assert moved.moved == 1
+    assert 0.9 * singular < moved.shift < singular
+    _, here, state = cut(pencil, dissection, plan, moved)
+    assert here
+    assert state.shift == moved.shift
 
 
 def test_traced_and_batched(rng):

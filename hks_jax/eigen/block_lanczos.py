@@ -12,14 +12,13 @@ from jaxtyping import Array, Float
 
 from hks_jax.eigen.dissection import dissect
 from hks_jax.eigen.host import complement_on_host
-from hks_jax.eigen.multifrontal import Factorisation
 from hks_jax.eigen.slicing import Plan, State, crowded, cut, first_state, make_room, search, unfinished
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
 
-_SLICE = 90
+_SLICE = 125
 """Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
 
 

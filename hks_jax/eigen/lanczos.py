@@ -64,26 +64,26 @@ def block_lanczos(
 
         def body(j: int, state: tuple[Array, _Blocks, _Projected]) -> tuple[Array, _Blocks, _Projected]:
             rows, blocks, matrix = state
-            (rows,), blocks, part = _two_steps(pencil, factor, [known], [rows], blocks, 2 * j * b)
+            (_, rows), blocks, part = _two_steps(pencil, factor, [known, rows], blocks, 2 * j * b)
             return rows, blocks, _Projected(*(all_.at[j].set(one) for all_, one in zip(matrix, part, strict=True)))
 
         state = jnp.zeros((steps * b, start.shape[1]), start.dtype), blocks, _Projected(empty, empty)
         rows, _, matrix = jax.lax.fori_loop(0, pairs, body, state)
-        basis = [rows]
+        basis = [known, rows]
     else:
-        basis, parts = [], []
+        basis, parts = [known], []
         size = max(_CHUNK // (2 * b), 1) * 2 * b
         for row in range(0, steps * b, 2 * b):
             if row % size == 0:
                 basis.append(jnp.zeros((min(size, steps * b - row), start.shape[1]), start.dtype))
-            basis, blocks, part = _two_steps(pencil, factor, [known], basis, blocks, row % size)
+            basis, blocks, part = _two_steps(pencil, factor, basis, blocks, row % size)
             parts.append(part)
         matrix = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-    return _ritz_pairs(matrix, basis, wanted)
+    return _ritz_pairs(matrix, basis[1:], wanted)
 
 
 def _two_steps(
-    pencil: Pencil, factor: Factorisation, known: list[Array], basis: list[Array], blocks: _Blocks, row: int | Array
+    pencil: Pencil, factor: Factorisation, basis: list[Array], blocks: _Blocks, row: int | Array
 ) -> tuple[list[Array], _Blocks, _Projected]:
     """Write the last block and one more into the basis, and return the block that follows these."""
     b = blocks.block.shape[0]
@@ -92,7 +92,7 @@ def _two_steps(
     diagonal_2, rest = _apply(factor, _Blocks(blocks.block, middle, image, coupling))
     basis = [*basis[:-1], _write(basis[-1], blocks.block, row)]
     both, images = _join(pencil, middle, image, rest)
-    for rows in [*known, *basis]:
+    for rows in basis:
         both = _project(rows, both, images)
     middle, rest = _part(both, image)
     basis = [*basis[:-1], _write(basis[-1], middle, row + b)]
@@ -178,7 +178,10 @@ def _ritz_pairs(
     order = jnp.argsort(-jnp.abs(theta))[:wanted]
     ends = np.cumsum([len(rows) for rows in basis])[:-1]
     mixes = jnp.split(modes[:, order].T, ends, axis=1)
-    return theta[order], sum(_combine(mix, rows) for mix, rows in zip(mixes, basis, strict=True))
+    vectors = jnp.zeros((), diagonal.dtype)
+    for mix, rows in zip(mixes, basis, strict=True):
+        vectors = vectors + _combine(mix, rows)
+    return theta[order], vectors
 
 
 def _products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:

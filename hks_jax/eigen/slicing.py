@@ -47,8 +47,11 @@ class Plan(NamedTuple):
 
     @property
     def window(self) -> int:
-        """Known eigenvectors that a slice stays orthogonal to, so as not to find them again."""
-        return self.slice_size // 2
+        """Known eigenvectors that a slice stays orthogonal to, so as not to find them again.
+
+        Those far away are not found before what is nearer, but of a large multiplet a slice finds only a part.
+        """
+        return max(self.slice_size // 4, min(self.slice_size // 2, 48))
 
     @property
     def capacity(self) -> int:
@@ -61,7 +64,7 @@ class State(NamedTuple):
 
     Attributes:
         values: (capacity,) known eigenvalues in the order found; infinite where there is none.
-        vectors: (capacity, n_dof) their M-orthonormal eigenvectors.
+        vectors: (capacity, n_dof) their M-orthonormal eigenvectors; None where they are handed over apart.
         known: how many there are.
         shift: where to cut next.
         front: known up to here without a gap, as far as is known.
@@ -73,7 +76,7 @@ class State(NamedTuple):
     """
 
     values: Float[Array, " capacity"]
-    vectors: Float[Array, "capacity n_dof"]
+    vectors: Float[Array, "capacity n_dof"] | None
     known: Int[Array, ""]
     shift: Float[Array, ""]
     front: Float[Array, ""]
@@ -117,6 +120,7 @@ def crowded(plan: Plan, state: State) -> Bool[Array, ""]:
 
 def make_room(plan: Plan, state: State) -> State:
     """Forget the highest of the known eigenpairs, which are more than wanted."""
+    assert state.vectors is not None
     order = jnp.argsort(state.values)
     kept = jnp.arange(plan.capacity) < plan.capacity - plan.ritz
     return state._replace(
@@ -155,13 +159,14 @@ def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, 
     """Find the eigenpairs around the shift."""
     window, low, high = _window(plan, state)
     theta, vectors = block_lanczos(pencil, factor, state.start, window, plan.steps, plan.ritz)
-    known = state.vectors
-    return _accept(pencil, factor.negative, plan, tolerance, theta, vectors, low, high, known, state._replace(vectors=()))
+    rest = state._replace(vectors=None)
+    return _accept(pencil, factor.negative, plan, tolerance, theta, vectors, low, high, state.vectors, rest)
 
 
 @partial(jax.jit, static_argnames="plan")
 def _window(plan: Plan, state: State) -> tuple[Float[Array, "window n_dof"], Float[Array, ""], Float[Array, ""]]:
     """Return the known eigenvectors nearest to the shift, and the interval in which nothing else is known."""
+    assert state.vectors is not None
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))
     window = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
     others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest[: plan.window]), jnp.nan, state.values)
@@ -183,9 +188,10 @@ def _accept(
     known_vectors: Float[Array, "capacity n_dof"],
     state: State,
 ) -> State:
-    """Take what converged between low and high, and choose the next shift; the state's vectors come apart, to be donated.
+    """Take what converged between low and high, and choose the next shift.
 
-    What is known outside that interval may have been found again: nothing out there is taken.
+    What is known outside that interval may have been found again: nothing out there is taken. The state's eigenvectors
+    come apart from it, and are overwritten.
     """
     shift, index = state.shift, jnp.arange(plan.capacity)
     near = shift + 1 / theta
