@@ -19,18 +19,8 @@ from machine import RESULTS, field, write
 import hks_jax as hj
 
 
-def main() -> None:
-    """Measure, print a table, and write the result file."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--fields", type=int, default=100)
-    parser.add_argument("--nodes", type=int, default=64, help="along each axis")
-    parser.add_argument("--pairs", type=int, default=100)
-    parser.add_argument("--float32", action="store_true")
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "batch.json")
-    arguments = parser.parse_args()
-    jax.config.update("jax_enable_x64", not arguments.float32)
-    warnings.simplefilter("ignore", hj.AccuracyWarning)
-    n, k, count = arguments.nodes, arguments.pairs, arguments.fields
+def measure(count: int, n: int, k: int) -> list[dict]:
+    """Measure every way to solve many fields of n² nodes, and print a table."""
     first = field(n)
     scales = np.exp(np.random.default_rng(0).uniform(-1, 1, (count, n, n, 1, 1)))
     tensors = jnp.asarray(scales * np.asarray(first.tensors))
@@ -62,7 +52,23 @@ def main() -> None:
         row = {"way": name, "seconds": seconds, "fields_per_second": count / seconds, "first_call_s": once}
         rows.append(row | {"worst_residual": float(residuals.max()), "eigenvalue_difference": difference})
         print(f"{name:26s} {seconds:8.2f} s {count / seconds:8.2f} fields/s, residual {float(residuals.max()):.1e}")
-    write(arguments.output, rows, nodes=n * n, k=k, fields=count, dtype=str(tensors.dtype))
+    return rows
+
+
+def main() -> None:
+    """Measure, print a table, and write the result file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--fields", type=int, default=100)
+    parser.add_argument("--nodes", type=int, default=64, help="along each axis")
+    parser.add_argument("--pairs", type=int, default=100)
+    parser.add_argument("--float32", action="store_true")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "batch.json")
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", not arguments.float32)
+    warnings.simplefilter("ignore", hj.AccuracyWarning)
+    rows = measure(arguments.fields, arguments.nodes, arguments.pairs)
+    sizes = {"nodes": arguments.nodes**2, "k": arguments.pairs, "fields": arguments.fields}
+    write(arguments.output, rows, **sizes, dtype="float32" if arguments.float32 else "float64")
 
 
 if __name__ == "__main__":

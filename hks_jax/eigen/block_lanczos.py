@@ -80,8 +80,8 @@ class BlockLanczos(Eigensolver):
         """Return the sizes of the computation."""
         slices = max(round(k / (self.slice_size or _SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
-        # Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2 converge to 1e-8.
-        steps = 2 * math.ceil((2 * size + 12 * self.block) / self.block / 2)
+        # Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
+        steps = 2 * math.ceil((2.1 * size + 12 * self.block) / self.block / 2)
         return Plan(k, self.block, steps, size, max_slices=3 * slices + 12)
 
     def _slice(self, pencil: Pencil, plan: Plan, tolerance: float) -> State:
