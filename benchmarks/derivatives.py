@@ -25,7 +25,7 @@ from machine import RESULTS, field, timed, write
 import hks_jax as hj
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-from differences import heat_kernel_by_contour
+from differences import directional, heat_kernel_by_contour
 
 PAIRS = {64: 100, 128: 200, 256: 500}
 N_TIMES = 8
@@ -77,9 +77,8 @@ def cost(n: int) -> dict:
     direction = rng.standard_normal(tensors.shape)
     direction = 0.01 * (direction + np.swapaxes(direction, -1, -2))
     difference = None
-    if n < 256:  # two Richardson extrapolations
-        a, b, c = ((loss(tensors + h * direction) - loss(tensors - h * direction)) / (2 * h) for h in (0.4, 0.2, 0.1))
-        truth = (16 * (4 * c - b) / 3 - (4 * b - a) / 3) / 15
+    if n < 256:
+        truth = directional(loss, tensors, direction, step=0.4)
         difference = float(abs(jnp.vdot(gradient, direction) - truth) / abs(truth))
     memory = {what: peak_memory(n, what) for what in ("nothing", "value", "gradient")}
     row = {"nodes": n * n, "k": PAIRS[n], "times": N_TIMES, "value_s": value, "value_and_gradient_s": both}
@@ -108,7 +107,7 @@ def accuracy() -> list[dict]:
         ends = float(pairs.eigenvalues[-1]), float(pairs.next_eigenvalue)
 
         def reference(tensors: jax.Array, ends: tuple[float, float] = ends) -> jax.Array:
-            # The circle crosses the axis left of 0 and between λ_k and λ_{k+1}; in batches, for memory.
+            # The circle crosses the axis left of 0 and between λ_k and λ_{k+1}.
             kernel = heat_kernel_by_contour(*matrices(tensors), times, *ends, nodes=256)
             return jnp.sum(probe * jnp.diagonal(kernel, axis1=1, axis2=2))
 

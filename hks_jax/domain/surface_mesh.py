@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from hks_jax.domain import spd
 from hks_jax.domain.static_array import StaticArray
-from hks_jax.domain.tensor_field import check_spd
+from hks_jax.traced import is_traced
 
 
 @jax.tree_util.register_static
@@ -93,7 +93,7 @@ class SurfaceMesh(eqx.Module):
         unused = n - np.unique(indices).size
         if unused:
             raise ValueError(f"vertices: {unused} of {n} belong to no face; remove them")
-        if not isinstance(positions, jax.core.Tracer):
+        if not is_traced(positions):
             _check_triangles(np.asarray(positions, dtype=np.float64), indices)
         self.vertices = positions
         self.triangulation = Triangulation(indices, n)
@@ -115,14 +115,8 @@ class SurfaceMesh(eqx.Module):
 
 
 def _checked_metric(metric: Any, n_faces: int) -> Float[Array, "F 2 2"]:
-    array = jnp.asarray(metric)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
-    if array.shape != (n_faces, 2, 2):
-        raise ValueError(f"metric: got shape {array.shape}; expected (F, 2, 2) = {(n_faces, 2, 2)}, one per triangle")
-    if not isinstance(array, jax.core.Tracer):
-        check_spd("metric", np.asarray(array), np.ones(n_faces, dtype=bool), place="face")
-    return spd.symmetrise(array)
+    expected = f"(F, 2, 2) = {(n_faces, 2, 2)}, one per triangle"
+    return spd.symmetrise(checked_tensors("metric", metric, np.ones(n_faces, dtype=bool), 2, expected, place="face"))
 
 
 def _check_triangles(vertices: np.ndarray, faces: np.ndarray) -> None:

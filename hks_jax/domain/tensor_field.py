@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
+from hks_jax.traced import is_traced
 
 MetricChoice = Literal["tensor", "inverse", "adjugate"]
 
@@ -112,21 +113,26 @@ def _identity_outside(grid: Grid, tensors: Float[Array, "*shape d d"]) -> Float[
 def _checked_tensors(name: str, grid: Grid, tensors: Any) -> Float[Array, "*shape d d"]:
     if not isinstance(grid, Grid):
         raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
+    d = grid.dimension
+    expected = f"(*grid.shape, d, d) = {(*grid.shape, d, d)}, one tensor per node"
+    return checked_tensors(name, tensors, grid.inside, d, expected)
+
+
+def checked_tensors(
+    name: str, tensors: Any, inside: np.ndarray, d: int, expected: str, place: str = "node"
+) -> Float[Array, "*shape d d"]:
+    """Return tensors (*inside.shape, d, d) as floating point; raise ValueError unless they are SPD inside."""
     array = jnp.asarray(tensors)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(jnp.result_type(float))
-    d = grid.dimension
-    if array.shape != (*grid.shape, d, d):
-        raise ValueError(
-            f"{name}: got shape {array.shape}; expected (*grid.shape, d, d) = {(*grid.shape, d, d)}, "
-            "one tensor per node"
-        )
-    if not isinstance(array, jax.core.Tracer):
-        check_spd(name, np.asarray(array), grid.inside)
+    if array.shape != (*inside.shape, d, d):
+        raise ValueError(f"{name}: got shape {array.shape}; expected {expected}")
+    if not is_traced(array):
+        _check_spd(name, np.asarray(array), inside, place)
     return array
 
 
-def check_spd(name: str, tensors: Float[np.ndarray, "*shape d d"], inside: np.ndarray, place: str = "node") -> None:
+def _check_spd(name: str, tensors: Float[np.ndarray, "*shape d d"], inside: np.ndarray, place: str = "node") -> None:
     """Raise ValueError unless the tensors are finite, symmetric and positive definite inside."""
     total = int(inside.sum())
 

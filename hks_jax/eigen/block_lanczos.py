@@ -17,6 +17,7 @@ from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
+from hks_jax.traced import is_traced
 
 _SLICE = 125
 """Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
@@ -56,8 +57,7 @@ class BlockLanczos(Eigensolver):
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("solver: block-lanczos needs a grid; use 'shift-invert' for a mesh")
         plan = self.plan(k, pencil.space.n_dof)
-        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(pencil))
-        state = (_slice_traced if traced else self._slice)(pencil, plan, self.tolerance)
+        state = (_slice_traced if is_traced(pencil) else self._slice)(pencil, plan, self.tolerance)
         values, vectors, complete_below = state.values, state.vectors, state.complete_below
         del state
         return (*_lowest(values, vectors, k), complete_below)

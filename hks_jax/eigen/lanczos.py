@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.eigen.multifrontal import Factorisation
 from hks_jax.fem.pencil import Pencil
+from hks_jax.traced import is_traced
 
 _CHUNK = 128
 """Called plainly, the basis grows by so many rows at a time: projecting on rows that are still empty costs as much."""
@@ -59,7 +60,7 @@ def block_lanczos(
     b = start.shape[0]
     pairs = steps // 2
     blocks = _begin(pencil, start, known)
-    if isinstance(factor.negative, jax.core.Tracer):
+    if is_traced(factor):
         empty = jnp.zeros((pairs, 2, b, b), start.dtype)
 
         def body(j: int, state: tuple[Array, _Blocks, _Projected]) -> tuple[Array, _Blocks, _Projected]:

@@ -13,6 +13,7 @@ from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.part import solve_part
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import MirrorPencil
+from hks_jax.traced import is_traced
 
 
 def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str) -> Eigenpairs:
@@ -24,8 +25,7 @@ def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra
     parts, total = pencil.parts, k + extra
     limits = [min(total, part.space.n_dof) for part in parts]
     share = math.ceil(total / len(parts)) + 2 * math.isqrt(total) + 4
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(jax.lax.stop_gradient(pencil)))
-    wanted = limits if traced else [min(limit, share) for limit in limits]
+    wanted = limits if is_traced(jax.lax.stop_gradient(pencil)) else [min(limit, share) for limit in limits]
     # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
     solvers = [
         solver if limit <= solver.max_pairs(part.space.n_dof) else Dense(solver.tolerance)

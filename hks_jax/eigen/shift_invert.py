@@ -14,6 +14,7 @@ from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator
 from hks_jax.eigen.host import complement_on_host, factorise_on_host, host_matrices
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.pencil import Pencil
+from hks_jax.traced import is_traced
 
 Found = tuple[np.ndarray, np.ndarray, float]
 
@@ -69,7 +70,7 @@ class ShiftInvert(Eigensolver):
             return tuple(np.asarray(found, dtype) for found in self._lanczos(K, M, k, shift))
 
         inputs = (data_k, data_m, pencil.volume)
-        if not any(isinstance(x, jax.core.Tracer) for x in inputs):
+        if not is_traced(inputs):
             values, vectors, complete_below = map(jnp.asarray, solve(*map(np.asarray, inputs)))
             return values, vectors, complete_below
         shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))

@@ -21,6 +21,7 @@ from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.traced import is_traced
 
 SOLVERS: dict[str, Callable[[], Eigensolver]] = {solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos)}
 
@@ -87,7 +88,7 @@ def eigenpairs(
         pairs = solve_part(pencil, choices[0], size, extra, name)
     pairs = truncate(pairs, k, multiplet)
     known = jax.lax.stop_gradient(pairs)
-    if not isinstance(known.eigenvalues, jax.core.Tracer):
+    if not is_traced(known.eigenvalues):
         for message in known.messages():
             warnings.warn(message, AccuracyWarning, stacklevel=2)
     return pairs

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.traced import is_traced
 
 
 def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
@@ -18,7 +19,7 @@ def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
         raise ValueError(f"{name}: got {times!r}; expected a 1-D array of positive numbers") from None
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}; expected a non-empty 1-D array; wrap one time as [t]")
-    if not isinstance(array, jax.core.Tracer):
+    if not is_traced(array):
         values = np.asarray(array)
         bad = ~(np.isfinite(values) & (values > 0))
         if bad.any():
@@ -62,7 +63,7 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
 def _n_positive(pairs: Eigenpairs) -> int:
     """Return how many positive eigenvalues are kept, as far as that is known."""
     kept = jax.lax.stop_gradient(pairs.kept)
-    count = pairs.k if isinstance(kept, jax.core.Tracer) else int(kept.sum())
+    count = pairs.k if is_traced(kept) else int(kept.sum())
     return count - pairs.n_null
 
 

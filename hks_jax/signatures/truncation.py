@@ -16,6 +16,7 @@ from hks_jax.fem.operators import DiagonalOperator
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import spectral_trace
 from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.traced import is_traced
 
 TAIL_LIMIT = 0.01
 BIAS_LIMIT = 0.1
@@ -87,8 +88,7 @@ def truncation(pairs: Eigenpairs, times: Float[Array, " n"]) -> Truncation:
 def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
     """Warn (AccuracyWarning) of times that k or the spacing does not resolve, where values are concrete."""
     pairs, times = jax.lax.stop_gradient((pairs, times))
-    leaves = jax.tree.leaves((pairs.eigenvalues, pairs.pencil, times))
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+    if is_traced((pairs.eigenvalues, pairs.pencil, times)):
         return
     for message in truncation(pairs, times).messages():
         warnings.warn(message, AccuracyWarning, stacklevel=3)

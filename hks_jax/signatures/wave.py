@@ -11,6 +11,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Wave
 from hks_jax.signatures.spectral import spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import default_energies, positive_range
+from hks_jax.traced import is_traced
 
 
 def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Array, "n_energies *shape"]:
@@ -35,9 +36,9 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     if energies is None:
         energies, sigma = default_energies(pairs)
     energies, sigma = (jnp.asarray(value, pairs.eigenvalues.dtype) for value in (energies, sigma))
-    if energies.ndim != 1 or energies.size == 0 or (_known(energies) and not np.isfinite(energies).all()):
+    if energies.ndim != 1 or energies.size == 0 or (not is_traced(energies) and not np.isfinite(energies).all()):
         raise ValueError(f"energies: got {energies}; expected a non-empty 1-D array of finite values of log λ")
-    if sigma.ndim != 0 or (_known(sigma) and not 0 < float(sigma) < np.inf):
+    if sigma.ndim != 0 or (not is_traced(sigma) and not 0 < float(sigma) < np.inf):
         raise ValueError(f"sigma: got {sigma}; expected one positive width in log λ")
     # The largest exponent is taken out of both sums: they do not underflow far outside of the spectrum.
     positive = pairs.kept & (pairs.eigenvalues > 0)
@@ -46,7 +47,3 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     offset = jax.lax.stop_gradient(jnp.max(exponents, axis=1))
     bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
-
-
-def _known(array: Array) -> bool:
-    return not isinstance(array, jax.core.Tracer)

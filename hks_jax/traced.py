@@ -1,0 +1,10 @@
+"""Whether values are there to be looked at, or stand for those of a computation to come."""
+
+from typing import Any
+
+import jax
+
+
+def is_traced(tree: Any) -> bool:
+    """Return whether any leaf is traced, as under `jax.jit`."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
