@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from hks_jax.domain import spd
 from hks_jax.domain.static_array import StaticArray
+from hks_jax.domain.tensor_field import checked_tensors
 from hks_jax.traced import is_traced
 
 

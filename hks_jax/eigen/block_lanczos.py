@@ -88,9 +88,7 @@ class BlockLanczos(Eigensolver):
         dissection = jax.tree.map(jnp.asarray, dissect(_grid(pencil)))
         state = _first_state(pencil, plan)
         while unfinished(plan, state):
-            # What a jitted function hands through is copied: the eigenvectors stay outside.
-            factor, here, rest = _cut(pencil, dissection, plan, state._replace(vectors=None))
-            state = rest._replace(vectors=state.vectors)
+            factor, here, state = cut(pencil, dissection, plan, state)
             if here:
                 state = _make_room(plan, state) if crowded(plan, state) else state
                 state = search(pencil, factor, plan, tolerance, state)
@@ -104,7 +102,6 @@ class BlockLanczos(Eigensolver):
 
 _first_state = jax.jit(first_state, static_argnames="plan")
 _make_room = jax.jit(make_room, static_argnames="plan")
-_cut = jax.jit(cut, static_argnames="plan")
 
 
 def _slice_traced(pencil: Pencil, plan: Plan, tolerance: float) -> State:

@@ -88,9 +88,9 @@ def _two_steps(
 ) -> tuple[list[Array], _Blocks, _Projected]:
     """Write the last block and one more into the basis, and return the block that follows these."""
     b = blocks.block.shape[0]
-    diagonal, rest = _apply(factor, blocks)
+    diagonal, rest = _recur(blocks, factor.solve(blocks.image))
     middle, image, coupling = _orthonormal(pencil, rest)
-    diagonal_2, rest = _apply(factor, _Blocks(blocks.block, middle, image, coupling))
+    diagonal_2, rest = _recur(_Blocks(blocks.block, middle, image, coupling), factor.solve(image))
     basis = [*basis[:-1], _write(basis[-1], blocks.block, row)]
     both, images = _join(pencil, middle, image, rest)
     for rows in basis:
@@ -112,13 +112,12 @@ def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "
 
 
 @jax.jit
-def _apply(factor: Factorisation, blocks: _Blocks) -> tuple[Float[Array, "b b"], Float[Array, "b n_dof"]]:
-    """Apply (K − σM)⁻¹M to the last block; return its diagonal block, and what is left of the image."""
+def _recur(blocks: _Blocks, x: Float[Array, "b n_dof"]) -> tuple[Float[Array, "b b"], Float[Array, "b n_dof"]]:
+    """Return what x = (K − σM)⁻¹M · block has in the block itself, and x without that block and the one before."""
     before, block, image, coupling = blocks
-    rest = factor.solve(image)
-    diagonal = _products(image, rest)
+    diagonal = _products(image, x)
     diagonal = (diagonal + diagonal.T) / 2
-    return diagonal, rest - _combine(diagonal, block) - _combine(coupling.T, before)
+    return diagonal, x - _combine(diagonal, block) - _combine(coupling.T, before)
 
 
 @jax.jit

@@ -25,7 +25,8 @@ def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra
     parts, total = pencil.parts, k + extra
     limits = [min(total, part.space.n_dof) for part in parts]
     share = math.ceil(total / len(parts)) + 2 * math.isqrt(total) + 4
-    wanted = limits if is_traced(jax.lax.stop_gradient(pencil)) else [min(limit, share) for limit in limits]
+    traced = is_traced(jax.lax.stop_gradient(pencil))
+    wanted = limits if traced else [min(limit, share) for limit in limits]
     # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
     solvers = [
         solver if limit <= solver.max_pairs(part.space.n_dof) else Dense(solver.tolerance)

@@ -36,28 +36,10 @@ class Factorisation(eqx.Module):
 
     def solve(self, rhs: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
         """Solve (K − σM) x = rhs for each row."""
-        columns, width = rhs.T, rhs.shape[0]
-        own: list[Array] = []
-        passed: Array | None = None
-        for level, matrix in zip(self.dissection.levels[::-1], self.downward[::-1], strict=True):
-            s = level.own.shape[1]
-            force, onward = _gather(columns, level.own), jnp.zeros((), rhs.dtype)
-            if passed is not None:
-                total = _gather(passed, level.children[0]) + _gather(passed, level.children[1])
-                force, onward = force + total[:, :s], total[:, s:]
-            product = jnp.matmul(matrix, force, precision="highest")
-            own.append(product[:, :s])
-            passed = (onward - product[:, s:]).reshape(-1, width)
-        solutions: list[Array] = []
-        above = jnp.zeros((0, width), rhs.dtype)
-        for level, matrix in zip(self.dissection.levels, self.upward, strict=True):
-            boundary = _gather(above, level.boundary)
-            x = own.pop() - jnp.matmul(matrix, boundary, precision="highest")
-            above = jnp.concatenate([x, boundary], axis=1).reshape(-1, width)
-            solutions.append(x.reshape(-1, width))
-        return jnp.concatenate(solutions)[self.dissection.order].T
+        return _solve(self, rhs)
 
 
+@jax.jit
 def factorise(dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]) -> Factorisation:
     """Factorise K − σM; what comes out is not finite where σ is an eigenvalue to rounding."""
     coefficients = _coefficients(pencil, shift)
@@ -81,6 +63,30 @@ def factorise(dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]) -
         upward.append(jnp.swapaxes(coupling, 1, 2))
         negative = negative + jnp.sum(below)
     return Factorisation(dissection, tuple(downward[::-1]), tuple(upward[::-1]), negative)
+
+
+@jax.jit
+def _solve(factor: Factorisation, rhs: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
+    columns, width = rhs.T, rhs.shape[0]
+    own: list[Array] = []
+    passed: Array | None = None
+    for level, matrix in zip(factor.dissection.levels[::-1], factor.downward[::-1], strict=True):
+        s = level.own.shape[1]
+        force, onward = _gather(columns, level.own), jnp.zeros((), rhs.dtype)
+        if passed is not None:
+            total = _gather(passed, level.children[0]) + _gather(passed, level.children[1])
+            force, onward = force + total[:, :s], total[:, s:]
+        product = jnp.matmul(matrix, force, precision="highest")
+        own.append(product[:, :s])
+        passed = (onward - product[:, s:]).reshape(-1, width)
+    solutions: list[Array] = []
+    above = jnp.zeros((0, width), rhs.dtype)
+    for level, matrix in zip(factor.dissection.levels, factor.upward, strict=True):
+        boundary = _gather(above, level.boundary)
+        x = own.pop() - jnp.matmul(matrix, boundary, precision="highest")
+        above = jnp.concatenate([x, boundary], axis=1).reshape(-1, width)
+        solutions.append(x.reshape(-1, width))
+    return jnp.concatenate(solutions)[factor.dissection.order].T
 
 
 def _coefficients(pencil: Pencil, shift: Float[Array, ""]) -> Float[Array, " entries"]:

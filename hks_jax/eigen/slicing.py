@@ -138,12 +138,20 @@ def cut(
 ) -> tuple[Factorisation, Bool[Array, ""], State]:
     """Factorise at the state's shift; return with it whether to search there, and the state if not."""
     factor = factorise(dissection, pencil, state.shift)
+    here, rest = _consider(pencil, factor.negative, factor.solve(state.start), plan, state._replace(vectors=None))
+    return factor, here, rest._replace(vectors=state.vectors)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _consider(
+    pencil: Pencil, negative: Int[Array, ""], solved: Float[Array, "block n_dof"], plan: Plan, state: State
+) -> tuple[Bool[Array, ""], State]:
+    """Return whether to search at the state's shift, and the state if not."""
     below = jnp.sum(state.values < state.shift)
-    missing = factor.negative - below
+    missing = negative - below
     finished = (missing == 0) & (below >= plan.wanted)
     too_many = missing > plan.slice_size
     # Fronts are not pivoted: where a part of the domain has an eigenvalue very near to the shift, rounding grows.
-    solved = factor.solve(state.start)
     defect = pencil.stiffness.apply(solved) - state.shift * pencil.mass.apply(solved) - state.start
     allowed = min(_GROWTH * float(jnp.finfo(defect.dtype).eps), 0.01)
     accurate = jnp.linalg.norm(defect) <= allowed * jnp.linalg.norm(state.start)
@@ -156,7 +164,7 @@ def cut(
         shift=jnp.where(elsewhere, state.front + nearer * (state.shift - state.front), state.shift),
         moved=jnp.where(elsewhere, state.moved + 1, 0),
     )
-    return factor, ~(finished | elsewhere), state
+    return ~(finished | elsewhere), state
 
 
 def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State) -> State:
