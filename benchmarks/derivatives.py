@@ -70,9 +70,10 @@ def only(what: str, n: int) -> None:
 def cost(n: int) -> dict:
     """Measure one size."""
     loss, tensors = loss_on(n)
+    solver_name = hj.eigenpairs(field(n), PAIRS[n]).solver_name
     repeats = 3 if n < 256 else 1
-    value, _ = timed(loss, tensors, repeats=repeats, warm_up=n < 256)
-    both, (_, gradient) = timed(jax.value_and_grad(loss), tensors, repeats=repeats, warm_up=n < 256)
+    value, _ = timed(loss, tensors, repeats=repeats)
+    both, (_, gradient) = timed(jax.value_and_grad(loss), tensors, repeats=repeats)
     rng = np.random.default_rng(0)
     direction = rng.standard_normal(tensors.shape)
     direction = 0.01 * (direction + np.swapaxes(direction, -1, -2))
@@ -81,7 +82,14 @@ def cost(n: int) -> dict:
         truth = directional(loss, tensors, direction, step=0.4)
         difference = float(abs(jnp.vdot(gradient, direction) - truth) / abs(truth))
     memory = {what: peak_memory(n, what) for what in ("nothing", "value", "gradient")}
-    row = {"nodes": n * n, "k": PAIRS[n], "times": N_TIMES, "value_s": value, "value_and_gradient_s": both}
+    row = {
+        "nodes": n * n,
+        "k": PAIRS[n],
+        "solver": solver_name,
+        "times": N_TIMES,
+        "value_s": value,
+        "value_and_gradient_s": both,
+    }
     row |= {"ratio": both / value, "directional_error": difference, "peak_GB": memory}
     print(f"{n}²/{PAIRS[n]}: value {value:.2f} s, with gradient {both:.2f} s, ratio {both / value:.2f}, ", end="")
     print(f"error {difference}, peak {memory}")

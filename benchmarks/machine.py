@@ -16,10 +16,9 @@ import hks_jax as hj
 RESULTS = Path(__file__).parent / "results"
 
 
-def timed(function: Callable[..., Any], *args: Any, repeats: int = 3, warm_up: bool = True) -> tuple[float, Any]:
+def timed(function: Callable[..., Any], *args: Any, repeats: int = 3) -> tuple[float, Any]:
     """Return the shortest time of several runs after a warm-up, and the result."""
-    if warm_up:
-        jax.block_until_ready(function(*args))
+    jax.block_until_ready(function(*args))
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
