@@ -39,9 +39,17 @@ class Factorisation(eqx.Module):
         return _solve(self, rhs)
 
 
-@jax.jit
 def factorise(dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]) -> Factorisation:
     """Factorise K − σM; what comes out is not finite where σ is an eigenvalue to rounding."""
+    # Compiled without its result's dissection: what a compiled function hands through is copied.
+    return Factorisation(dissection, *_eliminate(dissection, pencil, shift))
+
+
+@jax.jit
+def _eliminate(
+    dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Int[Array, ""]]:
+    """Return the matrices downward and upward, and the count of negative eigenvalues."""
     coefficients = _coefficients(pencil, shift)
     downward, upward = [], []
     negative = jnp.zeros((), int)
@@ -62,7 +70,7 @@ def factorise(dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]) -
         downward.append(jnp.concatenate([inverse, coupling], axis=1))
         upward.append(jnp.swapaxes(coupling, 1, 2))
         negative = negative + jnp.sum(below)
-    return Factorisation(dissection, tuple(downward[::-1]), tuple(upward[::-1]), negative)
+    return tuple(downward[::-1]), tuple(upward[::-1]), negative
 
 
 @jax.jit
