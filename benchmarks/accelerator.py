@@ -7,7 +7,6 @@ solver as it is called plainly, "whole" the same compiled into one computation.
 """
 
 import argparse
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import batch
 import jax
 import jax.numpy as jnp
-from machine import RESULTS, field, write
+from machine import RESULTS, field, timed_from_cold, write
 
 import hks_jax as hj
 
@@ -34,25 +33,21 @@ def measure(n: int, k: int) -> list[dict]:
 
     ways: dict[str, Callable] = {"host-driven": solve, "whole": jax.jit(solve)}
     if n <= 256:
-        ways["gradient of the HKS"] = lambda tensors: jax.value_and_grad(loss)(tensors)
+        ways["gradient of the HKS"] = jax.value_and_grad(loss)
     rows = []
     for way, run in ways.items():
         try:
-            times = []
-            for _ in range(3):
-                start = time.perf_counter()
-                found = jax.block_until_ready(run(given.tensors))
-                times.append(time.perf_counter() - start)
+            first, seconds, found = timed_from_cold(run, given.tensors, repeats=2)
         except jax.errors.JaxRuntimeError as error:  # out of memory, say: the other cases may do
             print(f"{n:5d}² {k:4d} {way:20s} {str(error).splitlines()[0]}")
             rows.append({"nodes": n * n, "k": k, "way": way, "not_run": str(error).splitlines()[0]})
             continue
-        row = {"nodes": n * n, "k": k, "way": way, "seconds": min(times[1:]), "first_call_s": times[0]}
+        row = {"nodes": n * n, "k": k, "way": way, "seconds": seconds, "first_call_s": first}
         if isinstance(found, hj.Eigenpairs):
             row["worst_residual"] = float(found.residuals.max())
             row["none_missed"] = bool(found.complete_below > found.eigenvalues[-1])
         rows.append(row)
-        print(f"{n:5d}² {k:4d} {way:20s} {min(times[1:]):8.3f} s, first call {times[0]:6.1f} s, ", end="")
+        print(f"{n:5d}² {k:4d} {way:20s} {seconds:8.3f} s, first call {first:6.1f} s, ", end="")
         print(f"residual {row.get('worst_residual', float('nan')):.1e}, none missed: {row.get('none_missed', '-')}")
     return rows
 
@@ -66,14 +61,15 @@ def main() -> None:
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", not arguments.float32)
     warnings.simplefilter("ignore", hj.AccuracyWarning)
+    dtype = "float32" if arguments.float32 else "float64"
     device = jax.devices()[0].device_kind
     output = arguments.output or RESULTS / f"accelerator_{device.replace(' ', '_')}.json"
     print(device)
     rows: list[dict] = []
     for case in arguments.cases:
         rows += measure(*map(int, case.split("/")))
-        write(output, rows, dtype="float32" if arguments.float32 else "float64")
-    write(output, rows, dtype="float32" if arguments.float32 else "float64", batch=batch.measure(100, 64, 100))
+        write(output, rows, dtype=dtype)
+    write(output, rows, dtype=dtype, batch=batch.measure(100, 64, 100))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ On whatever device JAX finds. The result file holds fields per second, the compi
 """
 
 import argparse
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from machine import RESULTS, field, write
+from machine import RESULTS, field, timed_from_cold, write
 
 import hks_jax as hj
 
@@ -41,12 +40,7 @@ def measure(count: int, n: int, k: int) -> list[dict]:
     }
     rows, reference = [], None
     for name, run in ways.items():
-        start = time.perf_counter()
-        jax.block_until_ready(run(tensors))
-        once = time.perf_counter() - start
-        start = time.perf_counter()
-        values, residuals = jax.block_until_ready(run(tensors))
-        seconds = time.perf_counter() - start
+        once, seconds, (values, residuals) = timed_from_cold(run, tensors, repeats=1)
         reference = values if reference is None else reference
         difference = float(jnp.max(jnp.abs(values - reference) / jnp.maximum(reference, reference[:, 1:2])))
         row = {"way": name, "seconds": seconds, "fields_per_second": count / seconds, "first_call_s": once}

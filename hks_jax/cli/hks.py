@@ -10,6 +10,7 @@ import numpy as np
 
 from hks_jax.cli.arguments import parse_boundary, parse_slice, parse_times
 from hks_jax.cli.progress import Progress
+from hks_jax.eigen.solve import SOLVERS
 from hks_jax.io import ORDERS, TensorVolume, erode, read_mask, read_tensors
 from hks_jax.io.nifti import is_nifti
 
@@ -69,12 +70,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     add("-k", type=int, help="number of eigenpairs (default 200, or a quarter of the unknowns if that is less)")
     add("--order", choices=tuple(ORDERS), help="order of the six components, where a NIfTI file does not declare it")
-    add(
-        "--solver",
-        choices=("auto", "dense", "shift-invert", "block-lanczos"),
-        default="auto",
-        help="eigensolver (default auto)",
-    )
+    add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
     add(
         "--normalisation",
         choices=("raw", "heat-trace", "volume", "flat"),

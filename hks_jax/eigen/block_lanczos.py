@@ -58,9 +58,7 @@ class BlockLanczos(Eigensolver):
             raise ValueError("solver: block-lanczos needs a grid; use 'shift-invert' for a mesh")
         plan = self.plan(k, pencil.space.n_dof)
         state = (_slice_traced if is_traced(pencil) else self._slice)(pencil, plan, self.tolerance)
-        values, vectors, complete_below = state.values, state.vectors, state.complete_below
-        del state
-        return (*_lowest(values, vectors, k), complete_below)
+        return (*_lowest(state.values, state.vectors, k), state.complete_below)
 
     def solve_complement(
         self,

@@ -105,7 +105,7 @@ def _two_steps(
 @jax.jit
 def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "w n_dof"]) -> _Blocks:
     """Return the first block."""
-    block = image = start
+    block = start
     for _ in range(2):
         block, image, _ = _orthonormal(pencil, _project(known, block, pencil.mass.apply(block)))
     return _Blocks(jnp.zeros_like(block), block, image, jnp.zeros((len(start), len(start)), start.dtype))
@@ -124,7 +124,6 @@ def _recur(blocks: _Blocks, x: Float[Array, "b n_dof"]) -> tuple[Float[Array, "b
 def _orthonormal(pencil: Pencil, x: Float[Array, "b n_dof"]) -> tuple[Array, Array, Float[Array, "b b"]]:
     """Return M-orthonormal rows y, My, and the factor R of x = Ry."""
     total = jnp.eye(x.shape[0], dtype=x.dtype)
-    image = x
     for _ in range(2):
         image = pencil.mass.apply(x)
         gram = _products(x, image)
@@ -133,9 +132,9 @@ def _orthonormal(pencil: Pencil, x: Float[Array, "b n_dof"]) -> tuple[Array, Arr
         sizes, mix = jnp.linalg.eigh(gram / norms / norms[:, None])
         sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(x.dtype).eps * sizes[-1]))
         change = (mix / sizes / norms[:, None]).T
-        x, image = _combine(change, x), _combine(change, image)
+        x = _combine(change, x)
         total = jnp.matmul(total, norms[:, None] * mix * sizes, precision="highest")
-    return x, image, total
+    return x, _combine(change, image), total
 
 
 @jax.jit

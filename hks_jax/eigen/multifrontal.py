@@ -119,7 +119,7 @@ def _gather_symmetric(
 ) -> Float[Array, "children fronts m m"]:
     """Return the entries of symmetric blocks at pairs of places (block · r + i, block · r + j); zero for padding."""
     (n, r), (children, fronts, m) = blocks.shape[:2], index.shape
-    within = jnp.where(index < n * r, jnp.arange(children * fronts).reshape(children, fronts, 1) * r + index % r, -1)
+    within = jnp.arange(children * fronts).reshape(children, fronts, 1) * r + index % r
     # Whole rows, and once more after transposition: many times faster than entry by entry.
     rows = jnp.swapaxes(_gather(blocks.reshape(-1, r), index), 2, 3)
-    return _gather(rows.reshape(-1, m), jnp.where(within < 0, children * fronts * r, within))
+    return _gather(rows.reshape(-1, m), jnp.where(index < n * r, within, children * fronts * r))
