@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.eigen import grid_complement
 from hks_jax.eigen.dissection import dissect
-from hks_jax.eigen.host import complement_on_host
+from hks_jax.eigen.multifrontal import Factorisation
 from hks_jax.eigen.slicing import Plan, State, crowded, cut, first_state, make_room, search, unfinished
 from hks_jax.eigen.solver import Eigensolver, RawPairs
 from hks_jax.fem.operators import StencilOperator
@@ -60,15 +61,20 @@ class BlockLanczos(Eigensolver):
         state = (_slice_traced if is_traced(pencil) else self._slice)(pencil, plan, self.tolerance)
         return (*_lowest(state.values, state.vectors, k), state.complete_below)
 
+    def prepare_complement(self, pencil: Pencil, values: Float[Array, " p"], k: int) -> Factorisation:
+        """Factorise K − σM for each group of neighbouring eigenvalues."""
+        return grid_complement.prepare(pencil, values, k, self.derivative_tolerance)
+
     def solve_complement(
         self,
+        prepared: Factorisation,
         pencil: Pencil,
         values: Float[Array, " p"],
         vectors: Float[Array, "p n_dof"],
         rhs: Float[Array, "k n_dof"],
     ) -> Float[Array, "k n_dof"]:
-        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0, on the host; see `hks_jax.eigen.complement`."""
-        return complement_on_host(pencil, values, vectors, rhs, self.derivative_tolerance, self._report)
+        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.grid_complement`."""
+        return grid_complement.solve(prepared, pencil, values, vectors, rhs, self.derivative_tolerance)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return how many pairs leave room for a Lanczos basis."""

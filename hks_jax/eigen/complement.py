@@ -131,19 +131,13 @@ def _conjugate_gradients(
 def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: float) -> list[tuple[np.ndarray, float]]:
     """Split rows into groups of neighbouring eigenvalues, and give each a shift.
 
-    With Λ − λᵢ between a and b in a group and the shift at Λ − √(ab), the condition is √(a/b). With s groups in
-    geometric progression that is ρ^(1/2s), ρ over all rows; s weighs factorisations against steps.
+    With Λ − λᵢ between a and b in a group and the shift at Λ − √(ab), the condition is √(a/b).
     """
     if active.size == 0:
         return []
     distance = beyond - values[active]
     ratio = max(distance.max() / distance.min(), 1 + 1e-12)
-
-    def cost(s: int) -> float:
-        root = ratio ** (1 / (4 * s))
-        return s * _FACTORISATION + active.size * np.log(2 / tolerance) / np.log((root + 1) / (root - 1))
-
-    count = min(range(1, 17), key=cost)
+    count = best_count(ratio, active.size, tolerance)
     number = np.minimum((np.log(distance.max() / distance) / np.log(ratio) * count).astype(int), count - 1)
     groups = []
     for i in np.unique(number):
@@ -151,6 +145,19 @@ def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: fl
         ends = beyond - values[rows]
         groups.append((rows, _between(values, beyond - float(np.sqrt(ends.min() * ends.max())))))
     return groups
+
+
+def best_count(ratio: float, rows: int, tolerance: float) -> int:
+    """Return how many groups to make of rows whose distances from Λ differ by up to the given ratio.
+
+    With s groups in geometric progression the condition is ratio^(1/2s); s weighs factorisations against steps.
+    """
+
+    def cost(s: int) -> float:
+        root = ratio ** (1 / (4 * s))
+        return s * _FACTORISATION + rows * np.log(2 / tolerance) / np.log((root + 1) / (root - 1))
+
+    return min(range(1, 17), key=cost)
 
 
 def _between(values: np.ndarray, target: float) -> float:

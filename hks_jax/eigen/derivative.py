@@ -102,8 +102,11 @@ def _outside(
     def matvec(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
 
+    # Outside the linear solve, so that many products with one Jacobian share it.
+    prepared = solver.prepare_complement(pencil, values, rhs.shape[0])
+
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return solver.solve_complement(pencil, values, vectors, b)
+        return solver.solve_complement(prepared, pencil, values, vectors, b)
 
     return jax.lax.custom_linear_solve(matvec, rhs, solve, symmetric=True)
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.multifrontal import Factorisation
+from hks_jax.eigen.products import combine, inner_products
 from hks_jax.fem.pencil import Pencil
 from hks_jax.traced import is_traced
 
@@ -115,9 +116,9 @@ def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "
 def _recur(blocks: _Blocks, x: Float[Array, "b n_dof"]) -> tuple[Float[Array, "b b"], Float[Array, "b n_dof"]]:
     """Return what x = (K − σM)⁻¹M · block has in the block itself, and x without that block and the one before."""
     before, block, image, coupling = blocks
-    diagonal = _products(image, x)
+    diagonal = inner_products(image, x)
     diagonal = (diagonal + diagonal.T) / 2
-    return diagonal, x - _combine(diagonal, block) - _combine(coupling.T, before)
+    return diagonal, x - combine(diagonal, block) - combine(coupling.T, before)
 
 
 @jax.jit
@@ -126,21 +127,21 @@ def _orthonormal(pencil: Pencil, x: Float[Array, "b n_dof"]) -> tuple[Array, Arr
     total = jnp.eye(x.shape[0], dtype=x.dtype)
     for _ in range(2):
         image = pencil.mass.apply(x)
-        gram = _products(x, image)
+        gram = inner_products(x, image)
         norms = jnp.sqrt(jnp.diagonal(gram))
         norms = jnp.where(norms > 0, norms, 1)
         sizes, mix = jnp.linalg.eigh(gram / norms / norms[:, None])
         sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(x.dtype).eps * sizes[-1]))
         change = (mix / sizes / norms[:, None]).T
-        x = _combine(change, x)
+        x = combine(change, x)
         total = jnp.matmul(total, norms[:, None] * mix * sizes, precision="highest")
-    return x, _combine(change, image), total
+    return x, combine(change, image), total
 
 
 @jax.jit
 def _project(basis: Float[Array, "rows n_dof"], x: Array, image: Array) -> Array:
     """Return x, whose image under M is given, orthogonal to the basis."""
-    return x - _combine(_products(basis, image), basis)
+    return x - combine(inner_products(basis, image), basis)
 
 
 @jax.jit
@@ -153,7 +154,7 @@ def _join(pencil: Pencil, middle: Array, image: Array, rest: Array) -> tuple[Arr
 def _part(both: Array, image: Array) -> tuple[Array, Array]:
     """Return two blocks apart, the latter orthogonal to the former, whose image under M is given."""
     middle, rest = jnp.split(both, 2)
-    return middle, rest - _combine(_products(image, rest), middle)
+    return middle, rest - combine(inner_products(image, rest), middle)
 
 
 @partial(jax.jit, donate_argnums=0)
@@ -179,20 +180,5 @@ def _ritz_pairs(
     mixes = jnp.split(modes[:, order].T, ends, axis=1)
     vectors = jnp.zeros((), diagonal.dtype)
     for mix, rows in zip(mixes, basis, strict=True):
-        vectors = vectors + _combine(mix, rows)
+        vectors = vectors + combine(mix, rows)
     return theta[order], vectors
-
-
-def _products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
-    """Return the inner products.
-
-    XLA's CPU kernels for a long contraction are many times faster with the large factor on the left, and for what
-    comes after with the small one there and not transposed; the barriers keep XLA from turning either round.
-    """
-    products = jax.lax.optimization_barrier(jnp.matmul(basis, block.T, precision="highest"))
-    return jax.lax.optimization_barrier(products.T)
-
-
-def _combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array, "q n"]:
-    """Return linear combinations of the basis."""
-    return jnp.matmul(mix, basis, precision="highest")

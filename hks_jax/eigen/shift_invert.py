@@ -78,6 +78,7 @@ class ShiftInvert(Eigensolver):
 
     def solve_complement(
         self,
+        prepared: None,
         pencil: Pencil,
         values: Float[Array, " p"],
         vectors: Float[Array, "p n_dof"],

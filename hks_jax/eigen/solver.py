@@ -1,7 +1,7 @@
 """The interface that every eigensolver implements."""
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -31,8 +31,13 @@ class Eigensolver(eqx.Module):
         the bound where nothing is certain. Traceable: works under `jit` and `vmap`.
         """
 
+    def prepare_complement(self, pencil: Pencil, values: Float[Array, " p"], k: int) -> Any:
+        """Return what `solve_complement` for the first k of p eigenvalues needs and no right-hand side changes."""
+        return None
+
     def solve_complement(
         self,
+        prepared: Any,
         pencil: Pencil,
         values: Float[Array, " p"],
         vectors: Float[Array, "p n_dof"],

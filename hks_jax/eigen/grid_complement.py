@@ -1,0 +1,190 @@
+"""Solves with K − λᵢM on the complement of known eigenvectors of a grid's pencil, all in JAX.
+
+The method is that of `hks_jax.eigen.complement`: conjugate gradients, preconditioned with a factorisation of K − σM for
+each group of neighbouring eigenvalues. Groups are made by index and not by value, so that shapes are static: by Weyl's
+law eigenvalues are spread evenly enough for that. The factorisations depend on the matrices alone, and serve all
+products with a Jacobian at one point.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.eigen.complement import best_count
+from hks_jax.eigen.dissection import Dissection, dissect
+from hks_jax.eigen.multifrontal import Factorisation, factorise
+from hks_jax.eigen.products import combine, inner_products
+from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.space import GridSpace
+
+_BLOCK = 32
+"""Rows solved at once."""
+_MEMORY = 5e8
+"""Bytes that factorisations may take together."""
+_MAX_ITERATIONS = 200
+_SINGULAR = 1e-8
+"""The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
+
+
+class _Iteration(NamedTuple):
+    """The state of conjugate gradients for one block of rows."""
+
+    x: Float[Array, "b n_dof"]
+    r: Float[Array, "b n_dof"]
+    p: Float[Array, "b n_dof"]
+    energy: Float[Array, " b"]
+    errors: Float[Array, " b"]
+    going: Bool[Array, " b"]
+    steps: Int[Array, ""]
+
+
+class _Groups(NamedTuple):
+    """How rows are grouped; static.
+
+    Attributes:
+        of_block: (blocks,) the group of each block of rows.
+        first: (groups,) the first row of each group.
+        last: (groups,) its last row.
+    """
+
+    of_block: Int[np.ndarray, " blocks"]
+    first: Int[np.ndarray, " groups"]
+    last: Int[np.ndarray, " groups"]
+
+
+def prepare(pencil: Pencil, values: Float[Array, " p"], k: int, tolerance: float) -> Factorisation:
+    """Factorise K − σM for each group of the first k of p eigenvalues; the results are stacked."""
+    assert isinstance(pencil.space, GridSpace)
+    dissection = dissect(pencil.space)
+    groups = _group(dissection, values, k, tolerance)
+    # Between the distances a and b from Λ the geometric mean leaves the least condition.
+    beyond = _beyond(values)
+    targets = beyond - jnp.sqrt((beyond - values[groups.first]) * (beyond - values[groups.last]))
+    factors = jax.lax.map(partial(factorise, dissection, pencil), _apart(values, targets))
+    return Factorisation(dissection, factors.downward, factors.upward, factors.negative)
+
+
+@partial(jax.jit, static_argnames="tolerance")
+def solve(
+    factors: Factorisation,
+    pencil: Pencil,
+    values: Float[Array, " p"],
+    vectors: Float[Array, "p n_dof"],
+    rhs: Float[Array, "k n_dof"],
+    tolerance: float,
+) -> Float[Array, "k n_dof"]:
+    """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; rows that do not converge are NaN.
+
+    Args:
+        factors: from `prepare`, for as many rows.
+        pencil: K and M.
+        values: (p,) the lowest eigenvalues, ascending.
+        vectors: (p, n_dof) their M-orthonormal eigenvectors Φ; Q = I − MΦΦᵀ.
+        rhs: (k, n_dof), k ≤ p; row i belongs to λᵢ.
+        tolerance: reduction of the error in the energy norm, relative to the largest row.
+    """
+    k, beyond = rhs.shape[0], _beyond(values)
+    # What rounded eigenvectors leave to be solved beyond their own accuracy is noise.
+    tolerance = max(tolerance, 100 * float(jnp.finfo(rhs.dtype).eps))
+    images = jax.lax.map(pencil.mass.apply, vectors, batch_size=_BLOCK)
+    rhs = rhs - combine(inner_products(vectors, rhs), images)
+    size = jnp.sqrt(jnp.sum(rhs * rhs / pencil.mass.diagonal(), axis=1))
+    # Small rows need fewer digits, or none; where λᵢ is near Λ the operator amplifies more.
+    share = size / jnp.maximum(jnp.max(size), jnp.finfo(rhs.dtype).tiny) * (beyond / (beyond - values[:k]))
+    wanted = jnp.where(share > tolerance, jnp.minimum(tolerance / jnp.maximum(share, tolerance), 0.1), jnp.inf)
+
+    of_block = _group(factors.dissection, values, k, tolerance).of_block
+    blocks = of_block.size
+    spare = blocks * _BLOCK - k  # rows that fill the last block up, with nothing to solve
+
+    def solve_block(block: tuple[Array, Array, Array, Array]) -> Array:
+        g, shifts, b, wanted = block
+        matrices = jax.tree.map(lambda stacked: stacked[g], (factors.downward, factors.upward, factors.negative))
+        factor = Factorisation(factors.dissection, *matrices)
+
+        def precondition(r: Array) -> Array:
+            z = factor.solve(r)
+            return z - combine(inner_products(images, z), vectors)
+
+        return _conjugate_gradients(pencil, precondition, shifts, b, wanted, beyond)
+
+    parts = (
+        jnp.asarray(of_block),
+        jnp.pad(values[:k], (0, spare)).reshape(blocks, _BLOCK),
+        jnp.pad(rhs, ((0, spare), (0, 0))).reshape(blocks, _BLOCK, -1),
+        jnp.pad(wanted, (0, spare), constant_values=jnp.inf).reshape(blocks, _BLOCK),
+    )
+    return jax.lax.map(solve_block, parts).reshape(blocks * _BLOCK, -1)[:k]
+
+
+def _conjugate_gradients(
+    pencil: Pencil,
+    precondition: Callable[[Array], Array],
+    shifts: Float[Array, " b"],
+    rhs: Float[Array, "b n_dof"],
+    wanted: Float[Array, " b"],
+    beyond: Float[Array, ""],
+) -> Float[Array, "b n_dof"]:
+    """Solve (K − λᵢM) xᵢ = rhsᵢ for a block of rows; NaN where the error asked for is not reached."""
+
+    def going_on(state: _Iteration) -> Bool[Array, ""]:
+        return jnp.any(state.going) & (state.steps < _MAX_ITERATIONS)
+
+    def step(state: _Iteration) -> _Iteration:
+        x, r, p, energy, errors, going, steps = state
+        image = pencil.mass.apply(p)
+        product = pencil.stiffness.apply(p) - shifts[:, None] * image
+        curvature = jnp.sum(p * product, axis=1)
+        # Where it nearly vanishes, an eigenvalue equal to λᵢ is left on the complement: there is no solution.
+        regular = curvature > _SINGULAR * beyond * jnp.sum(p * image, axis=1)
+        length = jnp.where(going & regular, energy / jnp.where(regular, curvature, 1), 0)[:, None]
+        x, r = x + length * p, r - length * product
+        z = precondition(r)
+        following = jnp.sum(r * z, axis=1)
+        error = jnp.where(regular, jnp.sqrt(jnp.abs(following) / first) / wanted, jnp.inf)
+        errors = jnp.where(going, error, errors)
+        p = z + (following / jnp.where(going, energy, 1))[:, None] * p
+        return _Iteration(x, r, p, following, errors, going & regular & (error > 1), steps + 1)
+
+    z = precondition(rhs)
+    first = jnp.sum(rhs * z, axis=1)
+    asked = jnp.isfinite(wanted)
+    start = _Iteration(jnp.zeros_like(rhs), rhs, z, first, jnp.where(asked, jnp.inf, 0), asked, jnp.zeros((), int))
+    end = jax.lax.while_loop(going_on, step, start)
+    return jnp.where((end.errors <= 1)[:, None], end.x, jnp.nan)
+
+
+def _beyond(values: Float[Array, " p"]) -> Float[Array, ""]:
+    """Return an estimate Λ of the first eigenvalue that is left."""
+    return jnp.where(values[-1] > 0, values[-1] * (1 + 1 / values.size), 1)
+
+
+def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> _Groups:
+    """Group blocks of the rows 0 … k−1 whose distance from Λ, by Weyl's law in 2D, is of one order."""
+    start = np.arange(0, k, _BLOCK)
+    end = np.minimum(start + _BLOCK, k)
+    distance = values.size + 1 - (start + end - 1) / 2
+    ratio = max(distance[0] / distance[-1], 1 + 1e-12)
+    entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
+    room = max(int(_MEMORY / (entries * values.dtype.itemsize)), 1)
+    count = min(best_count(ratio, k, tolerance), room)
+    number = np.minimum((np.log(distance[0] / distance) / np.log(ratio) * count).astype(int), count - 1)
+    _, first, of_block = np.unique(number, return_index=True, return_inverse=True)
+    return _Groups(of_block, start[first], np.append(start[first[1:]], k) - 1)
+
+
+def _apart(values: Float[Array, " p"], targets: Float[Array, " groups"]) -> Float[Array, " groups"]:
+    """Return the middles of gaps in the spectrum near the targets, so that no shift is an eigenvalue."""
+    below = -0.1 * jnp.where(values[-1] > 0, values[-1], 1)
+    if values.size == 1:
+        return jnp.broadcast_to(below, targets.shape)
+    gaps = jnp.diff(values)
+    typical = (values[-1] - values[0]) / (values.size - 1)
+    distance = jnp.abs(values[:-1] + gaps / 2 - targets[:, None])
+    nearest = jnp.argmin(jnp.where(gaps >= 0.1 * typical, distance, jnp.inf), axis=1)
+    return jnp.where(typical > 0, values[nearest] + gaps[nearest] / 2, below)
