@@ -26,10 +26,10 @@ demo: $(STAMPS)/dti $(STAMPS)/brain
 	$(BIN)/python -m hks_jax demo -o demo
 
 test: $(STAMPS)/test
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist loadgroup -m "not slow"
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) -m "not slow"
 
 test-slow: $(STAMPS)/test
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist loadgroup -m slow
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) -m slow
 
 lint: $(STAMPS)/lint
 	$(BIN)/ruff check .
