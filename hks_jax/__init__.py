@@ -49,9 +49,11 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    # The outside world (files, pictures) is imported when first asked for: it is slow to import and often not needed.
-    if name in ("io", "plot"):
+    # Fits and the outside world (files, pictures) are imported when first asked for: slow to import, often not needed.
+    if name in ("inverse", "io", "plot"):
         return importlib.import_module(f"hks_jax.{name}")
+    if name in ("fit_metric", "identifiability"):
+        return getattr(importlib.import_module("hks_jax.inverse"), name)
     if name == "examples":
         return importlib.import_module("hks_jax.domain.examples")
     raise AttributeError(f"module 'hks_jax' has no attribute {name!r}")

@@ -1,0 +1,12 @@
+"""From signatures back to metrics."""
+
+from hks_jax.inverse.fit import fit_metric as fit_metric
+from hks_jax.inverse.gauss_newton import GaussNewton as GaussNewton
+from hks_jax.inverse.metric_fit import MetricFit as MetricFit
+from hks_jax.inverse.metric_fit import Step as Step
+from hks_jax.inverse.parametrisation import Parametrisation as Parametrisation
+from hks_jax.inverse.regulariser import H1 as H1
+from hks_jax.inverse.regulariser import LogDeterminant as LogDeterminant
+from hks_jax.inverse.regulariser import Prior as Prior
+from hks_jax.inverse.regulariser import Regulariser as Regulariser
+from hks_jax.inverse.regulariser import TotalVariation as TotalVariation

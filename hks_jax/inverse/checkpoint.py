@@ -1,0 +1,81 @@
+"""Checkpoints of a fit: files that appear whole or not at all."""
+
+import dataclasses
+import hashlib
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hks_jax.inverse.metric_fit import Step
+
+
+class Checkpoint(NamedTuple):
+    """Where a fit stands.
+
+    Attributes:
+        values: the unknowns.
+        history: the steps so far.
+        start: which of the starts.
+        stage: which stage of the continuation.
+        step_size: by which the damping is divided.
+        best: the unknowns of the best of the starts before, and their losses.
+        losses: of the starts before.
+    """
+
+    values: Any
+    history: list[Step]
+    start: int
+    stage: int
+    step_size: float
+    best: Any
+    losses: list[float]
+
+
+def fingerprint(*parts: Any) -> str:
+    """Return a hash of arrays and settings."""
+    digest = hashlib.blake2b(digest_size=16)
+    for leaf in jax.tree.leaves(parts):
+        digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else repr(leaf).encode())
+    return digest.hexdigest()
+
+
+def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.part")
+    rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], np.float64)
+    with open(temporary, "wb") as file:
+        np.savez(file, mark=mark, **(checkpoint._asdict() | {"history": rows, "losses": np.array(checkpoint.losses)}))
+    os.replace(temporary, target)
+
+
+def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        ValueError: it is of another fit.
+    """
+    with np.load(path) as data:
+        if str(data["mark"]) != mark:
+            raise ValueError(
+                f"checkpoint: {path} is of another fit (another target, initial field or setting); give another name, "
+                "or remove it"
+            )
+        history = []
+        for step, loss, misfit, gradient, accepted, seconds, stage, start in data["history"]:
+            history.append(
+                Step(int(step), loss, misfit, gradient, bool(accepted), float(seconds), int(stage), int(start))
+            )
+        return Checkpoint(
+            data["values"],
+            history,
+            int(data["start"]),
+            int(data["stage"]),
+            float(data["step_size"]),
+            data["best"],
+            list(map(float, data["losses"])),
+        )

@@ -1,0 +1,88 @@
+"""The result of a fit."""
+
+import dataclasses
+
+from jaxtyping import Array
+
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.inverse.problem import Problem
+from hks_jax.inverse.unknowns import Values
+
+RESULTS = {
+    "converged": "the unknowns and the residuals no longer change",
+    "noise level reached": "the misfit is what the stated noise explains",
+    "steps exhausted": "max_steps was reached; allow more",
+    "stalled": "no step improves the loss any more; damping, regularisers or k may need a change",
+    "not finite": "the signature or its derivative is NaN or infinite; see the warnings",
+    "interrupted": "stopped from outside",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One step of a fit.
+
+    Attributes:
+        step: its number, from 0: what was known before any change.
+        loss: half the weighted mean square of the residuals, plus the penalties.
+        misfit: the part of the data.
+        gradient: the norm of the loss's gradient; NaN where the solver does not tell.
+        accepted: whether the step was taken.
+        seconds: since the start.
+        stage: which part of the continuation.
+        start: which of the starts.
+    """
+
+    step: int
+    loss: float
+    misfit: float
+    gradient: float
+    accepted: bool
+    seconds: float
+    stage: int = 0
+    start: int = 0
+
+    def __str__(self) -> str:
+        where = (f"start {self.start}, " if self.start else "") + (f"stage {self.stage}, " if self.stage else "")
+        mark = "" if self.accepted else ", rejected"
+        return (
+            f"{where}step {self.step}: loss {self.loss:.3e}, gradient {self.gradient:.1e}, {self.seconds:.1f} s{mark}"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class MetricFit:
+    """What `fit_metric` returns.
+
+    Attributes:
+        field: the fitted metric.
+        loss: half the weighted mean square of the residuals, plus the penalties.
+        misfit: the part of the data.
+        history: one entry for each step.
+        result: one of the keys of `RESULTS`, which say what they mean.
+        values: the unknowns, as the parametrisation has them.
+        problem: the least squares problem, for `identifiability` and for a fit of your own.
+        losses: the loss of each start.
+    """
+
+    field: TensorField
+    loss: float
+    misfit: float
+    history: tuple[Step, ...]
+    result: str
+    values: Values
+    problem: Problem
+    losses: tuple[float, ...]
+
+    @property
+    def converged(self) -> bool:
+        """Whether it stopped by itself at a solution."""
+        return self.result in ("converged", "noise level reached")
+
+    @property
+    def hks(self) -> Array:
+        """The signature of the fitted metric, of the kind and shape of the target."""
+        return self.problem.observation.predict(self.problem.pairs(self.values))
+
+    def __repr__(self) -> str:
+        return f"MetricFit({self.result}: loss {self.loss:.3e} after {len(self.history) - 1} steps)"

@@ -1,0 +1,90 @@
+"""The least squares problem of a fit: from unknowns to a field, its eigenpairs, its signature, and the residuals."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.eigen.block_lanczos import BlockLanczos
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.solve import eigenpairs
+from hks_jax.eigen.solver import Eigensolver
+from hks_jax.fem.operators import StencilOperator
+from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.inverse.observation import Observation
+from hks_jax.inverse.regulariser import Regulariser
+from hks_jax.inverse.unknowns import Unknowns, Values
+
+_TAIL = 1e-3
+"""What part of the heat trace at the smallest time may lie beyond the pairs that are computed."""
+_LOST = 0.05
+"""What part makes a time unresolvable."""
+
+
+class Problem(eqx.Module):
+    """Residuals as a function of the unknowns.
+
+    Attributes:
+        unknowns: what varies.
+        observation: what is to be matched.
+        regularisers: penalties.
+        k: eigenpairs.
+        boundary: boundary conditions.
+        solver: eigensolver.
+    """
+
+    unknowns: Unknowns
+    observation: Observation
+    regularisers: tuple[Regulariser, ...]
+    k: int = eqx.field(static=True)
+    boundary: Any = eqx.field(static=True)
+    solver: str | Eigensolver = eqx.field(static=True)
+
+    def pairs(self, values: Values) -> Eigenpairs:
+        """Return the eigenpairs of the field."""
+        # Of a multiplet that k cuts, the derivative exists only with all of its copies, or none.
+        return eigenpairs(self.unknowns.field(values), self.k, self.boundary, self.solver, multiplet="complete")
+
+    def residuals(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"]]:
+        """Return the residuals of the data and those of the penalties: half the sum of squares is the loss."""
+        field = self.unknowns.field(values)
+        data = self.observation.residuals(self.pairs(values))
+        penalties = [each.residuals(self.unknowns, values, field) for each in self.regularisers]
+        return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties])
+
+
+def fit_solver(n_dof: int, k: int, pencil: Pencil | MirrorPencil) -> str | Eigensolver:
+    """Return the eigensolver for a fit, where one linearisation serves many products with the Jacobian."""
+    if n_dof <= 1500 or 4 * k > n_dof:
+        return "dense"
+    grid = isinstance(pencil.parts[0].stiffness, StencilOperator)
+    if grid and k + 20 <= BlockLanczos().max_pairs(n_dof):
+        return BlockLanczos(derivative_tolerance=1e-10)
+    return "shift-invert"
+
+
+def pairs_for(times: Any, volume: float, dimension: int, n_dof: int) -> int:
+    """Return how many eigenpairs resolve the smallest time, by Weyl's law.
+
+    Raises:
+        ValueError: more than the grid has.
+    """
+    smallest = float(np.min(np.asarray(times)))
+    cap = max(n_dof // 4, min(n_dof, 20))
+    constant = 4 * math.pi if dimension == 2 else 6 * math.pi**2
+    # Of the heat trace exp(−Λt) lies beyond Λ in 2D, and a little more in 3D.
+    power = dimension / 2
+
+    def count(tail: float) -> int:
+        return math.ceil(1.1 * volume / constant * (-math.log(tail) / smallest) ** power) + 4
+
+    if count(_LOST) > cap:
+        least = -math.log(_LOST) * (1.1 * volume / constant / max(cap - 4, 1)) ** (1 / power)
+        raise ValueError(
+            f"times: got {smallest:.4g}, which takes about {count(_LOST)} eigenpairs to resolve to {_LOST:.0%}; with "
+            f"{n_dof} unknowns {cap} can be fitted. Use times from about {least:.3g}, or a finer grid"
+        )
+    return min(count(_TAIL), cap)

@@ -1,0 +1,95 @@
+"""Regularisers: what a fit prefers where the data leave a choice.
+
+Each is half a weighted mean of squares over the domain, given by its residuals: least squares solvers need these.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hks_jax.domain import spd
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.inverse.parametrisation import to_coordinates
+from hks_jax.inverse.unknowns import Unknowns, Values
+
+
+class Regulariser(eqx.Module):
+    """A penalty on the unknowns or on the field.
+
+    Attributes:
+        weight: what the penalty is multiplied by.
+    """
+
+    weight: eqx.AbstractVar[float]
+
+    @abstractmethod
+    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
+        """Return residuals, half of whose sum of squares is the penalty."""
+
+
+class H1(Regulariser):
+    """½ weight · mean |∇p|² of the parameters p (the logarithm of the tensor, say), in coordinate units."""
+
+    weight: float
+
+    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
+        """Return the scaled differences along the grid's edges."""
+        edges = [slopes.ravel() for slopes in unknowns.slopes(values)]
+        return jnp.sqrt(self.weight / _size(field)) * jnp.concatenate(edges)
+
+
+class TotalVariation(Regulariser):
+    """weight · mean (√(|∇p|² + ε²) − ε): edges in the parameters p stay sharp.
+
+    Attributes:
+        weight: what the penalty is multiplied by.
+        epsilon: slopes below it, per coordinate unit, count as smooth.
+    """
+
+    weight: float
+    epsilon: float = 0.1
+
+    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
+        """Return gradients at the nodes, scaled so that half their square is the penalty."""
+        d = field.grid.dimension
+        # Differences to the next node along each axis; none beyond the last.
+        padded = [
+            jnp.pad(slopes, [(0, 0)] + [(0, int(axis == along)) for axis in range(d)])
+            for along, slopes in enumerate(unknowns.slopes(values))
+        ]
+        gradient = jnp.stack(padded)
+        square = jnp.sum(gradient**2, axis=(0, 1))
+        # 2(√(s² + ε²) − ε)/s², without cancellation.
+        scale = 2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon)
+        return jnp.sqrt(self.weight / _size(field)) * (jnp.sqrt(scale) * gradient).ravel()
+
+
+class LogDeterminant(Regulariser):
+    """½ weight · mean (log |T| − log |T₀|)²: the area, or volume, stays."""
+
+    weight: float
+    prior: TensorField
+
+    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
+        """Return the differences of the logarithms of the determinants."""
+        ratio = spd.determinant(field.domain_tensors) / spd.determinant(self.prior.domain_tensors)
+        return jnp.sqrt(self.weight / _size(field)) * jnp.log(ratio).ravel()
+
+
+class Prior(Regulariser):
+    """½ weight · mean ‖log T − log T₀‖²: the log-Euclidean distance to another field."""
+
+    weight: float
+    prior: TensorField
+
+    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
+        """Return the coordinates of log T − log T₀."""
+        d = field.grid.dimension
+        difference = spd.log(field.domain_tensors) - spd.log(self.prior.domain_tensors)
+        return jnp.sqrt(self.weight / _size(field)) * to_coordinates(difference.reshape(-1, d, d)).ravel()
+
+
+def _size(field: TensorField) -> int:
+    return int(field.grid.inside.sum())

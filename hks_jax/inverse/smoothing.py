@@ -1,0 +1,80 @@
+"""The inner product in which steps of a fit are small: the identity, or one that prefers smooth steps."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.dissection import dissect
+from hks_jax.eigen.multifrontal import Factorisation, factorise
+from hks_jax.fem.assembly import assemble
+from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.space import GridSpace
+from hks_jax.inverse.unknowns import Values
+
+
+class InnerProduct(eqx.Module):
+    """A symmetric positive definite operator on unknowns."""
+
+    @abstractmethod
+    def apply(self, values: Values) -> Values:
+        """Return its product with the unknowns."""
+
+    @abstractmethod
+    def solve(self, values: Values) -> Values:
+        """Return the product of its inverse with the unknowns."""
+
+
+class Euclidean(InnerProduct):
+    """The identity."""
+
+    def apply(self, values: Values) -> Values:
+        """Return the values."""
+        return values
+
+    def solve(self, values: Values) -> Values:
+        """Return the values."""
+        return values
+
+
+class Smoothing(InnerProduct):
+    """1 − ℓ²Δ for each component, Δ the flat Laplacian on the domain: ℓ is the length below which steps are smooth.
+
+    Attributes:
+        pencil: stiffness and lumped mass of the flat metric.
+        factor: the factorisation of K + M/ℓ².
+        length: ℓ, in coordinate units.
+        cell: the mean of the masses, by which they are divided.
+    """
+
+    pencil: Pencil
+    factor: Factorisation
+    length: Float[Array, ""]
+    cell: Float[Array, ""]
+
+    def apply(self, values: Values) -> Values:
+        """Return (M + ℓ²K) x over the cell's mass."""
+        x = values.T
+        return ((self.pencil.mass.apply(x) + self.length**2 * self.pencil.stiffness.apply(x)) / self.cell).T
+
+    def solve(self, values: Values) -> Values:
+        """Return the inverse's product."""
+        return (self.factor.solve(values.T) * self.cell / self.length**2).T
+
+
+def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
+    """Return the inner product for numbers at the nodes of a grid's domain."""
+    d = grid.dimension
+    flat = TensorField(grid, jnp.broadcast_to(jnp.eye(d, dtype=dtype), (*grid.shape, d, d)))
+    pencil = assemble(flat, mass="lumped")
+    assert isinstance(pencil, Pencil)
+    assert isinstance(pencil.space, GridSpace)
+    dissection = jax.tree.map(jnp.asarray, dissect(pencil.space))
+    ell = jnp.asarray(length, dtype)
+    factor = factorise(dissection, pencil, -1 / ell**2)
+    return Smoothing(pencil, factor, ell, jnp.mean(pencil.mass.diagonal()))
