@@ -49,7 +49,7 @@ def fit_metric(
     solver: str | Eigensolver = "auto",
     optimiser: str | Optimiser = "gauss-newton",
     smoothness: float | None = None,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-4,
     max_steps: int = 50,
     continuation: int = 1,
     starts: int = 1,
@@ -164,7 +164,7 @@ def fit_metric(
         for log.stage in range(from_stage, len(problems)):
             # Early stages need no last digits.
             enough = tolerance if log.stage == len(problems) - 1 else 100 * tolerance
-            method = _optimiser(optimiser, enough, inner_product, step_size)
+            method = _optimiser(optimiser, enough, noise, inner_product, step_size)
             values, result = optimise(
                 problems[log.stage], values, method, noise, max_steps, log, log.stage, log.start, clock
             )
@@ -251,12 +251,16 @@ def _inner_product(unknowns: Unknowns, smoothness: float | None) -> InnerProduct
         smoothness = 0.1 * extent if unknowns.smooth else 0.0
     if not 0 <= smoothness < math.inf:
         raise ValueError(f"smoothness: got {smoothness}; expected a length ≥ 0 in coordinate units")
-    return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype) if smoothness > 0 else Euclidean()
+    return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype)
 
 
-def _optimiser(given: str | Optimiser, tolerance: float, inner_product: InnerProduct, step_size: float) -> Optimiser:
+def _optimiser(
+    given: str | Optimiser, tolerance: float, noise: float | None, inner_product: InnerProduct, step_size: float
+) -> Optimiser:
     if given == "gauss-newton":
-        return GaussNewton(tolerance, 1e-3 / step_size, inner_product)
+        # Against noise small steps: the misfit must not fall far below what the noise explains.
+        damping, growth = (1e-4, 10.0) if noise is None else (1e-2, 4.0)
+        return GaussNewton(tolerance, damping / step_size, growth, inner_product)
     if given == "lbfgs":
         return optx.LBFGS(tolerance, tolerance, optx.rms_norm)
     if given == "bfgs":

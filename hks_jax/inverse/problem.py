@@ -62,7 +62,7 @@ def fit_solver(n_dof: int, k: int, pencil: Pencil | MirrorPencil) -> str | Eigen
         return "dense"
     grid = isinstance(pencil.parts[0].stiffness, StencilOperator)
     if grid and k + 20 <= BlockLanczos().max_pairs(n_dof):
-        return BlockLanczos(derivative_tolerance=1e-10)
+        return BlockLanczos(derivative_tolerance=1e-7)
     return "shift-invert"
 
 

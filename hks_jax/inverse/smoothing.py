@@ -43,17 +43,20 @@ class Euclidean(InnerProduct):
 
 
 class Smoothing(InnerProduct):
-    """1 − ℓ²Δ for each component, Δ the flat Laplacian on the domain: ℓ is the length below which steps are smooth.
+    """⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ over the domain, for each component: ℓ is the length below which steps are smooth.
+
+    With the mass and not the identity, because a node at the side stands for half a cell: where the same change of the
+    field is a smaller one of the data.
 
     Attributes:
         pencil: stiffness and lumped mass of the flat metric.
-        factor: the factorisation of K + M/ℓ².
+        factor: the factorisation of K + M/ℓ²; None for ℓ = 0.
         length: ℓ, in coordinate units.
         cell: the mean of the masses, by which they are divided.
     """
 
     pencil: Pencil
-    factor: Factorisation
+    factor: Factorisation | None
     length: Float[Array, ""]
     cell: Float[Array, ""]
 
@@ -64,6 +67,8 @@ class Smoothing(InnerProduct):
 
     def solve(self, values: Values) -> Values:
         """Return the inverse's product."""
+        if self.factor is None:
+            return values * (self.cell / self.pencil.mass.diagonal())[:, None]
         return (self.factor.solve(values.T) * self.cell / self.length**2).T
 
 
@@ -74,7 +79,8 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     pencil = assemble(flat, mass="lumped")
     assert isinstance(pencil, Pencil)
     assert isinstance(pencil.space, GridSpace)
-    dissection = jax.tree.map(jnp.asarray, dissect(pencil.space))
-    ell = jnp.asarray(length, dtype)
-    factor = factorise(dissection, pencil, -1 / ell**2)
-    return Smoothing(pencil, factor, ell, jnp.mean(pencil.mass.diagonal()))
+    factor = None
+    if length > 0:
+        dissection = jax.tree.map(jnp.asarray, dissect(pencil.space))
+        factor = factorise(dissection, pencil, jnp.asarray(-1 / length**2, dtype))
+    return Smoothing(pencil, factor, jnp.asarray(length, dtype), jnp.mean(pencil.mass.diagonal()))
