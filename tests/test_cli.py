@@ -17,7 +17,8 @@ from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.arguments import Times, parse_boundary, parse_times
 from hks_jax.cli.picture import away_from_rim, bounding_box
 from hks_jax.cli.progress import Progress
-from hks_jax.io import TensorVolume, save_tensors
+from hks_jax.inverse.metric_fit import RESULTS
+from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12)
 QUIET_FILES = ["hks.npz", "hks.png", "report.json"]
@@ -385,3 +386,102 @@ def test_picture_helpers():
     assert not away_from_rim(inside)[5:10].any()
     assert away_from_rim(inside)[10:30, 6:33].all()
     np.testing.assert_array_equal(away_from_rim(inside[4:12]), inside[4:12])  # too thin: all of it
+
+
+# ---------------------------------------------------------------------------------------------------- fits
+
+FIT_GRID = hj.Grid((14, 13), 1 / 13)
+FIT_TIMES = np.array([0.02, 0.05, 0.1])
+FIT_ARGUMENTS = ["--parametrisation", "conformal", "-k", "40", "--h1", "1e-8"]  # the same ones compile once
+
+
+@pytest.fixture(scope="module")
+def conformal():
+    """A smooth conformal metric and its signature."""
+    x, y = np.moveaxis(FIT_GRID.nodes, -1, 0)
+    field = hj.TensorField(FIT_GRID, np.exp(0.4 * np.sin(2 * x) * np.cos(3 * y))[..., None, None] * np.eye(2))
+    return np.asarray(field.tensors), np.asarray(hj.hks(hj.eigenpairs(field, 40, multiplet="complete"), FIT_TIMES))
+
+
+def write_target(path, values, **changes):
+    arrays = {"hks": values, "times": FIT_TIMES, "spacing": FIT_GRID.spacing, "origin": FIT_GRID.origin, **changes}
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    return path
+
+
+def test_fit_end_to_end_recovers_the_metric(conformal, tmp_path, capsys):
+    tensors, values = conformal
+    target, out = write_target(tmp_path / "target.npz", values), tmp_path / "out"
+    arguments = ["--max-steps", "4", "-q", *FIT_ARGUMENTS]
+    assert main(["fit", str(target), "-o", str(out), *arguments]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["fit.npz", "fit.png", "report.json", "tensors.npz"]
+    assert (out / "fit.png").read_bytes()[:4] == b"\x89PNG"
+
+    fitted = read_tensors(out / "tensors.npz")
+    assert np.linalg.norm(fitted.tensors - tensors) < 0.02 * np.linalg.norm(tensors)
+    assert fitted.spacing == FIT_GRID.spacing
+    with np.load(out / "fit.npz") as read:
+        np.testing.assert_allclose(read["hks"], values, rtol=0.02)
+        np.testing.assert_array_equal(read["times"], FIT_TIMES)
+        losses = read["losses"]
+    report = json.loads((out / "report.json").read_text())
+    assert (report["result"], report["steps"], len(losses)) == ("steps exhausted", 4, 5)
+    assert report["explanation"] == RESULTS["steps exhausted"]
+    assert report["misfit"] < report["loss"] == pytest.approx(losses.min())
+    assert losses[-1] < 1e-3 * losses[0]
+    assert (report["k"], report["parametrisation"], report["settings"]["max_steps"]) == (40, "conformal", 4)
+    assert report["settings"]["h1"] == 1e-8
+    assert report["target"] == {
+        "source": str(target),
+        "shape": list(FIT_GRID.shape),
+        "spacing": list(FIT_GRID.spacing),
+        "nodes_inside": FIT_GRID.size,
+        "times": FIT_TIMES.tolist(),
+    }
+    assert {"reading", "fitting"} <= set(report["seconds"])
+    assert {"optimistix", "jax", "device"} <= set(report["versions"])
+    assert report["warnings"] == [capsys.readouterr().err.removeprefix("warning: ").rstrip()]
+    assert "steps exhausted" in report["warnings"][0]
+
+
+def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, monkeypatch):
+    tensors, values = conformal
+    target, out = write_target(tmp_path / "target.npz", values), tmp_path / "out"
+    np.savez(tmp_path / "init.npz", tensors=1.3 * np.linalg.inv(tensors), spacing=FIT_GRID.spacing)
+
+    def interrupt(progress, text):
+        if text.startswith("step 1"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Progress, "update", interrupt)
+    arguments = ["--init", str(tmp_path / "init.npz"), "--metric", "inverse", "-q", *FIT_ARGUMENTS]
+    assert main(["fit", str(target), "-o", str(out), *arguments]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["result"] == "interrupted"
+    assert "interrupted" in capsys.readouterr().err
+    with np.load(out / "fit.npz") as read:
+        assert read["losses"][1] < read["losses"][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changes", "words"),
+    [
+        ([], {"times": None, "spacing": None}, ["the arrays hks, origin;", "Add times, spacing"]),
+        ([], {"times": FIT_TIMES[:2]}, ["hks of shape (3, 14, 13)", "times of shape (2,)"]),
+        ([], {"hks": np.nan}, ["target: 1 of 546 observed values are NaN", "(2, 3, 4)"]),
+        (["--init", "init.npz"], {}, ["--init: got tensors of shape (14, 12)", "the target's shape (14, 13)"]),
+        (["--metric", "inverse"], {}, ["--metric", "--init"]),
+        (["--init", "init.nii.gz"], {}, ["--metric: choose"]),
+        (["--h1", "-1"], {}, ["--h1: got '-1'; expected a positive number"]),
+    ],
+)
+def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, monkeypatch, arguments, changes, words):
+    monkeypatch.chdir(tmp_path)
+    values = conformal[1].copy()
+    if "hks" in changes:
+        values[2, 3, 4], changes = changes["hks"], {}
+    write_target("target.npz", values, **changes)
+    np.savez("init.npz", tensors=metric())
+    before = sorted(tmp_path.iterdir())
+    assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2
+    assert sorted(tmp_path.iterdir()) == before

@@ -16,9 +16,12 @@ def test_readme_code_runs_in_an_empty_folder(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "120 of 120 converged" in done.stdout
     # K = −∇² log f / 2f of the metric f·I, here −(−40/11)/22
-    curvature, signature = map(float, done.stdout.split("\n")[-2].split())
+    lines = done.stdout.splitlines()
+    steps = [line for line in lines if line.startswith("step ")]
+    curvature, signature = map(float, lines[-1 - len(steps)].split())
     assert abs(curvature - 40 / 11 / 22) < 1e-12
     assert signature > 0
+    assert float(re.search("loss ([^,]+)", steps[-1])[1]) < 1e-8
     assert (tmp_path / "hks.png").stat().st_size > 10_000
 
 

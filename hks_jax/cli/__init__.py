@@ -8,9 +8,9 @@ from typing import NoReturn
 import numpy as np
 
 from hks_jax import __version__
-from hks_jax.cli import demo, hks, paper
+from hks_jax.cli import demo, fit, hks, paper
 
-SUBCOMMANDS = (hks, demo, paper)
+SUBCOMMANDS = (hks, fit, demo, paper)
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
     0: done; 1: the computation failed; 2: bad input; 130: interrupted. Output files appear whole
-    and, but for `paper`, all at the end: unless it is 0, there are none.
+    and, but for `paper` and the checkpoint of `fit`, all at the end: unless it is 0, there are none.
     """
     try:
         args = build_parser().parse_args(argv)

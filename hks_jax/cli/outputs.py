@@ -41,16 +41,21 @@ def write_outputs(
         if nifti:
             save(temporary / "hks.nii.gz", result.values, result.volume, name="hks")
         draw(temporary / "hks.png")
-        report = {
-            "command": command,
-            **result.report,
-            "warnings": progress.warnings,
-            "versions": versions(),
-            "seconds": {stage: round(seconds, 3) for stage, seconds in progress.timings.items()},
-        }
-        (temporary / "report.json").write_text(json.dumps(_plain(report), indent=2, ensure_ascii=False) + "\n")
+        write_report(temporary / "report.json", result.report, progress, command)
         names = sorted(file.name for file in temporary.iterdir())
     return [folder / name for name in names]
+
+
+def write_report(path: Path, report: dict[str, Any], progress: Progress, command: list[str]) -> None:
+    """Write a report as JSON, with the command before it, and warnings, versions and seconds of each stage after it."""
+    whole = {
+        "command": command,
+        **report,
+        "warnings": progress.warnings,
+        "versions": versions(),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in progress.timings.items()},
+    }
+    path.write_text(json.dumps(_plain(whole), indent=2, ensure_ascii=False) + "\n")
 
 
 def versions() -> dict[str, str]:
@@ -58,7 +63,7 @@ def versions() -> dict[str, str]:
     import jax
 
     found = {"python": platform.python_version(), "system": platform.platform(), "device": jax.devices()[0].device_kind}
-    for package in ("hks-jax", "jax", "jaxlib", "numpy", "scipy", "matplotlib", "nibabel", "dipy"):
+    for package in ("hks-jax", "jax", "jaxlib", "optimistix", "numpy", "scipy", "matplotlib", "nibabel", "dipy"):
         try:
             found[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:

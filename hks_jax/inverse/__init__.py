@@ -2,6 +2,8 @@
 
 from hks_jax.inverse.fit import fit_metric as fit_metric
 from hks_jax.inverse.gauss_newton import GaussNewton as GaussNewton
+from hks_jax.inverse.identifiability import Identifiability as Identifiability
+from hks_jax.inverse.identifiability import identifiability as identifiability
 from hks_jax.inverse.metric_fit import MetricFit as MetricFit
 from hks_jax.inverse.metric_fit import Step as Step
 from hks_jax.inverse.parametrisation import Parametrisation as Parametrisation

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import os
+import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,10 +58,15 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        ValueError: it is of another fit.
+        ValueError: it is of another fit, or no checkpoint.
     """
-    with np.load(path) as data:
-        if str(data["mark"]) != mark:
+    try:
+        data = np.load(path)
+        marked = str(data["mark"])
+    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile):
+        raise ValueError(f"checkpoint: {path} is not one of a fit; give another name, or remove it") from None
+    with data:
+        if marked != mark:
             raise ValueError(
                 f"checkpoint: {path} is of another fit (another target, initial field or setting); give another name, "
                 "or remove it"

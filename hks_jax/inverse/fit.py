@@ -88,7 +88,7 @@ def fit_metric(
         solver: eigensolver; ``"auto"`` chooses for many products with one Jacobian.
         optimiser: ``"gauss-newton"`` (damped, matrix-free), ``"lbfgs"``, ``"bfgs"``, or a solver of optimistix.
         smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth; 0 for no preference; by
-            default a tenth of the domain, and 0 for ``"conformal"``.
+            default a tenth of the domain, and 0 for ``"conformal"`` without noise.
         tolerance: the change of unknowns and residuals (root mean square) at which it has converged.
         max_steps: steps per stage.
         continuation: stages: the first fits the largest times alone, the last all of them.
@@ -134,7 +134,7 @@ def fit_metric(
         chosen = fit_solver(space.n_dof, pairs, pencil) if solver == "auto" else solver
         problems.append(Problem(unknowns, each, tuple(regularisers), pairs, boundary, chosen))
 
-    inner_product = _inner_product(unknowns, smoothness)
+    inner_product = _inner_product(unknowns, smoothness, noise)
     first = unknowns.start()
     settings = (
         parametrisation,
@@ -242,13 +242,13 @@ def _pairs(observation: Observation, k: int | None, shape: tuple[int, ...], volu
     return wanted if k is None else k
 
 
-def _inner_product(unknowns: Unknowns, smoothness: float | None) -> InnerProduct:
+def _inner_product(unknowns: Unknowns, smoothness: float | None, noise: float | None) -> InnerProduct:
     if not isinstance(unknowns, Nodal):
         return Euclidean()
     grid = unknowns.init.grid
     if smoothness is None:
         extent = max(h * (n - 1) for h, n in zip(grid.spacing, grid.shape, strict=True))
-        smoothness = 0.1 * extent if unknowns.smooth else 0.0
+        smoothness = 0.1 * extent if unknowns.smooth or noise is not None else 0.0
     if not 0 <= smoothness < math.inf:
         raise ValueError(f"smoothness: got {smoothness}; expected a length ≥ 0 in coordinate units")
     return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype)

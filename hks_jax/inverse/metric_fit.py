@@ -80,9 +80,14 @@ class MetricFit:
         return self.result in ("converged", "noise level reached")
 
     @property
+    def steps(self) -> int:
+        """How many steps were computed, over all stages and starts."""
+        return sum(step.step > 0 for step in self.history)
+
+    @property
     def hks(self) -> Array:
-        """The signature of the fitted metric, of the kind and shape of the target."""
+        """The signature of the fitted metric, of the kind and shape of the target; computed anew each time."""
         return self.problem.observation.predict(self.problem.pairs(self.values))
 
     def __repr__(self) -> str:
-        return f"MetricFit({self.result}: loss {self.loss:.3e} after {len(self.history) - 1} steps)"
+        return f"MetricFit({self.result}: loss {self.loss:.3e} after {self.steps} steps)"

@@ -148,5 +148,5 @@ def _check_values(values: np.ndarray, used: np.ndarray, positive: bool) -> None:
             first = tuple(int(i) for i in np.argwhere(bad)[0])
             raise ValueError(
                 f"target: {int(bad.sum())} of {int(used.sum())} observed values are {what} (the first at {first}: "
-                f"{values[first]:.4g}). Give them the weight 0, or correct them"
+                f"{values[first]:.4g}). Give them the weight 0, take their nodes out of the mask, or correct them"
             )

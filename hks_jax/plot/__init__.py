@@ -9,6 +9,7 @@ from hks_jax.plot.ellipses import ellipses as ellipses
 from hks_jax.plot.figure import new_figure as new_figure
 from hks_jax.plot.figure import number_text as number_text
 from hks_jax.plot.figure import save_figure as save_figure
+from hks_jax.plot.fit import fit_panels as fit_panels
 from hks_jax.plot.images import hks_panels as hks_panels
 from hks_jax.plot.images import scalar_image as scalar_image
 from hks_jax.plot.lines import integral_lines as integral_lines

@@ -1,0 +1,147 @@
+"""How well a fitted metric explains a signature, and what it is."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from hks_jax.plot.ellipses import ellipses
+from hks_jax.plot.figure import SMALL, cell_extent, new_figure, number_text, require_plane
+from hks_jax.plot.images import scalar_image
+
+if TYPE_CHECKING:  # slow to import
+    from hks_jax.inverse.metric_fit import MetricFit, Step
+
+LEAST_DIFFERENCE = 1e-6
+"""The least relative difference that takes the last colour: below it lie the errors of the eigenpairs."""
+
+
+def fit_panels(
+    fit: "MetricFit",
+    target: Float[ArrayLike, "n_times nx ny"],
+    times: Sequence[float] | Float[ArrayLike, " n_times"] | None = None,
+    *,
+    max_times: int = 3,
+    title: str | None = None,
+) -> Figure:
+    """Return a figure of a fit in 2D: signatures, the metric, and the way there.
+
+    A row for each of a few times, the first and the last among them: the target, the fitted signature in the same
+    colours, and their relative difference, in colours shared by all rows. Below, the unit circles of the fitted metric
+    and the loss over the steps, a curve for each start, broken where a stage begins or a fit was resumed.
+
+    Args:
+        fit: what `hks_jax.fit_metric` returned.
+        target: (n_times, *grid.shape), what was fitted; NaN where it was not observed.
+        times: (n_times,), or energies; None: those of the fit.
+        max_times: the most rows.
+        title: the figure's title.
+
+    Raises:
+        ValueError: a 3D grid; a target or a signature that is not one image per time; no times.
+    """
+    grid = fit.field.grid
+    require_plane("fit", grid)
+    if times is None:
+        times = fit.problem.observation.times
+    if times is None:
+        raise ValueError("times: got None, and the fit has none; expected one number per image of the target")
+    if max_times < 1:
+        raise ValueError(f"max_times: got {max_times}; expected at least 1")
+    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
+    for name, array in (("target", wanted), ("fit.hks", fitted)):
+        if array.shape != (t.size, *grid.shape):
+            raise ValueError(
+                f"{name}: got shape {array.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}"
+            )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        difference = np.where(wanted != 0, (fitted - wanted) / np.abs(wanted), np.nan)
+
+    rows = np.unique(np.linspace(0, t.size - 1, max_times).round().astype(int))
+    drawn = np.abs(difference[rows][:, grid.inside])
+    limit = max(float(np.max(drawn[np.isfinite(drawn)], initial=0.0)), LEAST_DIFFERENCE)
+
+    x0, x1, y0, y1 = cell_extent(grid)
+    aspect = min(max((y1 - y0) / (x1 - x0), 0.25), 4.0)
+    width = 2.5 / max(1.0, aspect**0.5)
+    # The lowest row is no lower than a curve needs.
+    heights = [width * aspect] * len(rows) + [max(width * aspect, 1.8)]
+    figure = new_figure(3 * (width + 0.9) + 0.4, sum(heights) + 0.3 * len(heights) + 0.6 + 0.3 * bool(title))
+    # Apart, because the last row's labels would else widen the columns above.
+    halves = figure.add_gridspec(2, 1, height_ratios=[sum(heights[:-1]), heights[-1]])
+    panels, last = halves[0].subgridspec(len(rows), 3), halves[1].subgridspec(1, 2, width_ratios=(1, 1.7))
+    symbol = "e" if fit.problem.observation.signature == "wks" else "t"
+    for row, index in enumerate(rows):
+        first, second, third = (figure.add_subplot(panels[row, column]) for column in range(3))
+        both = np.stack([wanted[index], fitted[index]])[:, grid.inside]
+        both = both[np.isfinite(both)]
+        low, high = (float(both.min()), float(both.max())) if np.ptp(both) > 1e-6 * np.abs(both).max() else (None, None)
+        for ax, values in ((first, wanted[index]), (second, fitted[index])):
+            scalar_image(ax, values, grid, vmin=low, vmax=high)
+        scalar_image(third, difference[index], grid, cmap="RdBu_r", vmin=-limit, vmax=limit)
+        first.set_ylabel(f"${symbol}$ = {number_text(t[index])}")
+        for ax, text in ((first, "target"), (second, "fitted"), (third, "fitted / target − 1")):
+            ax.tick_params(labelleft=ax is first, labelbottom=row == len(rows) - 1)
+            if row == 0:
+                ax.set_title(text, fontsize="medium")
+    ax = figure.add_subplot(last[0])
+    ellipses(ax, fit.field)
+    ax.set_title("fitted metric, unit circles", fontsize="medium")
+    _draw_loss(figure.add_subplot(last[1]), fit)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
+    """Draw the loss over the steps, and the data's part of it where there are penalties."""
+    starts = sorted({step.start for step in fit.history})
+    offset, before = 0, None
+    for piece in _pieces(fit.history):
+        if before is not None:
+            offset = offset + before.step if before.start == piece[0].start else 0
+        before = piece[-1]
+        steps = [offset + step.step for step in piece]
+        color = f"C{starts.index(before.start) % 10}"
+        first = offset == 0
+        label = "loss" if len(starts) == 1 else f"start {before.start}"
+        losses = [step.loss for step in piece]
+        ax.plot(steps, _positive(losses), ".-", color=color, label=label if first else None)
+        if fit.problem.regularisers:
+            label = "misfit" if before.start == starts[0] else ""
+            misfits = _positive([step.misfit for step in piece])
+            ax.plot(steps, misfits, ":", color=color, label=label if first and label else None)
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(numticks=6))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    ax.tick_params(labelsize=SMALL)
+    ax.grid(alpha=0.3)
+    ax.set_xlabel("step", fontsize=SMALL)
+    ax.set_ylabel("loss", fontsize=SMALL)
+    ax.set_title(fit.result, fontsize="medium")
+    if len(starts) > 1 or fit.problem.regularisers:
+        ax.legend(fontsize=SMALL)
+
+
+def _pieces(history: Sequence["Step"]) -> list[list["Step"]]:
+    """Return the runs of steps that follow one another: a stage, a start or a resumed fit counts from 0 again."""
+    pieces: list[list[Step]] = []
+    for step in history:
+        last = pieces[-1][-1] if pieces else None
+        if last is None or step.step <= last.step or (step.start, step.stage) != (last.start, last.stage):
+            pieces.append([])
+        pieces[-1].append(step)
+    return pieces
+
+
+def _positive(values: Sequence[float]) -> Float[np.ndarray, " n"]:
+    """Return values for a logarithmic axis: NaN where there is no logarithm."""
+    array = np.asarray(values, dtype=np.float64)
+    return np.where(array > 0, array, np.nan)

@@ -1,0 +1,274 @@
+"""Fits of metrics to signatures."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from fields import random_spd
+
+import hks_jax as hj
+from hks_jax.domain import spd
+from hks_jax.inverse import H1, LogDeterminant, Prior, TotalVariation, identifiability
+from hks_jax.inverse.optimise import loss_of
+from hks_jax.inverse.parametrisation import PARAMETRISATIONS
+from hks_jax.inverse.unknowns import Nodal, nodes_of
+
+N = 14
+GRID = hj.Grid((N, N), 1 / (N - 1))
+X, Y = GRID.nodes[..., 0], GRID.nodes[..., 1]
+FLAT = hj.TensorField(GRID, np.broadcast_to(np.eye(2), (N, N, 2, 2)))
+TIMES = np.geomspace(0.012, 0.15, 4)
+K = 45
+LOG_FACTOR = 0.4 * np.sin(2 * X) * np.cos(3 * Y)
+CONFORMAL = hj.TensorField(GRID, np.exp(LOG_FACTOR)[..., None, None] * np.eye(2))
+
+
+def smooth_field():
+    a, b, c = 0.3 * np.sin(2 * X + Y), 0.3 * np.cos(3 * Y), 0.2 * np.sin(3 * X)
+    return hj.TensorField(GRID, spd.exp(jnp.stack([jnp.stack([a, c], -1), jnp.stack([c, b], -1)], -2)))
+
+
+def signature(field, k=K, times=TIMES):
+    return np.asarray(hj.hks(hj.eigenpairs(field, k, multiplet="complete"), times))
+
+
+def error(fit, truth):
+    return np.linalg.norm(fit.field.tensors - truth.tensors) / np.linalg.norm(truth.tensors)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_exponential_and_logarithm_are_smooth_at_multiple_eigenvalues(rng, d):
+    tensors = jnp.asarray(np.concatenate([random_spd(rng, (4,) * d).reshape(-1, d, d), np.eye(d)[None]]))
+    np.testing.assert_allclose(spd.exp(spd.log(tensors)), tensors, rtol=1e-12, atol=1e-14)
+    direction = rng.standard_normal(tensors.shape)
+    direction = jnp.asarray(direction + np.swapaxes(direction, 1, 2))
+    for function in (spd.exp, spd.log):
+        slope = jax.jvp(function, (tensors,), (direction,))[1]
+        difference = (function(tensors + 1e-6 * direction) - function(tensors - 1e-6 * direction)) / 2e-6
+        np.testing.assert_allclose(slope, difference, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+    np.testing.assert_allclose(spd.exp(tensors), jax.vmap(jax.scipy.linalg.expm)(tensors), rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", PARAMETRISATIONS)
+@pytest.mark.parametrize("d", [2, 3])
+def test_parametrisations_start_at_the_initial_field_and_stay_positive_definite(rng, name, d):
+    base = jnp.asarray(random_spd(rng, (3,) * d).reshape(-1, d, d))
+    parametrisation = PARAMETRISATIONS[name]()
+    start = parametrisation.start(base)
+    np.testing.assert_allclose(parametrisation.tensors(start, base), base, rtol=1e-12, atol=1e-12)
+    moved = parametrisation.tensors(start + jnp.asarray(rng.standard_normal(start.shape)), base)
+    assert spd.is_spd(np.asarray(moved)).all()
+    kept = {"rotation": jnp.linalg.eigvalsh, "conformal": lambda t: t / spd.determinant(t)[:, None, None] ** (1 / d)}
+    if name in kept:
+        np.testing.assert_allclose(kept[name](moved), kept[name](base), rtol=1e-10, atol=1e-12)
+    # Finite derivatives at the start, where base may be isotropic.
+    isotropic = jnp.broadcast_to(jnp.eye(d), base.shape)
+    slope = jax.jvp(lambda p: parametrisation.tensors(p, isotropic), (parametrisation.start(isotropic),), (start,))[1]
+    assert jnp.isfinite(slope).all()
+
+
+def test_a_conformal_factor_is_recovered_from_a_flat_start():
+    told = []
+    fit = hj.fit_metric(signature(CONFORMAL), TIMES, FLAT, "conformal", k=K, progress=told.append)
+    assert fit.converged
+    assert fit.result == "converged"
+    assert error(fit, CONFORMAL) < 1e-5
+    assert told == list(fit.history)
+    assert fit.history[-1].loss < 1e-6 * fit.history[0].loss
+    np.testing.assert_allclose(fit.hks, signature(CONFORMAL), rtol=1e-5)
+    np.testing.assert_allclose(fit.values[:, 0], LOG_FACTOR.ravel(), atol=1e-4)
+    assert "converged" in repr(fit)
+
+
+def test_a_full_tensor_field_is_recovered():
+    truth = smooth_field()
+    fit = hj.fit_metric(signature(truth), TIMES, FLAT, k=K, max_steps=7)
+    assert error(fit, truth) < 0.03
+    assert fit.loss < 1e-7 * fit.history[0].loss
+
+
+def test_noise_stops_the_fit_where_it_explains_the_misfit(rng):
+    target = signature(CONFORMAL) * np.exp(0.01 * rng.standard_normal((4, N, N)))
+    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, noise=0.01)
+    assert fit.result == "noise level reached"
+    assert 0.5 * 0.01**2 * 0.3 < fit.misfit <= 1.05 * 0.5 * 0.01**2
+    assert error(fit, CONFORMAL) < 0.03
+
+
+def test_rotations_with_fixed_eigenvalues():
+    angle = 0.3 * np.sin(2 * X) + 0.2 * Y
+    rotation = np.stack(
+        [np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], -2
+    )
+    values = np.diag([2.0, 0.8])
+    init = hj.TensorField(GRID, np.broadcast_to(values, (N, N, 2, 2)))
+    truth = hj.TensorField(GRID, rotation @ values @ np.swapaxes(rotation, -1, -2))
+    fit = hj.fit_metric(signature(truth), TIMES, init, "rotation", k=K)
+    assert error(fit, truth) < 0.02
+
+
+def test_eigenvalues_alone():
+    """From a start without symmetry: within a multiple eigenvalue only the sum of its copies has a derivative."""
+    target = hj.eigenpairs(CONFORMAL, 30).eigenvalues
+    init = hj.TensorField(GRID, np.exp(0.1 * X - 0.15 * Y)[..., None, None] * np.eye(2))
+    fit = hj.fit_metric(
+        target, None, init, "conformal", signature="eigenvalues", loss="relative", smoothness=0.2, max_steps=12
+    )
+    assert fit.misfit < 1e-8 * fit.history[0].misfit
+    np.testing.assert_allclose(fit.hks, target, rtol=1e-5, atol=1e-9)
+
+
+def test_unobserved_entries_may_be_nan_and_do_not_count(rng):
+    target = signature(CONFORMAL).copy()
+    weights = (rng.uniform(size=(N, N)) > 0.3).astype(float)
+    target[:, weights == 0] = np.nan
+    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, weights=weights)
+    assert error(fit, CONFORMAL) < 1e-2
+
+
+def test_gauss_newton_needs_fewer_signatures_than_lbfgs():
+    target = signature(CONFORMAL)
+    newton = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, max_steps=4)
+    lbfgs = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, optimiser="lbfgs", max_steps=12)
+    assert newton.loss < lbfgs.loss < lbfgs.history[0].loss
+    assert all(np.isfinite(step.gradient) for step in (*newton.history, *lbfgs.history))
+
+
+def test_a_function_of_a_few_parameters():
+    def bump(parameters):
+        height = parameters["height"] * jnp.exp(-((X - parameters["x"]) ** 2 + (Y - 0.5) ** 2) / 0.1)
+        return hj.TensorField(GRID, jnp.exp(height)[..., None, None] * jnp.eye(2))
+
+    target = signature(bump({"height": 0.6, "x": 0.4}))
+    start = {"height": 0.1, "x": 0.5}
+    fit = hj.fit_metric(target, TIMES, FLAT, bump, parameters=start, k=K)
+    np.testing.assert_allclose(fit.values, [0.6, 0.4], atol=1e-4)
+    with pytest.raises(ValueError, match="parameters: got None"):
+        hj.fit_metric(target, TIMES, FLAT, bump, k=K)
+    with pytest.raises(ValueError, match="regularisers: parameters of a function have no neighbours"):
+        hj.fit_metric(target, TIMES, FLAT, bump, parameters=start, k=K, regularisers=[H1(1.0)])
+
+
+def test_penalties_are_means_over_the_domain():
+    grid = hj.Grid((40, 60), (1 / 39, 2 / 59))
+    x, y = grid.nodes[..., 0], grid.nodes[..., 1]
+    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (40, 60, 2, 2)))
+    unknowns = Nodal(PARAMETRISATIONS["conformal"](), flat, nodes_of(grid.inside))
+    values = jnp.asarray((3 * x + 2 * y).reshape(-1, 1))
+    field = unknowns.field(values)
+
+    def penalty(regulariser):
+        return float(jnp.sum(regulariser.residuals(unknowns, values, field) ** 2) / 2)
+
+    square = np.mean((3 * x + 2 * y) ** 2)
+    # log T = p·I has the squared norm 2p², and log |T| = 2p.
+    assert penalty(Prior(0.5, flat)) == pytest.approx(0.25 * 2 * square)
+    assert penalty(LogDeterminant(0.5, flat)) == pytest.approx(0.25 * 4 * square)
+    # A line of nodes has no edge beyond it.
+    assert penalty(H1(0.5)) == pytest.approx(0.25 * 13, rel=0.03)
+    assert penalty(TotalVariation(0.5, 0.01)) == pytest.approx(0.5 * np.sqrt(13), rel=0.03)
+    assert all(penalty(each) == 0 for each in (Prior(1.0, field), LogDeterminant(1.0, field)))
+
+
+def test_a_regulariser_smooths_what_noise_roughens(rng):
+    target = signature(CONFORMAL) * np.exp(0.05 * rng.standard_normal((4, N, N)))
+
+    def roughness(*regularisers):
+        fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, regularisers=regularisers, max_steps=5)
+        assert fit.loss > fit.misfit or not regularisers
+        return float(jnp.sum(jnp.diff(fit.values.reshape(N, N), axis=0) ** 2))
+
+    assert roughness(H1(1e-4)) < 0.5 * roughness()
+
+
+def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
+    target, file = signature(CONFORMAL), tmp_path / "deep" / "fit.npz"
+
+    def interrupt(step):
+        if step.step == 2:
+            raise KeyboardInterrupt
+
+    stopped = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, progress=interrupt)
+    assert stopped.result == "interrupted"
+    assert not stopped.converged
+    assert stopped.loss < 1e-2 * stopped.history[0].loss
+    first = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, max_steps=2, checkpoint=file)
+    assert first.result == "steps exhausted"
+    again = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, checkpoint=file)
+    assert again.converged
+    assert again.history[:3] == first.history
+    assert [path.name for path in file.parent.iterdir()] == ["fit.npz"]
+    with pytest.raises(ValueError, match=r"checkpoint: .* is of another fit"):
+        hj.fit_metric(2 * target, TIMES, FLAT, "conformal", k=K, checkpoint=file)
+    (tmp_path / "notes.txt").write_text("no checkpoint")
+    with pytest.raises(ValueError, match=r"checkpoint: .*notes.txt is not one of a fit"):
+        hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, checkpoint=tmp_path / "notes.txt")
+
+
+@pytest.mark.slow
+def test_continuation_and_several_starts():
+    fit = hj.fit_metric(signature(CONFORMAL), TIMES, FLAT, "conformal", continuation=2, starts=2, max_steps=2, seed=3)
+    assert [(step.start, step.stage) for step in fit.history[::3]] == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert fit.loss == min(fit.losses)
+    assert len(fit.losses) == 2
+    # Two times of four need fewer eigenpairs.
+    assert fit.history[0].loss != fit.history[3].loss
+
+
+@pytest.mark.slow
+def test_identifiability_is_the_spectrum_of_the_information(rng):
+    fit = hj.fit_metric(signature(CONFORMAL), TIMES, FLAT, "conformal", k=K, max_steps=2)
+    problem = fit.problem
+    report = identifiability(fit, n=12, n_weak=2, iterations=6)
+    jacobian = jax.jacfwd(lambda v: problem.observation.residuals(problem.pairs(v)))(fit.values)
+    information = np.asarray(jacobian.reshape(len(jacobian), -1))
+    exact = np.linalg.eigvalsh(information.T @ information)
+    np.testing.assert_allclose(report.strengths[:8], exact[::-1][:8], rtol=0.02)
+    assert exact[0] * (1 - 1e-9) <= report.weak_strengths[0] < 0.05 * exact[-1]
+    assert ((report.resolution >= 0) & (report.resolution <= 1)).all()
+    assert 0 < report.effective <= 12
+    assert (report.deviation <= 1).all()
+    # Fewer times, less information.
+    fewer = hj.fit_metric(signature(CONFORMAL)[2:], TIMES[2:], FLAT, "conformal", k=K, max_steps=1)
+    poorer = identifiability(fewer.problem, fit.values, n=12, n_weak=1, iterations=6)
+    assert poorer.strengths[11] < report.strengths[11]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"target": lambda t: t[:, 1:]}, r"target: got shape \(4, 13, 14\); expected .* \(4, 14, 14\)"),
+        ({"target": lambda t: np.where(t == t[0, 0, 0], np.nan, t)}, r"target: 1 of 784 observed values are NaN"),
+        ({"target": lambda t: t - 100}, r"target: \d+ of 784 observed values are not positive \(the first at \(0, 0, "),
+        ({"times": [0.1, -1.0, 1.0, 2.0]}, "times: got -1.0; expected positive"),
+        ({"times": np.array([1e-5, 0.1, 0.2, 0.3])}, "times: got 1e-05, which takes about .* Use times from about"),
+        ({"parametrisation": "spherical"}, "parametrisation: got 'spherical'; expected 'log-euclidean'"),
+        ({"signature": "sound"}, "signature: got 'sound'; expected 'hks'"),
+        ({"loss": "gain"}, "loss: got 'gain'; expected 'log'"),
+        ({"optimiser": "sgd"}, "optimiser: got 'sgd'; expected 'gauss-newton'"),
+        ({"weights": np.zeros((N, N))}, "weights: all are zero"),
+        ({"weights": np.ones(3)}, r"weights: got shape \(3,\); expected one that broadcasts"),
+        ({"noise": -1}, "noise: got -1; expected a positive"),
+        ({"max_steps": 0}, "max_steps: got 0; expected an integer from 1"),
+        ({"smoothness": -1.0}, "smoothness: got -1.0; expected a length"),
+        ({"signature": "wks"}, "sigma: got None"),
+        ({"signature": lambda pairs: pairs.eigenvalues, "target": lambda t: t[0, 0]}, "k: got None"),
+    ],
+)
+def test_bad_arguments_are_named(changes, message):
+    target = np.linspace(1, 2, 4 * N * N).reshape(4, N, N)
+    target = changes.pop("target", lambda t: t)(target)
+    arguments = {"times": TIMES, "init": FLAT} | changes
+    with pytest.raises(ValueError, match=message):
+        hj.fit_metric(target, **arguments)
+
+
+def test_solvers_of_optimistix_are_taken_as_they_are():
+    solver = optx.BFGS(1e-3, 1e-3)
+    target = hj.heat_trace(hj.eigenpairs(CONFORMAL, K), TIMES)
+    fit = hj.fit_metric(
+        target, TIMES, FLAT, "conformal", signature="heat-trace", k=K, optimiser=solver, tolerance=1e-2, max_steps=12
+    )
+    assert float(loss_of(fit.problem, fit.values)[0]) == pytest.approx(fit.loss)
+    assert fit.loss < 0.1 * fit.history[0].loss
