@@ -92,7 +92,7 @@ def test_noise_stops_the_fit_where_it_explains_the_misfit(rng):
     target = signature(CONFORMAL) * np.exp(0.01 * rng.standard_normal((4, N, N)))
     fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, noise=0.01)
     assert fit.result == "noise level reached"
-    assert 0.5 * 0.01**2 * 0.3 < fit.misfit <= 1.05 * 0.5 * 0.01**2
+    assert 0.5 * 0.01**2 * 0.3 < fit.misfit <= 0.5 * 0.01**2
     assert error(fit, CONFORMAL) < 0.03
 
 
@@ -116,7 +116,7 @@ def test_eigenvalues_alone():
         target, None, init, "conformal", signature="eigenvalues", loss="relative", smoothness=0.2, max_steps=12
     )
     assert fit.misfit < 1e-8 * fit.history[0].misfit
-    np.testing.assert_allclose(fit.hks, target, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(fit.hks, target, rtol=1e-3, atol=1e-9)
 
 
 def test_unobserved_entries_may_be_nan_and_do_not_count(rng):
@@ -225,7 +225,7 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
     information = np.asarray(jacobian.reshape(len(jacobian), -1))
     exact = np.linalg.eigvalsh(information.T @ information)
     np.testing.assert_allclose(report.strengths[:8], exact[::-1][:8], rtol=0.02)
-    assert exact[0] * (1 - 1e-9) <= report.weak_strengths[0] < 0.05 * exact[-1]
+    assert exact[0] * (1 - 1e-9) <= report.weak_strengths[0] < 1.5 * exact[0]
     assert ((report.resolution >= 0) & (report.resolution <= 1)).all()
     assert 0 < report.effective <= 12
     assert (report.deviation <= 1).all()

@@ -259,7 +259,7 @@ def _optimiser(
 ) -> Optimiser:
     if given == "gauss-newton":
         # Against noise small steps: the misfit must not fall far below what the noise explains.
-        damping, growth = (1e-4, 10.0) if noise is None else (1e-2, 4.0)
+        damping, growth = (1e-4, 10.0) if noise is None else (1e-2, 3.0)
         return GaussNewton(tolerance, damping / step_size, growth, inner_product)
     if given == "lbfgs":
         return optx.LBFGS(tolerance, tolerance, optx.rms_norm)

@@ -13,6 +13,9 @@ from hks_jax.inverse.metric_fit import MetricFit
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
 
+_ROUNDS = 4
+"""Rounds of Chebyshev filtering for the weakest directions, each with what the last one found."""
+
 
 class Identifiability(eqx.Module):
     """What noisy data determine near a solution, to first order.
@@ -95,7 +98,7 @@ def identifiability(
     start = jax.random.normal(keys[0], (min(n + 8, total), *values.shape), values.dtype)
     strengths, directions = _strongest(problem, values, start, iterations)
     weak_start = jax.random.normal(keys[1], (min(n_weak + 4, total), *values.shape), values.dtype)
-    weak, weak_directions = _weakest(problem, values, weak_start, strengths[0], 6 * iterations)
+    weak, weak_directions = _weakest(problem, values, weak_start, strengths[0], 2 * iterations)
 
     # The weights add up to one over m entries: a residual of deviation σ has σ²/m after weighting, in the mean.
     variance = noise**2 / problem.observation.target.size
@@ -154,19 +157,22 @@ def _strongest(problem: Problem, values: Values, start: Array, iterations: int) 
 def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, ""], degree: int) -> tuple[Array, Array]:
     product = _information(problem, values)
     shape = start.shape
-    # A Chebyshev polynomial that is small on [cut, top] and grows below: what is left is weak.
-    high, cut = 1.1 * top, 1e-3 * top
-    centre, half = (high + cut) / 2, (high - cut) / 2
-
-    def recur(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        before, block = state
-        return block, 2 / half * (product(block) - centre * block) - before
-
     block = _orthonormal(start.reshape(shape[0], -1)).reshape(shape)
-    first = (product(block) - centre * block) / half
-    _, block = jax.lax.fori_loop(1, degree, recur, (block, first))
-    block = _orthonormal(block.reshape(shape[0], -1)).reshape(shape)
-    return _ritz(block, product(block), largest=False)
+    values = jnp.full(shape[0], 0.2 * top)
+    for _ in range(_ROUNDS):
+        # A Chebyshev polynomial that is small between what is weak as far as is known and the top, and grows below.
+        cut = jnp.mean(values)
+        centre, half = (1.1 * top + cut) / 2, (1.1 * top - cut) / 2
+
+        def recur(_: Any, state: tuple[Array, Array], centre: Array = centre, half: Array = half) -> tuple:
+            before, now = state
+            return now, 2 / half * (product(now) - centre * now) - before
+
+        first = (product(block) - centre * block) / half
+        _, block = jax.lax.fori_loop(1, degree, recur, (block, first))
+        block = _orthonormal(block.reshape(shape[0], -1)).reshape(shape)
+        values, block = _ritz(block, product(block), largest=False)
+    return values, block
 
 
 def _orthonormal(rows: Float[Array, "n m"]) -> Float[Array, "n m"]:

@@ -34,6 +34,7 @@ class Observation(eqx.Module):
         root_weights: (m,) the square roots of their weights, which add up to one.
         times: the times, energies, or None.
         sigma: the width of a wave kernel signature, or None.
+        shape: of the whole target.
         entries: which of the flat target's entries they are.
         signature: one of `SIGNATURES`, or a function of the eigenpairs.
         loss: one of `LOSSES`, or a function of predicted and target (m,) to residuals (m,).
@@ -43,6 +44,7 @@ class Observation(eqx.Module):
     root_weights: Float[Array, " m"]
     times: Float[Array, " n_times"] | None
     sigma: Float[Array, ""] | None
+    shape: tuple[int, ...] = eqx.field(static=True)
     entries: StaticArray = eqx.field(static=True)
     signature: str | Signature = eqx.field(static=True)
     loss: str | Loss = eqx.field(static=True)
@@ -57,7 +59,7 @@ class Observation(eqx.Module):
             return wks(pairs, self.times, self.sigma)
         if self.signature == "heat-trace":
             return heat_trace(pairs, self.times)
-        return pairs.eigenvalues
+        return pairs.eigenvalues[: self.shape[0]]  # there may be spare ones
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
         """Return the residuals, half of whose sum of squares is the misfit."""
@@ -121,6 +123,7 @@ def observe(
         root_weights=jnp.asarray(np.sqrt(share / share.sum()), dtype),
         times=times,
         sigma=sigma if signature == "wks" else None,
+        shape=values.shape,
         entries=StaticArray(entries),
         signature=signature,
         loss=loss,

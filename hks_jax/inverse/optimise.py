@@ -17,8 +17,6 @@ from hks_jax.inverse.unknowns import Values
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 _REJECTIONS = 12
 """Rejected steps in a row after which a fit counts as stalled."""
-_MOROZOV = 1.05
-"""How near to the misfit that noise explains is near enough: the last per cents would fit the noise."""
 
 
 def _residuals(values: Values, problem: Problem) -> tuple[Array, tuple[Array, Array]]:
@@ -108,7 +106,7 @@ def optimise(
                 best, least = values, record.loss
             size = getattr(getattr(state, "search_state", None), "step_size", 1.0)
             report(record, values, float(size))
-            if noise is not None and record.misfit <= _MOROZOV * noise**2 / 2:
+            if noise is not None and record.misfit <= noise**2 / 2:
                 return best, "noise level reached"
             if not bool(fine):
                 return best, "not finite"
