@@ -119,6 +119,16 @@ def test_eigenvalues_alone():
     np.testing.assert_allclose(fit.hks, target, rtol=1e-3, atol=1e-9)
 
 
+def test_a_wave_kernel_signature():
+    pairs = hj.eigenpairs(CONFORMAL, K)
+    energies, sigma = hj.default_energies(pairs, 30)
+    target = hj.wks(pairs, energies, sigma)
+    fit = hj.fit_metric(target, energies, FLAT, "conformal", signature="wks", sigma=sigma, k=K, max_steps=8)
+    assert fit.loss < 1e-3 * fit.history[0].loss
+    with pytest.raises(ValueError, match=r"times: got energies up to 9, which take about \d+ eigenpairs; with 196"):
+        hj.fit_metric(target, np.linspace(3, 9, 30), FLAT, "conformal", signature="wks", sigma=sigma)
+
+
 def test_unobserved_entries_may_be_nan_and_do_not_count(rng):
     target = signature(CONFORMAL).copy()
     weights = (rng.uniform(size=(N, N)) > 0.3).astype(float)

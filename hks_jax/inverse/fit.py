@@ -23,7 +23,7 @@ from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Loss, Observation, Signature, observe
 from hks_jax.inverse.optimise import Optimiser, loss_of, optimise
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
-from hks_jax.inverse.problem import Problem, fit_solver, pairs_for
+from hks_jax.inverse.problem import Problem, fit_solver, most_pairs, pairs_below, pairs_for
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.smoothing import Euclidean, InnerProduct, smoothing
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
@@ -233,12 +233,17 @@ def _pairs(observation: Observation, k: int | None, shape: tuple[int, ...], volu
     if observation.signature == "wks":
         assert observation.sigma is not None
         reach = float(jnp.max(observation.times) + 2 * observation.sigma)
-        times = [7 / math.exp(reach)]
+        wanted = pairs_below(math.exp(reach), volume, space.dimension)
+        if k is None and wanted > most_pairs(space.n_dof):
+            raise ValueError(
+                f"times: got energies up to {float(jnp.max(observation.times)):.4g}, which take about {wanted} "
+                f"eigenpairs; with {space.n_dof} unknowns {most_pairs(space.n_dof)} can be fitted. Use lower energies"
+            )
     else:
         # Only the times that are observed in this stage.
         per_time = math.prod(shape[1:])
         times = np.asarray(observation.times)[np.unique(observation.entries.value // per_time)]
-    wanted = pairs_for(times, volume, space.dimension, space.n_dof)
+        wanted = pairs_for(times, volume, space.dimension, space.n_dof)
     return wanted if k is None else k
 
 

@@ -66,25 +66,33 @@ def fit_solver(n_dof: int, k: int, pencil: Pencil | MirrorPencil) -> str | Eigen
     return "shift-invert"
 
 
+def pairs_below(eigenvalue: float, volume: float, dimension: int) -> int:
+    """Return about how many eigenvalues lie below one, by Weyl's law, and some more."""
+    constant = 4 * math.pi if dimension == 2 else 6 * math.pi**2
+    return math.ceil(1.1 * volume / constant * eigenvalue ** (dimension / 2)) + 4
+
+
+def most_pairs(n_dof: int) -> int:
+    """Return how many eigenpairs of a grid are near enough to those of the manifold to be fitted."""
+    return max(n_dof // 4, min(n_dof, 20))
+
+
 def pairs_for(times: Any, volume: float, dimension: int, n_dof: int) -> int:
-    """Return how many eigenpairs resolve the smallest time, by Weyl's law.
+    """Return how many eigenpairs resolve the smallest time.
 
     Raises:
         ValueError: more than the grid has.
     """
-    smallest = float(np.min(np.asarray(times)))
-    cap = max(n_dof // 4, min(n_dof, 20))
-    constant = 4 * math.pi if dimension == 2 else 6 * math.pi**2
-    # Of the heat trace exp(−Λt) lies beyond Λ in 2D, and a little more in 3D.
-    power = dimension / 2
+    smallest, most = float(np.min(np.asarray(times))), most_pairs(n_dof)
 
     def count(tail: float) -> int:
-        return math.ceil(1.1 * volume / constant * (-math.log(tail) / smallest) ** power) + 4
+        # Of the heat trace exp(−Λt) lies beyond Λ in 2D, and a little more in 3D.
+        return pairs_below(-math.log(tail) / smallest, volume, dimension)
 
-    if count(_LOST) > cap:
-        least = -math.log(_LOST) * (1.1 * volume / constant / max(cap - 4, 1)) ** (1 / power)
+    if count(_LOST) > most:
+        least = smallest * (count(_LOST) / most) ** (2 / dimension)
         raise ValueError(
             f"times: got {smallest:.4g}, which takes about {count(_LOST)} eigenpairs to resolve to {_LOST:.0%}; with "
-            f"{n_dof} unknowns {cap} can be fitted. Use times from about {least:.3g}, or a finer grid"
+            f"{n_dof} unknowns {most} can be fitted. Use times from about {least:.3g}, or a finer grid"
         )
-    return min(count(_TAIL), cap)
+    return min(count(_TAIL), most)

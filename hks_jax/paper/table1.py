@@ -91,9 +91,9 @@ def interpolate_periodic(values: Float[np.ndarray, "n n"], factor: int) -> Float
     return values
 
 
-def computed_reference() -> Float[np.ndarray, "400 400"]:
+def computed_reference(k: int = REFERENCE_PAIRS) -> Float[np.ndarray, "400 400"]:
     """Compute the HKS of the triangulated surface at the nodes of the 400² grid: minutes."""
-    (values,) = signature(bumpy_torus_mesh(REFERENCE_SIZE), [TIME], REFERENCE_PAIRS)
+    (values,) = signature(bumpy_torus_mesh(REFERENCE_SIZE), [TIME], k)
     return values.reshape(REFERENCE_SIZE, REFERENCE_SIZE)
 
 
