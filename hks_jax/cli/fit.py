@@ -285,8 +285,7 @@ def _report(args: argparse.Namespace, fit: "MetricFit", target: Target) -> dict[
         "explanation": RESULTS[fit.result],
         "loss": fit.loss,
         "misfit": fit.misfit,
-        # Step 0 of a stage, or of a fit resumed, changes nothing.
-        "steps": sum(step.step > 0 for step in fit.history),
+        "steps": fit.steps,
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
         "parametrisation": args.parametrisation,

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.atomic import atomic_folder
 from hks_jax.cli.job import Result
 from hks_jax.cli.progress import Progress
-from hks_jax.io.atomic import atomic_folder
 from hks_jax.io.save import save
 
 

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 from threadpoolctl import threadpool_limits
@@ -22,8 +23,9 @@ _BLOCK = 16
 """Columns solved at once: enough for fast products, few enough for the cache."""
 _FACTORISATION = 100
 """What one factorisation costs, in solves of one column."""
-_MAX_ITERATIONS = 200
-_SINGULAR = 1e-8
+_MOST_GROUPS = 16
+MAX_ITERATIONS = 200
+SINGULAR = 1e-8
 """The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
 
 
@@ -107,14 +109,14 @@ def _conjugate_gradients(
     r = np.ascontiguousarray(b)
     p = z = precondition(r)
     first = energy = np.einsum("nb,nb->b", r, z)
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         if left.size == 0:
             break
         m_p = M @ p
         a_p = K @ p - m_p * eigenvalues[left]
         curvature = np.einsum("nb,nb->b", p, a_p)
         # Where it nearly vanishes, an eigenvalue equal to λᵢ is left on the complement: there is no solution.
-        regular = curvature > _SINGULAR * beyond * np.einsum("nb,nb->b", p, m_p)
+        regular = curvature > SINGULAR * beyond * np.einsum("nb,nb->b", p, m_p)
         length = energy / np.where(regular, curvature, np.inf)
         x[:, left] += length * p
         r = r - length * a_p
@@ -135,10 +137,7 @@ def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: fl
     """
     if active.size == 0:
         return []
-    distance = beyond - values[active]
-    ratio = max(distance.max() / distance.min(), 1 + 1e-12)
-    count = best_count(ratio, active.size, tolerance)
-    number = np.minimum((np.log(distance.max() / distance) / np.log(ratio) * count).astype(int), count - 1)
+    number = group_numbers(beyond - values[active], active.size, tolerance)
     groups = []
     for i in np.unique(number):
         rows = active[number == i]
@@ -147,17 +146,22 @@ def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: fl
     return groups
 
 
-def best_count(ratio: float, rows: int, tolerance: float) -> int:
-    """Return how many groups to make of rows whose distances from Λ differ by up to the given ratio.
+def group_numbers(
+    distance: Float[np.ndarray, " m"], rows: int, tolerance: float, most: int = _MOST_GROUPS
+) -> Int[np.ndarray, " m"]:
+    """Return the group of each distance from Λ, of at most so many groups in geometric progression.
 
-    With s groups in geometric progression the condition is ratio^(1/2s); s weighs factorisations against steps.
+    With s groups of distances that differ by up to a ratio ρ the condition is ρ^(1/2s); s weighs factorisations against
+    the steps for all rows.
     """
+    ratio = max(distance.max() / distance.min(), 1 + 1e-12)
 
     def cost(s: int) -> float:
         root = ratio ** (1 / (4 * s))
         return s * _FACTORISATION + rows * np.log(2 / tolerance) / np.log((root + 1) / (root - 1))
 
-    return min(range(1, 17), key=cost)
+    count = min(min(range(1, _MOST_GROUPS + 1), key=cost), most)
+    return np.minimum((np.log(distance.max() / distance) / np.log(ratio) * count).astype(int), count - 1)
 
 
 def _between(values: np.ndarray, target: float) -> float:

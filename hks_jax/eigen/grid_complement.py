@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.eigen.complement import best_count
+from hks_jax.eigen.complement import MAX_ITERATIONS, SINGULAR, group_numbers
 from hks_jax.eigen.dissection import Dissection, dissect
 from hks_jax.eigen.multifrontal import Factorisation, factorise
 from hks_jax.eigen.products import combine, inner_products
@@ -26,9 +26,6 @@ _BLOCK = 32
 """Rows solved at once."""
 _MEMORY = 5e8
 """Bytes that factorisations may take together."""
-_MAX_ITERATIONS = 200
-_SINGULAR = 1e-8
-"""The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
 
 
 class _Iteration(NamedTuple):
@@ -133,7 +130,7 @@ def _conjugate_gradients(
     """Solve (K − λᵢM) xᵢ = rhsᵢ for a block of rows; NaN where the error asked for is not reached."""
 
     def going_on(state: _Iteration) -> Bool[Array, ""]:
-        return jnp.any(state.going) & (state.steps < _MAX_ITERATIONS)
+        return jnp.any(state.going) & (state.steps < MAX_ITERATIONS)
 
     def step(state: _Iteration) -> _Iteration:
         x, r, p, energy, errors, going, steps = state
@@ -141,7 +138,7 @@ def _conjugate_gradients(
         product = pencil.stiffness.apply(p) - shifts[:, None] * image
         curvature = jnp.sum(p * product, axis=1)
         # Where it nearly vanishes, an eigenvalue equal to λᵢ is left on the complement: there is no solution.
-        regular = curvature > _SINGULAR * beyond * jnp.sum(p * image, axis=1)
+        regular = curvature > SINGULAR * beyond * jnp.sum(p * image, axis=1)
         length = jnp.where(going & regular, energy / jnp.where(regular, curvature, 1), 0)[:, None]
         x, r = x + length * p, r - length * product
         z = precondition(r)
@@ -169,11 +166,9 @@ def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance
     start = np.arange(0, k, _BLOCK)
     end = np.minimum(start + _BLOCK, k)
     distance = values.size + 1 - (start + end - 1) / 2
-    ratio = max(distance[0] / distance[-1], 1 + 1e-12)
     entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
     room = max(int(_MEMORY / (entries * values.dtype.itemsize)), 1)
-    count = min(best_count(ratio, k, tolerance), room)
-    number = np.minimum((np.log(distance[0] / distance) / np.log(ratio) * count).astype(int), count - 1)
+    number = group_numbers(distance, k, tolerance, room)
     _, first, of_block = np.unique(number, return_index=True, return_inverse=True)
     return _Groups(of_block, start[first], np.append(start[first[1:]], k) - 1)
 

@@ -4,12 +4,12 @@ import dataclasses
 import hashlib
 import os
 import zipfile
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from hks_jax.atomic import atomic_path
 from hks_jax.inverse.metric_fit import Step
 
 
@@ -45,13 +45,9 @@ def fingerprint(*parts: Any) -> str:
 
 def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> None:
     """Write a checkpoint."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.part")
     rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], np.float64)
-    with open(temporary, "wb") as file:
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, mark=mark, **(checkpoint._asdict() | {"history": rows, "losses": np.array(checkpoint.losses)}))
-    os.replace(temporary, target)
 
 
 def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:

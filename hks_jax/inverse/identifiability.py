@@ -5,10 +5,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.inverse.metric_fit import MetricFit
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
@@ -117,17 +115,6 @@ def identifiability(
         noise,
         prior,
     )
-
-
-def on_grid(field: TensorField, problem: Problem, nodal: Any) -> np.ndarray:
-    """Put values at the nodes of the domain, such as a resolution, on the grid; NaN elsewhere."""
-    grid = field.grid
-    full = np.full(grid.size, np.nan)
-    nodes = getattr(problem.unknowns, "nodes", None)
-    if nodes is None:
-        raise ValueError("problem: the parameters of a function do not belong to nodes")
-    full[nodes.value] = np.asarray(nodal)
-    return full.reshape(grid.shape)
 
 
 def _information(problem: Problem, values: Values) -> Any:

@@ -82,6 +82,7 @@ class MetricFit:
     @property
     def steps(self) -> int:
         """How many steps were computed, over all stages and starts."""
+        # Step 0 of a stage, or of a fit resumed, changes nothing.
         return sum(step.step > 0 for step in self.history)
 
     @property

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.block_lanczos import BlockLanczos
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
@@ -44,14 +45,17 @@ class Problem(eqx.Module):
     solver: str | Eigensolver = eqx.field(static=True)
 
     def pairs(self, values: Values) -> Eigenpairs:
-        """Return the eigenpairs of the field."""
+        """Return the eigenpairs of the field that the values stand for."""
+        return self._pairs_of(self.unknowns.field(values))
+
+    def _pairs_of(self, field: TensorField) -> Eigenpairs:
         # Of a multiplet that k cuts, the derivative exists only with all of its copies, or none.
-        return eigenpairs(self.unknowns.field(values), self.k, self.boundary, self.solver, multiplet="complete")
+        return eigenpairs(field, self.k, self.boundary, self.solver, multiplet="complete")
 
     def residuals(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"]]:
         """Return the residuals of the data and those of the penalties: half the sum of squares is the loss."""
         field = self.unknowns.field(values)
-        data = self.observation.residuals(self.pairs(values))
+        data = self.observation.residuals(self._pairs_of(field))
         penalties = [each.residuals(self.unknowns, values, field) for each in self.regularisers]
         return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties])
 

@@ -1,7 +1,7 @@
 """Files: tensor volumes, masks and results in NIfTI and npz; tensors fitted to diffusion-weighted images."""
 
-from hks_jax.io.atomic import atomic_folder as atomic_folder
-from hks_jax.io.atomic import atomic_path as atomic_path
+from hks_jax.atomic import atomic_folder as atomic_folder
+from hks_jax.atomic import atomic_path as atomic_path
 from hks_jax.io.dwi import ExampleBrain as ExampleBrain
 from hks_jax.io.dwi import find_example_brain as find_example_brain
 from hks_jax.io.dwi import fit_dwi as fit_dwi

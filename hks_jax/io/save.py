@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.atomic import atomic_path
 from hks_jax.io import nifti
-from hks_jax.io.atomic import atomic_path
 from hks_jax.io.tensor_order import pack
 from hks_jax.io.volume import TensorVolume
 

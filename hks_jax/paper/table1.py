@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.atomic import atomic_path
 from hks_jax.domain.examples import bumpy_torus_field, bumpy_torus_mesh
-from hks_jax.io.atomic import atomic_path
 from hks_jax.paper.signature import signature
 
 TIME = 1.0
