@@ -36,7 +36,7 @@ lint: $(STAMPS)/lint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-notebooks: $(STAMPS)/dti
+notebooks: $(STAMPS)/dti $(STAMPS)/brain
 	@set -e; for notebook in notebooks/*.py; do \
 	    test -e "$$notebook" || { echo "no notebooks"; break; }; \
 	    echo "$$notebook"; MPLBACKEND=Agg $(BIN)/python "$$notebook"; \
@@ -59,7 +59,7 @@ $(STAMPS)/dti $(STAMPS)/test $(STAMPS)/lint: $(STAMPS)/%: pyproject.toml $(STAMP
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$*]"
 	@touch $@
 
-# A brain to show, and no dependency: the demo runs on a phantom where it cannot be had. It is tried again next time.
+# A brain to show, and no dependency: a phantom takes its place where it cannot be had. It is tried again next time.
 $(STAMPS)/brain: $(STAMPS)/venv
 	@if $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 1 --no-deps "$(BRAIN)"; then touch $@; \
-	else echo "note: $(BRAIN), which carries the example brain, could not be installed; the demo uses a phantom" >&2; fi
+	else echo "note: $(BRAIN), which carries the example brain, could not be installed; a phantom takes its place" >&2; fi
