@@ -85,7 +85,7 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
     if shape[3:] not in ((6,), (1, 6)):
         raise ValueError(
             f"{name}: got an image of shape {shape}; expected six components per voxel, (nx, ny, nz, 1, 6) or "
-            "(nx, ny, nz, 6). Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi"
+            "(nx, ny, nz, 6). Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi, or --bval and --bvec"
         )
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     if order is None and not declared:

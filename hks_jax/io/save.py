@@ -39,7 +39,8 @@ def save(
     ``.npz``: the arrays `name` (the values), ``spacing``, ``origin``, ``mask`` and ``affine`` (where there are any),
     ``slice_axis`` (for a slice), and those in `extra`.
 
-    A mesh's ``.vtu``, ``.vtk``, ``.ply``: the mesh, and one array per time, which is in its name. Its ``.npz``: `name`, ``vertices``, ``faces``, and those in `extra`.
+    A mesh's ``.vtu``, ``.vtk``, ``.ply``: the mesh, and one array per time, which is in its name. Its ``.npz``: `name`,
+    ``vertices``, ``faces``, and those in `extra`.
 
     Every file says where it came from, in JSON: the version, the tensors' file with its SHA-256, order and frame, what
     was decided in reading it, and `provenance`. It is the comment extension of NIfTI; ``provenance`` in the others; for

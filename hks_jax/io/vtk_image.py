@@ -22,6 +22,13 @@ def is_vtk_image(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
+def holds_structured_points(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a legacy .vtk file holds an image, and not a mesh."""
+    with open(path, "rb") as stream:
+        head = stream.read(1024)
+    return head.startswith(b"# vtk DataFile") and b"STRUCTURED_POINTS" in head.upper()
+
+
 def require_vtk() -> None:
     """Raise ImportError, and say what to install, where VTK is missing."""
     try:
@@ -53,7 +60,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     remember.CallDataType = "string0"  # type: ignore[attr-defined]
     reader: Any = vtkXMLImageDataReader() if xml else vtkStructuredPointsReader()
     # VTK prints what its parts find wrong; what they would stumble over is looked at first.
-    if _whole_xml(name) and reader.CanReadFile(name) if xml else _holds_structured_points(name):
+    if _whole_xml(name) and reader.CanReadFile(name) if xml else holds_structured_points(name):
         for event in ("ErrorEvent", "WarningEvent"):
             reader.AddObserver(event, remember)
         reader.SetFileName(name)
@@ -187,12 +194,6 @@ def _whole_xml(name: str) -> bool:
     with open(name, "rb") as stream:
         stream.seek(max(0, os.path.getsize(name) - 64))
         return b"</VTKFile>" in stream.read()
-
-
-def _holds_structured_points(name: str) -> bool:
-    with open(name, "rb") as stream:
-        head = stream.read(1024)
-    return head.startswith(b"# vtk DataFile") and b"STRUCTURED_POINTS" in head.upper()
 
 
 def _long_enough(name: str, image: Any) -> bool:
