@@ -13,7 +13,7 @@ from hks_jax.cli.reading import add_arguments, read
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.provenance import digest
-from hks_jax.io.vtk_image import holds_structured_points
+from hks_jax.io.vtk_image import holds_dataset
 
 EPILOG = """\
 examples:
@@ -142,7 +142,7 @@ def _times(d: int, volume: float, width2: float, size: float, nodes: int) -> dic
 
 def _is_mesh(path: Path) -> bool:
     suffix = path.suffix.lower()
-    return suffix in MESHES and (suffix != ".vtk" or (path.is_file() and not holds_structured_points(path)))
+    return suffix in MESHES and (suffix != ".vtk" or (path.is_file() and not holds_dataset(path, "STRUCTURED_POINTS")))
 
 
 def _lines(found: dict[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Triangle meshes through meshio, which is optional."""
+"""Triangle meshes through meshio, and VTK's polygonal data, which meshio leaves out, through VTK; both are optional."""
 
 import json
 import os
@@ -12,8 +12,9 @@ from jaxtyping import Float, Int
 from hks_jax.atomic import atomic_path
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.io.nifti import existing
+from hks_jax.io.vtk_image import holds_dataset, require_vtk
 
-READ = (".vtk", ".vtu", ".ply", ".stl", ".obj", ".off")
+READ = (".vtk", ".vtu", ".vtp", ".ply", ".stl", ".obj", ".off")
 WRITTEN = (".vtu", ".vtk", ".ply")
 """The formats with room for values at the vertices."""
 
@@ -34,10 +35,11 @@ def meshio() -> ModuleType:
 
 
 def read_mesh(path: str | os.PathLike[str], *, clean: bool = False) -> SurfaceMesh:
-    """Read a triangle mesh: ``.vtk`` and ``.vtu`` (unstructured grids), ``.ply``, ``.stl``, ``.obj``, ``.off``.
+    """Read a triangle mesh: ``.vtk``, ``.vtu``, ``.ply``, ``.stl``, ``.obj``, ``.off`` through meshio.
 
-    Quadrilaterals are cut in two; vertices and triangles keep their order. STL has no vertices, only corners: those at
-    the same place become one vertex.
+    Polygonal data in ``.vtk`` and ``.vtp``, which meshio does not read, come through VTK. Quadrilaterals (there, all
+    polygons) are cut into triangles; vertices keep their order. STL has no vertices, only corners: those at the same
+    place become one vertex.
 
     Args:
         path: the file.
@@ -49,7 +51,7 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False) -> SurfaceMe
         FileNotFoundError: no such file.
         ValueError: an unknown kind of file, an unreadable one, other cells than triangles and quadrilaterals, or a mesh
             that `SurfaceMesh` refuses.
-        ImportError: meshio is missing.
+        ImportError: meshio, or for polygonal data VTK, is missing.
     """
     vertices, faces = _load(str(existing(path)))
     if clean:
@@ -79,13 +81,16 @@ def write(
 
 
 def _load(name: str) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    library = meshio()
     suffix = Path(name).suffix.lower()
     if suffix not in READ:
         raise ValueError(f"{name}: unknown kind of mesh; expected {', '.join(READ)}")
+    if suffix == ".vtp" or (suffix == ".vtk" and holds_dataset(name, "POLYDATA")):
+        return _polygonal(name)
+    library = meshio()
     try:
         # The format's own reader: meshio.read ends the process where it cannot read a file.
-        read = getattr(library, suffix[1:]).read(name)
+        with np.errstate(over="ignore"):  # of a text's letters, which it takes for a number of triangles first
+            read = getattr(library, suffix[1:]).read(name)
     except (library.ReadError, ValueError, KeyError, IndexError, AssertionError, OSError, EOFError) as error:
         raise ValueError(f"{name}: meshio cannot read it as {suffix} ({error or type(error).__name__})") from error
     points = np.asarray(read.points, np.float64)
@@ -97,6 +102,30 @@ def _load(name: str) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
         raise ValueError(f"{name}: has no triangles; expected a surface in two or three dimensions")
     flat = np.zeros((len(points), 3 - points.shape[1]))
     return np.concatenate([points, flat], axis=1), np.concatenate(faces).astype(np.int64)
+
+
+def _polygonal(name: str) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    require_vtk()
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    reader = vtkPolyDataReader() if name.lower().endswith(".vtk") else vtkXMLPolyDataReader()
+    errors: list[str] = []
+    reader.AddObserver("ErrorEvent", lambda source, event: errors.append(event))
+    reader.SetFileName(name)
+    triangles = vtkTriangleFilter()
+    triangles.PassLinesOff()
+    triangles.PassVertsOff()
+    triangles.SetInputConnection(reader.GetOutputPort())
+    triangles.Update()
+    surface = triangles.GetOutput()
+    if errors or not surface.GetNumberOfPolys():
+        raise ValueError(f"{name}: VTK finds no triangles in it; expected polygonal data, whole")
+    points = np.asarray(vtk_to_numpy(surface.GetPoints().GetData()), np.float64)
+    faces = np.asarray(vtk_to_numpy(surface.GetPolys().GetConnectivityArray()), np.int64)
+    return points, faces.reshape(-1, 3)
 
 
 def _triangles(cells: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "m 3"]:

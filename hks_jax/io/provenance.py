@@ -24,7 +24,7 @@ def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str
     if volume is not None:
         record |= {"source": volume.source, "sha256": volume.digest, "order": volume.order, "frame": volume.frame}
         record |= {"notes": list(volume.notes)}
-    return json.dumps({**record, **(more or {})}, ensure_ascii=False, default=_plain)
+    return json.dumps({**record, **(more or {})}, default=_plain)  # in ASCII, which NRRD's header needs
 
 
 def _plain(value: Any) -> Any:

@@ -1,10 +1,12 @@
 """VTK's image data (.vti, and structured points in .vtk) through VTK, which is optional."""
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Bool
@@ -22,11 +24,11 @@ def is_vtk_image(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
-def holds_structured_points(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a legacy .vtk file holds an image, and not a mesh."""
+def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
+    """Tell whether a legacy .vtk file holds a dataset of this kind, such as STRUCTURED_POINTS."""
     with open(path, "rb") as stream:
         head = stream.read(1024)
-    return head.startswith(b"# vtk DataFile") and b"STRUCTURED_POINTS" in head.upper()
+    return head.startswith(b"# vtk DataFile") and kind.encode() in head.upper()
 
 
 def require_vtk() -> None:
@@ -60,12 +62,12 @@ def load(path: str | os.PathLike[str]) -> Any:
     remember.CallDataType = "string0"  # type: ignore[attr-defined]
     reader: Any = vtkXMLImageDataReader() if xml else vtkStructuredPointsReader()
     # VTK prints what its parts find wrong; what they would stumble over is looked at first.
-    if _whole_xml(name) and reader.CanReadFile(name) if xml else holds_structured_points(name):
+    if _whole_xml(name) and reader.CanReadFile(name) if xml else holds_dataset(name, "STRUCTURED_POINTS"):
         for event in ("ErrorEvent", "WarningEvent"):
             reader.AddObserver(event, remember)
         reader.SetFileName(name)
         reader.Update()
-        if not errors and (xml or _long_enough(name, reader.GetOutput())):
+        if not errors:
             return reader.GetOutput()
     why = f" ({errors[0]})" if errors else ""
     raise ValueError(f"{name}: not readable as VTK image data (.vti, or structured points in .vtk), or incomplete{why}")
@@ -73,12 +75,14 @@ def load(path: str | os.PathLike[str]) -> Any:
 
 def read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
     """Read tensors; see `hks_jax.io.read_tensors`."""
+    image = load(name)
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    image = load(name)
     at_points = _has_candidates(image.GetPointData(), array) or not _has_candidates(image.GetCellData(), array)
     attributes = image.GetPointData() if at_points else image.GetCellData()
     chosen, declared = _tensor_array(name, attributes, array)
+    if name.lower().endswith(".vtk"):
+        _check_length(name, [chosen])
     components = np.asarray(vtk_to_numpy(chosen))
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
     if components.shape[-1] == 9:
@@ -196,14 +200,19 @@ def _whole_xml(name: str) -> bool:
         return b"</VTKFile>" in stream.read()
 
 
-def _long_enough(name: str, image: Any) -> bool:
-    """Tell whether a legacy file can hold all its values: VTK does not notice where a text ends early."""
+def _check_length(name: str, arrays: list[Any]) -> None:
+    """Raise ValueError where a legacy file ends before its values do, which VTK hardly notices."""
     content = Path(name).read_bytes()
-    values = 0
-    for attributes in (image.GetPointData(), image.GetCellData()):
-        arrays = [attributes.GetAbstractArray(i) for i in range(attributes.GetNumberOfArrays())]
-        values += sum(array.GetNumberOfTuples() * array.GetNumberOfComponents() for array in arrays)
-    return content.split(maxsplit=40)[:40].count(b"ASCII") == 0 or len(content.split()) > values
+    text = b"ASCII" in content.split(maxsplit=40)[:40]
+    for array in arrays:
+        key = re.escape(quote(array.GetName()).encode())
+        line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
+        count = array.GetNumberOfTuples() * array.GetNumberOfComponents()
+        if line is None:
+            continue  # a name that is written otherwise: nothing to measure from
+        values = content[line.end() :]
+        if len(values.split(maxsplit=count)) < count if text else len(values) < count * array.GetDataTypeSize():
+            raise ValueError(f"{name}: incomplete; it ends before the {count} values of {array.GetName()!r} do")
 
 
 def _arrays(attributes: Any) -> dict[str, Any]:
@@ -249,8 +258,10 @@ def _mask(attributes: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "nx ny nz
 
 def _as_plane(volume: TensorVolume) -> TensorVolume:
     """Return a field in a plane as one: an image one voxel thick whose tensors vanish across it."""
+    size = np.abs(volume.tensors).max()
+    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # of turning to the voxel axes
     for axis in range(3):
-        if volume.shape[axis] == 1 and not volume.tensors[..., axis, :].any() and volume.tensors.any():
+        if volume.shape[axis] == 1 and size > 0 and np.abs(volume.tensors[..., axis, :]).max() <= rounding:
             plane = volume.slice(("x", "y", "z")[axis], 0)
             affine = volume.volume_affine if volume.origin[axis] else volume.affine
             return replace(plane, affine=affine, notes=(*volume.notes, "a field in the plane: no components across it"))
