@@ -2,13 +2,16 @@
 
 import builtins
 import gzip
+import hashlib
 import importlib.metadata
+import json
 import os
 import stat
 
 import nibabel as nib
 import numpy as np
 import pytest
+from dipy.segment.mask import median_otsu
 
 import hks_jax as hj
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, atomic_path, erode, find_example_brain, read_mask
@@ -149,6 +152,34 @@ def test_npz_defaults(tmp_path):
     read = hj.io.read_tensors(tmp_path / "t.npz")
     assert (read.spacing, read.origin, read.mask, read.affine) == ((1.0, 1.0), (0.0, 0.0), None, None)
     assert read.tensors.dtype == np.float64
+
+
+@pytest.mark.parametrize(("d", "order"), [(d, order) for d in (2, 3) for order in ORDERS])
+def test_components_in_npy_and_npz(tmp_path, tensors, d, order):
+    whole = tensors if d == 3 else tensors[:, :, 0, :2, :2]
+    names = [(a, b) for a, b in ORDERS[order] if d == 3 or "z" not in (a, b)]
+    components = np.stack([whole[..., "xyz".index(a), "xyz".index(b)] for a, b in names], -1)
+    np.save(tmp_path / "t.npy", components)
+    read = hj.io.read_tensors(tmp_path / "t.npy", order, spacing=0.5)
+    np.testing.assert_array_equal(read.tensors, whole)
+    assert (read.order, read.spacing) == (order, (0.5,) * d)
+    with pytest.raises(ValueError, match="of undeclared order, and programs differ"):
+        hj.io.read_tensors(tmp_path / "t.npy")
+    np.savez(tmp_path / "t.npz", D=components, order=order, spacing=np.ones(d))
+    np.testing.assert_array_equal(hj.io.read_tensors(tmp_path / "t.npz", array="D").tensors, whole)
+    with pytest.raises(ValueError, match=r"spacing: .* has its own"):
+        hj.io.read_tensors(tmp_path / "t.npz", array="D", spacing=2.0)
+
+
+def test_frames_in_npz(tmp_path, tensors):
+    axes = rotated_affine()[:3, :3] / [1.5, 2.0, 3.25]
+    np.savez(tmp_path / "t.npz", tensors=axes @ tensors @ axes.T, affine=rotated_affine(), frame="world")
+    read = hj.io.read_tensors(tmp_path / "t.npz")
+    np.testing.assert_allclose(read.tensors, tensors, rtol=1e-9, atol=1e-15)
+    assert read.frame == "world"
+    np.save(tmp_path / "t.npy", tensors)
+    with pytest.raises(ValueError, match="no 3×3 tensors with an affine"):
+        hj.io.read_tensors(tmp_path / "t.npy", frame="world")
 
 
 @pytest.mark.parametrize(
@@ -315,6 +346,19 @@ def test_a_slice_without_affine_is_placed_by_spacing_and_origin(tmp_path):
     np.testing.assert_array_equal(image.affine @ [2, 1, 0, 1], [11.0, 22.0, 0.0, 1.0])
 
 
+def test_a_nifti_says_where_it_came_from(tmp_path, volume):
+    scan = hj.io.save_tensors(tmp_path / "t.nii.gz", volume)
+    read = hj.io.read_tensors(scan)
+    path = hj.io.save(tmp_path / "v.nii.gz", np.zeros(SHAPE), read, provenance={"settings": {"k": np.int64(7)}})
+    (extension,) = nib.load(path).header.extensions
+    record = json.loads(extension.get_content())
+    assert extension.get_code() == 6  # a comment
+    assert record["source"] == str(scan)
+    assert record["sha256"] == hashlib.sha256(scan.read_bytes()).hexdigest()
+    assert (record["order"], record["frame"], record["settings"]) == ("nifti", "voxel", {"k": 7})
+    assert record["software"] == f"hks-jax {hj.__version__}"
+
+
 def test_npz_results(tmp_path, volume):
     plane = volume.slice("z", 1)
     hj.io.save(tmp_path / "v.npz", np.ones((2, 4, 5)), plane, name="hks", extra={"times": [1.0, 2.0]})
@@ -419,6 +463,25 @@ def test_fit_recovers_the_tensors_of_a_perfect_scan(scan, volume):
     assert not fit.tensors[~volume.mask].any()
     np.testing.assert_allclose(fit.spacing, volume.spacing, rtol=1e-6)
     assert fit.notes[0] == "weighted least squares on 15 of 25 images (b ≤ 800 s/mm²)"
+
+
+def test_a_scan_without_a_mask_is_masked_by_dipy(tmp_path):
+    shape = (24, 26, 10)
+    i, j, _ = (2 * a / (n - 1) - 1 for a, n in zip(np.indices(shape), shape, strict=True))
+    brain = i**2 + j**2 < 0.6
+    directions = np.random.default_rng(0).normal(size=(13, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    b = np.array([0.0] + [1000.0] * 12)
+    exponent = b * np.einsum("na,ab,nb->n", directions, 1e-3 * np.diag([1.7, 0.6, 0.4]), directions)
+    write_components(tmp_path / "d.nii", np.where(brain[..., None], 1000 * np.exp(-exponent), 10.0), np.eye(4))
+    np.savetxt(tmp_path / "b", b[None])
+    np.savetxt(tmp_path / "g", directions.T)
+    fit = hj.io.fit_dwi(tmp_path / "d.nii", tmp_path / "b", tmp_path / "g")
+    np.testing.assert_array_equal(fit.mask, median_otsu(np.where(brain, 1000.0, 10.0))[1])
+    assert not fit.mask[~brain].any()
+    assert fit.mask.sum() > 0.5 * brain.sum()
+    assert np.linalg.eigvalsh(fit.tensors[fit.mask]).min() > 3.9e-4
+    assert fit.notes[1] == f"no mask: DIPY's median_otsu of the unweighted images keeps {fit.mask.sum()} voxels"
 
 
 def test_bad_scans(scan, volume):

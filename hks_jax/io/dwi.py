@@ -120,9 +120,10 @@ def _inside(
 ) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
     """Return the mask, given or found, and a note of how it was found."""
     if mask is None:
-        _, found = segmentation.median_otsu(unweighted.mean(axis=-1))
+        with np.errstate(invalid="ignore"):  # where its median filter leaves nothing, it divides by zero
+            _, found = segmentation.median_otsu(unweighted.mean(axis=-1))
         if not found.any():
-            raise ValueError("mask: median_otsu finds nothing in the unweighted images; pass a mask")
+            raise ValueError("mask: DIPY's median_otsu finds nothing in the unweighted images; pass a mask")
         return found.astype(bool), [
             f"no mask: DIPY's median_otsu of the unweighted images keeps {int(found.sum())} voxels"
         ]
