@@ -11,6 +11,10 @@ import stat
 import nibabel as nib
 import numpy as np
 import pytest
+from dipy.core.gradients import gradient_table
+from dipy.io.gradients import read_bvals_bvecs
+from dipy.io.utils import nifti1_symmat
+from dipy.reconst.dti import TensorModel, lower_triangular
 from dipy.segment.mask import median_otsu
 
 import hks_jax as hj
@@ -463,6 +467,32 @@ def test_fit_recovers_the_tensors_of_a_perfect_scan(scan, volume):
     assert not fit.tensors[~volume.mask].any()
     np.testing.assert_allclose(fit.spacing, volume.spacing, rtol=1e-6)
     assert fit.notes[0] == "weighted least squares on 15 of 25 images (b ≤ 800 s/mm²)"
+
+
+@pytest.mark.parametrize("flip", [1, -1])
+def test_tensors_that_dipy_fitted_and_wrote(tmp_path, flip):
+    """DIPY's tensors are along the axes of its b-vectors, FSL's here; the file declares the order only."""
+    affine = rotated_affine() @ np.diag([flip, 1, 1, 1])
+    directions = np.random.default_rng(0).normal(size=(13, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    b = np.array([0.0] + [1000.0] * 12)
+    D = 1e-3 * np.array([[1.7, 0.3, 0.2], [0.3, 0.6, 0.1], [0.2, 0.1, 0.4]])  # along FSL's axes
+    signal = np.broadcast_to(1000 * np.exp(-b * np.einsum("na,ab,nb->n", directions, D, directions)), (3, 4, 5, 13))
+    write_components(tmp_path / "d.nii.gz", signal.copy(), affine)
+    np.savetxt(tmp_path / "b", b[None])
+    np.savetxt(tmp_path / "g", directions.T)
+    table = gradient_table(b, bvecs=read_bvals_bvecs(str(tmp_path / "b"), str(tmp_path / "g"))[1])
+    theirs = TensorModel(table).fit(signal)
+    nib.save(nifti1_symmat(lower_triangular(theirs.quadratic_form), affine), tmp_path / "t.nii.gz")
+
+    read = hj.io.read_tensors(tmp_path / "t.nii.gz", frame="fsl")
+    ours = hj.io.fit_dwi(tmp_path / "d.nii.gz", tmp_path / "b", tmp_path / "g", np.ones((3, 4, 5), bool))
+    np.testing.assert_allclose(read.tensors, ours.tensors, rtol=1e-6, atol=1e-12)
+    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
+    sign = np.diag([-1.0 if np.linalg.det(affine) > 0 else 1.0, 1, 1])
+    np.testing.assert_allclose(axes @ read.tensors[0, 0, 0] @ axes.T, axes @ sign @ D @ sign @ axes.T, rtol=1e-4)
+    note = 'pass frame "fsl"'
+    assert any(note in text for text in hj.io.read_tensors(tmp_path / "t.nii.gz").notes) == (np.linalg.det(affine) > 0)
 
 
 def test_a_scan_without_a_mask_is_masked_by_dipy(tmp_path):

@@ -93,7 +93,7 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
             f"{name}: six components, but the file does not declare their order (its NIfTI intent is not "
             f"symmetric-matrix), and programs differ. Pass order: one of {choices()}"
         )
-    notes = []
+    notes, open_frame = [], order is None and frame is None
     if order is None:
         order = "nifti"
     elif declared and order != "nifti":
@@ -110,6 +110,11 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
     header = np.asarray(image.header.get_zooms()[:3], np.float64)
     if np.abs(header / spacing - 1).max() > 1e-3:
         notes.append(f"voxel sizes {_sizes(spacing)} are those of the affine; the header's own are {_sizes(header)}")
+    if open_frame and np.linalg.det(affine[:3, :3]) > 0:
+        notes.append(
+            "NIfTI does not declare the axes of its tensors: taken for those of the voxels; if they were fitted with "
+            'FSL\'s b-vectors as they are, as DIPY does, pass frame "fsl"'
+        )
     notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
     return TensorVolume(
         to_voxel_axes(tensors, frame, affine),
