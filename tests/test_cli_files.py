@@ -1,6 +1,7 @@
 """The command line on files: what is in them, other formats, and scans to signatures."""
 
 import json
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
@@ -8,6 +9,10 @@ import pytest
 
 import hks_jax as hj
 from hks_jax.cli import main
+from hks_jax.cli.job import Result
+from hks_jax.cli.outputs import write_outputs
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12, 5)
@@ -28,12 +33,15 @@ def tensors(tmp_path):
 
 @pytest.fixture
 def scan(tmp_path):
-    """A noise-free scan of the tensor D in the disc."""
+    """A noise-free scan of the tensor D in the disc, but for one voxel that no diffusion explains."""
     directions = np.random.default_rng(0).normal(size=(13, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     b = np.array([0.0] + [1000.0] * 12)
     signal = 1000 * np.exp(-b * np.einsum("na,ab,nb->n", directions, D, directions))
-    nib.save(nib.Nifti1Image(np.where(disc()[..., None], signal, 5.0), AFFINE), tmp_path / "d.nii.gz")
+    images = np.where(disc()[..., None], signal, 5.0)
+    impossible = np.diag([-5e-4, 8e-4, 8e-4])
+    images[7, 6, 3] = 1000 * np.exp(-b * np.einsum("na,ab,nb->n", directions, impossible, directions))
+    nib.save(nib.Nifti1Image(images, AFFINE), tmp_path / "d.nii.gz")
     nib.save(nib.Nifti1Image(disc().astype(np.uint8), AFFINE), tmp_path / "m.nii.gz")
     np.savetxt(tmp_path / "b", b[None])
     np.savetxt(tmp_path / "g", (directions * [-1 if np.linalg.det(AFFINE) > 0 else 1, 1, 1]).T)
@@ -52,11 +60,18 @@ def error_of(capsys, arguments):
 def test_a_scan_to_pictures_by_one_command(scan, tmp_path):
     out, mask = tmp_path / "out", str(tmp_path / "m.nii.gz")
     arguments = ["--mask", mask, "--slice", "z=3", "--metric", "inverse", "-k", "10", "--times", "2e4", "4e4"]
+    arguments += ["--repair", "nearest:1e-6"]
     assert main(["hks", *scan, "-o", str(out), "-q", *arguments]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["hks.nii.gz", "hks.npz", "hks.png", "report.json"]
     report = json.loads((out / "report.json").read_text())
     assert report["input"]["order"] == "fit"
     assert report["input"]["notes"][0] == "weighted least squares on 13 of 13 images (b ≤ 1000 s/mm²)"
+    repair = report["input"]["repair"]
+    assert (repair["method"], repair["voxels"], repair["first"]) == ("nearest", 1, [[7, 6]])
+    assert (
+        report["input"]["notes"][1]
+        == f"1 of {disc().sum()} fits are not positive definite; DIPY clips their eigenvalues"
+    )
     grid = hj.Grid(SHAPE[:2], 2.0, mask=disc()[..., 0])
     field = hj.TensorField.from_diffusion(grid, np.broadcast_to(D[:2, :2], (*SHAPE[:2], 2, 2)), "inverse")
     expected = hj.hks(hj.eigenpairs(field, 10), [2e4, 4e4])
@@ -101,18 +116,21 @@ def test_info_of_tensors(tensors, tmp_path, capsys):
         assert words in text
 
 
-def test_the_times_that_info_names_are_those_of_the_computation(tmp_path, capsys):
-    """Against the spectrum: k pairs resolve what is said, up to Weyl's law's boundary term."""
-    metric = np.broadcast_to(np.diag([2.0, 0.5]), (18, 24, 2, 2))
+def test_the_times_that_info_names_are_those_of_the_spectrum(tmp_path, capsys):
+    """Against the eigenvalues of a flat rectangle, π²(i²/a² + j²/b²); Weyl's law leaves out a boundary term."""
+    metric = np.broadcast_to(np.diag([2.0, 0.5]), (60, 80, 2, 2))
     np.savez(tmp_path / "t.npz", tensors=metric, spacing=[0.1, 0.2])
     assert main(["info", str(tmp_path / "t.npz"), "--json"]) == 0
     suits = json.loads(capsys.readouterr().out)["suits"]["tensor"]
-    grid = hj.Grid((18, 24), (0.1, 0.2))
-    pairs = hj.eigenpairs(hj.TensorField(grid, metric), suits["k"], solver="dense")
-    estimate = hj.truncation(pairs, np.array([suits["least_time"]]))
-    assert float(estimate.smallest_time) == pytest.approx(suits["least_time_of_k"], rel=0.25)
-    assert float(estimate.resolution_bias[0]) == pytest.approx(0.01, rel=0.3)
-    assert float(4 * np.log(10) / pairs.eigenvalues[1]) == pytest.approx(suits["largest_time"], rel=0.1)
+    a, b = 59 * 0.1 * np.sqrt(2), 79 * 0.2 * np.sqrt(0.5)
+    i, j = np.indices((100, 100))
+    eigenvalues = np.sort((np.pi**2 * ((i / a) ** 2 + (j / b) ** 2)).ravel())
+    assert suits["k"] == 200
+    assert suits["least_time_of_k"] == pytest.approx(4.6 / eigenvalues[200], rel=0.2)  # where the tail is 1 %
+    assert suits["largest_time"] == pytest.approx(4 * np.log(10) / eigenvalues[1], rel=0.1)
+    assert suits["least_time"] == pytest.approx(6 * max(2 * 0.1**2, 0.5 * 0.2**2))
+    needed = np.searchsorted(eigenvalues, 4.6 / suits["least_time"])
+    assert suits["k_for_least_time"] == pytest.approx(needed, rel=0.2)
 
 
 def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
@@ -181,7 +199,10 @@ def test_convert_orders_masks_and_repairs(tmp_path, capsys):
 
 def test_convert_fits_scans_and_refuses_what_cannot_be(scan, tmp_path, capsys):
     target = tmp_path / "t.npz"
-    assert main(["convert", *scan, str(target), "--mask", str(tmp_path / "m.nii.gz"), "-q"]) == 0
+    assert (
+        main(["convert", *scan, str(target), "--mask", str(tmp_path / "m.nii.gz"), "--repair", "nearest:1e-6", "-q"])
+        == 0
+    )
     np.testing.assert_allclose(
         read_tensors(target).tensors[disc()], np.broadcast_to(D, (disc().sum(), 3, 3)), rtol=1e-4, atol=1e-12
     )
@@ -191,6 +212,35 @@ def test_convert_fits_scans_and_refuses_what_cannot_be(scan, tmp_path, capsys):
     arguments = ["convert", str(target), str(tmp_path / "s.nii.gz"), "--slice", "z=1"]
     assert "NIfTI has no 2×2 tensors" in error_of(capsys, arguments)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_numpy_files_and_unsymmetric_matrices(tmp_path, capsys):
+    field = np.broadcast_to(D, (*SHAPE, 3, 3)).copy()
+    field[1, 2, 3, 0, 1] = 0
+    np.save(tmp_path / "t.npy", field)
+    assert main(["info", str(tmp_path / "t.npy"), "--spacing", "1", "2", "3"]) == 0
+    text = capsys.readouterr().out
+    assert "spacing         1 × 2 × 3" in text
+    assert "1 tensors are not symmetric" in text
+    error = error_of(capsys, ["convert", str(tmp_path / "t.npy"), str(tmp_path / "t.nii.gz")])
+    assert "1 tensors are unsymmetric, and this format keeps one half of them only" in error
+
+
+@pytest.mark.parametrize(("library", "suffix"), [("nrrd", ".nrrd"), ("vtkmodules", ".vti"), ("nibabel", ".nii.gz")])
+def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library, suffix):
+    pytest.importorskip(library)
+    volume = read_tensors(tensors)
+    assert image_suffix(tmp_path / f"t{suffix}") == suffix
+    report = {"settings": {"k": 3, "metric": "inverse"}}
+    result = Result(volume, np.array([1.0, 2.0]), np.ones((2, *SHAPE)), np.arange(3.0), report)
+    out = tmp_path / "out"
+    write_outputs(out, result, Progress(quiet=True), Path.touch, suffix, ["hks-jax", "hks"])
+    assert sorted(file.name for file in out.iterdir()) == sorted([f"hks{suffix}", "hks.npz", "hks.png", "report.json"])
+    assert b"hks-jax " in (out / f"hks{suffix}").read_bytes() or suffix != ".nrrd"  # headers are text
+    with np.load(out / "hks.npz") as read:
+        record = json.loads(str(read["provenance"]))
+    assert (record["command"], record["settings"], record["times"]) == (["hks-jax", "hks"], report["settings"], [1, 2])
+    assert record["source"] == str(tensors)
 
 
 def test_help(capsys):

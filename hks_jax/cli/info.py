@@ -13,6 +13,7 @@ from hks_jax.cli.reading import add_arguments, read
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.provenance import digest
+from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.vtk_image import holds_dataset
 
 EPILOG = """\
@@ -78,6 +79,7 @@ def describe(path: Path, volume: TensorVolume) -> dict[str, Any]:
         "components": count,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
         "not_positive_definite": int(bad.sum()),
+        "not_symmetric": int(find_unsymmetric(volume).sum()),
     }
     if good.any():
         tensors = volume.tensors[good].astype(np.float64)
@@ -172,6 +174,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
             f"components      {found['components']} ({sizes} nodes)",
             f"invalid         {bad} tensors are not positive definite" + (": see --repair" if bad else ""),
         ]
+        if found["not_symmetric"]:
+            lines.append(f"                {found['not_symmetric']} tensors are not symmetric")
     if "eigenvalues" in found:
         e = found["eigenvalues"]
         lines += [
@@ -180,8 +184,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         ]
     for name, s in found.get("suits", {}).items():
         lines += [
-            f"metric {name:<8} t = {s['least_time']:.3g} (what the spacing resolves to 1 %; takes k ≈ "
-            f"{s['k_for_least_time']}) … {s['largest_time']:.3g} (all of the domain); k = {s['k']} is for t ≥ "
-            f"{s['least_time_of_k']:.3g}"
+            f"metric {name:<8} t ≥ {s['least_time']:.3g} by the spacing (to 1 %; takes k ≈ {s['k_for_least_time']}); "
+            f"t ≥ {s['least_time_of_k']:.3g} by k = {s['k']}; t ≤ {s['largest_time']:.3g} by the size"
         ]
     return lines

@@ -137,7 +137,7 @@ def _triangles(cells: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "m 3"]:
 def _cleaned(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     faces = first[inverse.ravel()[faces]]
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

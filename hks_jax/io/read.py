@@ -88,7 +88,8 @@ def read_tensors(
         volume = arrays.read_tensors(name, order, frame, array, spacing)
     else:
         raise ValueError(f"{name}: unknown kind of file; expected {', '.join(SUFFIXES)}")
-    volume = replace(volume, digest=digest(name))
+    if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
+        volume = replace(volume, digest=digest(name))
     if mask is not None:
         inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, volume.affine)
         if inside.shape != volume.shape:

@@ -34,6 +34,13 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
     return bad
 
 
+def find_unsymmetric(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
+    """Mark the voxels inside whose matrix is unsymmetric beyond rounding, as `hks_jax.TensorField` refuses them."""
+    scale = np.abs(volume.tensors).max(axis=(-2, -1))
+    skew = np.abs(volume.tensors - np.swapaxes(volume.tensors, -1, -2)).max(axis=(-2, -1))
+    return volume.inside & (skew > 1e-5 * scale)
+
+
 def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
     """Raise ValueError where tensors inside are not positive definite: how many, where the first is, the choices."""
     bad = find_invalid(volume)

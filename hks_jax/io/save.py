@@ -12,6 +12,7 @@ from hks_jax.atomic import atomic_path
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.io import mesh, nifti, nrrd, vtk_image
 from hks_jax.io.provenance import describe
+from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.volume import TensorVolume
 
 SUFFIXES = (".npz", ".nii.gz", ".nii", ".nrrd", ".vti")
@@ -108,10 +109,16 @@ def save_tensors(
     Where the tensors came from is said as by `save`.
 
     Raises:
-        ValueError: an unknown suffix, or NIfTI for a slice.
+        ValueError: an unknown suffix; NIfTI for a slice; unsymmetric tensors in NIfTI or NRRD.
         ImportError: an optional library is missing; says what to install.
     """
     record = describe(volume, provenance)
+    unsymmetric = int(find_unsymmetric(volume).sum())
+    if unsymmetric and (nrrd.is_nrrd(path) or nifti.is_nifti(path)):
+        raise ValueError(
+            f"volume: {unsymmetric} tensors are unsymmetric, and this format keeps one half of them only. Write their "
+            "symmetric part (T + Tᵀ)/2, or an .npz or .vti"
+        )
     if nrrd.is_nrrd(path):
         return nrrd.write_tensors(path, volume, record)
     if vtk_image.is_vtk_image(path):

@@ -27,7 +27,7 @@ class TensorVolume:
         frame: the axes along which the file's components were.
         notes: what the reader decided, in sentences.
         source: the file.
-        digest: the SHA-256 of the file.
+        digest: the SHA-256 of the file; empty where the data are in more than one.
         repair: what was done to tensors that are not positive definite, for reports; empty if nothing was.
 
     Raises:
