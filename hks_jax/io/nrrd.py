@@ -191,8 +191,7 @@ def write(
     if not os.fspath(path).lower().endswith(".nrrd"):
         raise ValueError(f"path: got {os.fspath(path)!r}; NRRD is written as one file, .nrrd")
     nrrd = pynrrd()
-    d = array.ndim if kind is None else array.ndim - 1
-    placed = volume.affine is not None and kind not in ("2D-symmetric-matrix", "2D-masked-symmetric-matrix")
+    placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
     if placed:
         d, linear, origin = 3, volume.volume_affine[:3, :3], volume.volume_affine[:3, 3]
     else:

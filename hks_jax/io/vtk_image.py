@@ -82,7 +82,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     attributes = image.GetPointData() if at_points else image.GetCellData()
     chosen, declared = _tensor_array(name, attributes, array)
     if name.lower().endswith(".vtk"):
-        _check_length(name, [chosen])
+        _check_length(name, chosen)
     components = np.asarray(vtk_to_numpy(chosen))
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
     if components.shape[-1] == 9:
@@ -200,19 +200,18 @@ def _whole_xml(name: str) -> bool:
         return b"</VTKFile>" in stream.read()
 
 
-def _check_length(name: str, arrays: list[Any]) -> None:
-    """Raise ValueError where a legacy file ends before its values do, which VTK hardly notices."""
+def _check_length(name: str, array: Any) -> None:
+    """Raise ValueError where a legacy file ends before an array does, which VTK hardly notices."""
     content = Path(name).read_bytes()
+    key = re.escape(quote(array.GetName()).encode())
+    line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
+    if line is None:
+        return  # a name that is written otherwise: nothing to measure from
+    values = content[line.end() :]
+    count = array.GetNumberOfTuples() * array.GetNumberOfComponents()
     text = b"ASCII" in content.split(maxsplit=40)[:40]
-    for array in arrays:
-        key = re.escape(quote(array.GetName()).encode())
-        line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
-        count = array.GetNumberOfTuples() * array.GetNumberOfComponents()
-        if line is None:
-            continue  # a name that is written otherwise: nothing to measure from
-        values = content[line.end() :]
-        if len(values.split(maxsplit=count)) < count if text else len(values) < count * array.GetDataTypeSize():
-            raise ValueError(f"{name}: incomplete; it ends before the {count} values of {array.GetName()!r} do")
+    if len(values.split(maxsplit=count)) < count if text else len(values) < count * array.GetDataTypeSize():
+        raise ValueError(f"{name}: incomplete; it ends before the {count} values of {array.GetName()!r} do")
 
 
 def _arrays(attributes: Any) -> dict[str, Any]:
