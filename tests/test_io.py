@@ -2,13 +2,20 @@
 
 import builtins
 import gzip
+import hashlib
 import importlib.metadata
+import json
 import os
 import stat
 
 import nibabel as nib
 import numpy as np
 import pytest
+from dipy.core.gradients import gradient_table
+from dipy.io.gradients import read_bvals_bvecs
+from dipy.io.utils import nifti1_symmat
+from dipy.reconst.dti import TensorModel, lower_triangular
+from dipy.segment.mask import median_otsu
 
 import hks_jax as hj
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, atomic_path, erode, find_example_brain, read_mask
@@ -73,8 +80,10 @@ def test_written_tensors_are_what_nibabel_and_we_read(tmp_path, volume):
     assert image.shape == (*SHAPE, 1, 6)
     assert image.header.get_intent()[:2] == ("symmetric matrix", (3.0,))
     np.testing.assert_allclose(image.affine, volume.affine, rtol=1e-6)
-    np.testing.assert_array_equal(image.get_fdata()[..., 0, 3], volume.tensors[..., 0, 2])
-    np.testing.assert_array_equal(hj.io.read_tensors(path).tensors, volume.tensors)
+    inside = volume.mask
+    np.testing.assert_array_equal(image.get_fdata()[inside, 0, 3], volume.tensors[inside, 0, 2])
+    np.testing.assert_array_equal(hj.io.read_tensors(path).tensors[inside], volume.tensors[inside])
+    assert not image.get_fdata()[~inside].any()
 
 
 @pytest.mark.parametrize("extra_axis", [False, True])
@@ -149,6 +158,34 @@ def test_npz_defaults(tmp_path):
     assert read.tensors.dtype == np.float64
 
 
+@pytest.mark.parametrize(("d", "order"), [(d, order) for d in (2, 3) for order in ORDERS])
+def test_components_in_npy_and_npz(tmp_path, tensors, d, order):
+    whole = tensors if d == 3 else tensors[:, :, 0, :2, :2]
+    names = [(a, b) for a, b in ORDERS[order] if d == 3 or "z" not in (a, b)]
+    components = np.stack([whole[..., "xyz".index(a), "xyz".index(b)] for a, b in names], -1)
+    np.save(tmp_path / "t.npy", components)
+    read = hj.io.read_tensors(tmp_path / "t.npy", order, spacing=0.5)
+    np.testing.assert_array_equal(read.tensors, whole)
+    assert (read.order, read.spacing) == (order, (0.5,) * d)
+    with pytest.raises(ValueError, match="of undeclared order, and programs differ"):
+        hj.io.read_tensors(tmp_path / "t.npy")
+    np.savez(tmp_path / "t.npz", D=components, order=order, spacing=np.ones(d))
+    np.testing.assert_array_equal(hj.io.read_tensors(tmp_path / "t.npz", array="D").tensors, whole)
+    with pytest.raises(ValueError, match=r"spacing: .* has its own"):
+        hj.io.read_tensors(tmp_path / "t.npz", array="D", spacing=2.0)
+
+
+def test_frames_in_npz(tmp_path, tensors):
+    axes = rotated_affine()[:3, :3] / [1.5, 2.0, 3.25]
+    np.savez(tmp_path / "t.npz", tensors=axes @ tensors @ axes.T, affine=rotated_affine(), frame="world")
+    read = hj.io.read_tensors(tmp_path / "t.npz")
+    np.testing.assert_allclose(read.tensors, tensors, rtol=1e-9, atol=1e-15)
+    assert read.frame == "world"
+    np.save(tmp_path / "t.npy", tensors)
+    with pytest.raises(ValueError, match="no 3×3 tensors with an affine"):
+        hj.io.read_tensors(tmp_path / "t.npy", frame="world")
+
+
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
@@ -170,7 +207,7 @@ def test_unreadable_files(tmp_path, tensors):
     with pytest.raises(FileNotFoundError, match="no such file"):
         hj.io.read_tensors(tmp_path / "absent.nii.gz")
     (tmp_path / "t.mha").write_text("")
-    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii, \.nii\.gz or \.npz"):
+    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii, \.nii\.gz, \.nrrd"):
         hj.io.read_tensors(tmp_path / "t.mha")
     for name in ("t.nii", "t.nii.gz", "t.npz"):
         (tmp_path / name).write_bytes(b"not what the name says")
@@ -313,11 +350,24 @@ def test_a_slice_without_affine_is_placed_by_spacing_and_origin(tmp_path):
     np.testing.assert_array_equal(image.affine @ [2, 1, 0, 1], [11.0, 22.0, 0.0, 1.0])
 
 
+def test_a_nifti_says_where_it_came_from(tmp_path, volume):
+    scan = hj.io.save_tensors(tmp_path / "t.nii.gz", volume)
+    read = hj.io.read_tensors(scan)
+    path = hj.io.save(tmp_path / "v.nii.gz", np.zeros(SHAPE), read, provenance={"settings": {"k": np.int64(7)}})
+    (extension,) = nib.load(path).header.extensions
+    record = json.loads(extension.get_content())
+    assert extension.get_code() == 6  # a comment
+    assert record["source"] == str(scan)
+    assert record["sha256"] == hashlib.sha256(scan.read_bytes()).hexdigest()
+    assert (record["order"], record["frame"], record["settings"]) == ("nifti", "voxel", {"k": 7})
+    assert record["software"] == f"hks-jax {hj.__version__}"
+
+
 def test_npz_results(tmp_path, volume):
     plane = volume.slice("z", 1)
     hj.io.save(tmp_path / "v.npz", np.ones((2, 4, 5)), plane, name="hks", extra={"times": [1.0, 2.0]})
     with np.load(tmp_path / "v.npz") as read:
-        assert set(read.files) == {"hks", "times", "spacing", "origin", "mask", "affine", "slice_axis"}
+        assert set(read.files) == {"hks", "times", "spacing", "origin", "mask", "affine", "slice_axis", "provenance"}
         np.testing.assert_array_equal(read["times"], [1, 2])
         np.testing.assert_array_equal(read["mask"], plane.mask)
 
@@ -325,7 +375,7 @@ def test_npz_results(tmp_path, volume):
 def test_results_that_cannot_be_saved(tmp_path, volume):
     with pytest.raises(ValueError, match=r"values: got shape \(5, 4, 6\); expected \(4, 5, 6\)"):
         hj.io.save(tmp_path / "v.npz", np.zeros((5, 4, 6)), volume)
-    with pytest.raises(ValueError, match=r"expected a name that ends in \.npz, \.nii or \.nii\.gz"):
+    with pytest.raises(ValueError, match=r"expected a name that ends in \.npz, \.nii\.gz, \.nii, \.nrrd, \.vti"):
         hj.io.save(tmp_path / "v.txt", np.zeros(SHAPE), volume)
     with pytest.raises(ValueError, match="NIfTI has no place for more arrays"):
         hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"times": [1]})
@@ -417,6 +467,51 @@ def test_fit_recovers_the_tensors_of_a_perfect_scan(scan, volume):
     assert not fit.tensors[~volume.mask].any()
     np.testing.assert_allclose(fit.spacing, volume.spacing, rtol=1e-6)
     assert fit.notes[0] == "weighted least squares on 15 of 25 images (b ≤ 800 s/mm²)"
+
+
+@pytest.mark.parametrize("flip", [1, -1])
+def test_tensors_that_dipy_fitted_and_wrote(tmp_path, flip):
+    """DIPY's tensors are along the axes of its b-vectors, FSL's here; the file declares the order only."""
+    affine = rotated_affine() @ np.diag([flip, 1, 1, 1])
+    directions = np.random.default_rng(0).normal(size=(13, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    b = np.array([0.0] + [1000.0] * 12)
+    D = 1e-3 * np.array([[1.7, 0.3, 0.2], [0.3, 0.6, 0.1], [0.2, 0.1, 0.4]])  # along FSL's axes
+    signal = np.broadcast_to(1000 * np.exp(-b * np.einsum("na,ab,nb->n", directions, D, directions)), (3, 4, 5, 13))
+    write_components(tmp_path / "d.nii.gz", signal.copy(), affine)
+    np.savetxt(tmp_path / "b", b[None])
+    np.savetxt(tmp_path / "g", directions.T)
+    table = gradient_table(b, bvecs=read_bvals_bvecs(str(tmp_path / "b"), str(tmp_path / "g"))[1])
+    theirs = TensorModel(table).fit(signal)
+    nib.save(nifti1_symmat(lower_triangular(theirs.quadratic_form), affine), tmp_path / "t.nii.gz")
+
+    read = hj.io.read_tensors(tmp_path / "t.nii.gz", frame="fsl")
+    ours = hj.io.fit_dwi(tmp_path / "d.nii.gz", tmp_path / "b", tmp_path / "g", np.ones((3, 4, 5), bool))
+    np.testing.assert_allclose(read.tensors, ours.tensors, rtol=1e-6, atol=1e-12)
+    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
+    sign = np.diag([-1.0 if np.linalg.det(affine) > 0 else 1.0, 1, 1])
+    np.testing.assert_allclose(axes @ read.tensors[0, 0, 0] @ axes.T, axes @ sign @ D @ sign @ axes.T, rtol=1e-4)
+    note = 'pass frame "fsl"'
+    assert any(note in text for text in hj.io.read_tensors(tmp_path / "t.nii.gz").notes) == (np.linalg.det(affine) > 0)
+
+
+def test_a_scan_without_a_mask_is_masked_by_dipy(tmp_path):
+    shape = (24, 26, 10)
+    i, j, _ = (2 * a / (n - 1) - 1 for a, n in zip(np.indices(shape), shape, strict=True))
+    brain = i**2 + j**2 < 0.6
+    directions = np.random.default_rng(0).normal(size=(13, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    b = np.array([0.0] + [1000.0] * 12)
+    exponent = b * np.einsum("na,ab,nb->n", directions, 1e-3 * np.diag([1.7, 0.6, 0.4]), directions)
+    write_components(tmp_path / "d.nii", np.where(brain[..., None], 1000 * np.exp(-exponent), 10.0), np.eye(4))
+    np.savetxt(tmp_path / "b", b[None])
+    np.savetxt(tmp_path / "g", directions.T)
+    fit = hj.io.fit_dwi(tmp_path / "d.nii", tmp_path / "b", tmp_path / "g")
+    np.testing.assert_array_equal(fit.mask, median_otsu(np.where(brain, 1000.0, 10.0))[1])
+    assert not fit.mask[~brain].any()
+    assert fit.mask.sum() > 0.5 * brain.sum()
+    assert np.linalg.eigvalsh(fit.tensors[fit.mask]).min() > 3.9e-4
+    assert fit.notes[1] == f"no mask: DIPY's median_otsu of the unweighted images keeps {fit.mask.sum()} voxels"
 
 
 def test_bad_scans(scan, volume):

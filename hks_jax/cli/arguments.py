@@ -1,9 +1,11 @@
-"""How the command line writes slices, boundaries and times."""
+"""How the command line writes slices, repairs, boundaries and times."""
 
+import math
 from argparse import ArgumentTypeError
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.io.repair import REPAIRS, Repair
 
 
 class Times(NamedTuple):
@@ -22,6 +24,18 @@ def parse_slice(text: str) -> tuple[str, int]:
     if axis not in ("x", "y", "z") or not index.isdecimal():
         raise ArgumentTypeError(f"got {text!r}; expected an axis and an index from 0, such as z=14")
     return axis, int(index)
+
+
+def parse_repair(text: str) -> tuple[Repair, float | None]:
+    """Read ``clip``, ``mask``, ``nearest``, or one of them with a floor, ``clip:1e-4``."""
+    name, colon, number = text.partition(":")
+    try:
+        floor = float(number) if colon else None
+    except ValueError:
+        floor = math.nan
+    if name not in REPAIRS or not (floor is None or 0 < floor < math.inf):
+        raise ArgumentTypeError(f"got {text!r}; expected {', '.join(REPAIRS)}, or one with a floor, such as clip:1e-4")
+    return cast(Repair, name), floor
 
 
 def parse_boundary(text: str) -> BoundarySpec:

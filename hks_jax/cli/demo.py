@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
                 first=("mean diffusivity, mm²/s", mean),
                 title=f"Heat kernel signature of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹",
             ),
-            nifti=brain is not None,
+            image="" if brain is None else ".nii.gz",
             command=sys.argv,
         )
     if not args.quiet:

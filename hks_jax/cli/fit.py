@@ -18,6 +18,7 @@ from hks_jax.io import ORDERS, TensorVolume, atomic_folder, read_tensors, save, 
 from hks_jax.io.masks import as_mask
 from hks_jax.io.nifti import is_nifti
 from hks_jax.io.npz import load_npz
+from hks_jax.io.provenance import digest
 
 if TYPE_CHECKING:
     from hks_jax.domain.grid import Grid
@@ -208,6 +209,7 @@ def read_target(path: Path) -> Target:
         None if affine is None else np.asarray(affine, np.float64),
         int(arrays["slice_axis"]) if "slice_axis" in arrays else None,
         source=str(path),
+        digest=digest(path),
     )
     return Target(values, times, volume)
 
@@ -258,12 +260,14 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
         "starts": [step.start for step in fit.history],
     }
     with progress.stage("writing", str(args.output)), atomic_folder(args.output) as folder:
-        save_tensors(folder / "tensors.npz", volume)
+        report = _report(args, fit, target)
+        origin = {"command": sys.argv, "settings": report["settings"]}
+        save_tensors(folder / "tensors.npz", volume, provenance=origin)
         extra = {"times": target.times, **{name: np.asarray(array) for name, array in history.items()}}
-        save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra)
+        save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
         if volume.dimension == 2:
             save_figure(fit_panels(fit, target.values, target.times), folder / "fit.png")
-        write_report(folder / "report.json", _report(args, fit, target), progress, sys.argv)
+        write_report(folder / "report.json", report, progress, sys.argv)
         names = sorted(file.name for file in folder.iterdir())
     return [args.output / name for name in names]
 

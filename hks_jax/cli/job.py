@@ -126,11 +126,14 @@ def _report(
     return {
         "input": {
             "source": volume.source,
+            "sha256": volume.digest,
             "shape": volume.shape,
             "spacing": volume.spacing,
             "order": volume.order,
+            "frame": volume.frame,
             "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),
             "notes": list(volume.notes),
+            "repair": dict(volume.repair) or None,
         },
         "settings": {**asdict(chosen), "times": "automatic" if settings.times.automatic else "explicit"},
         "eigenpairs": {

@@ -32,14 +32,15 @@ def check_folder(path: Path) -> None:
 
 
 def write_outputs(
-    folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], nifti: bool, command: list[str]
+    folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], image: str, command: list[str]
 ) -> list[Path]:
-    """Write hks.npz, hks.nii.gz (if `nifti`), hks.png (by `draw`) and report.json; return their paths."""
+    """Write hks.npz, hks.png (by `draw`), report.json and, unless its suffix is empty, an image; return their paths."""
     with progress.stage("writing", str(folder)), atomic_folder(folder) as temporary:
         extra = {"times": result.times, "eigenvalues": result.eigenvalues}
-        save(temporary / "hks.npz", result.values, result.volume, name="hks", extra=extra)
-        if nifti:
-            save(temporary / "hks.nii.gz", result.values, result.volume, name="hks")
+        origin = {"command": command, "settings": plain(result.report["settings"]), "times": result.times}
+        for suffix in filter(None, (".npz", image)):
+            more = None if suffix == ".nii.gz" else extra
+            save(temporary / f"hks{suffix}", result.values, result.volume, name="hks", extra=more, provenance=origin)
         draw(temporary / "hks.png")
         write_report(temporary / "report.json", result.report, progress, command)
         names = sorted(file.name for file in temporary.iterdir())
@@ -55,7 +56,7 @@ def write_report(path: Path, report: dict[str, Any], progress: Progress, command
         "versions": versions(),
         "seconds": {stage: round(seconds, 3) for stage, seconds in progress.timings.items()},
     }
-    path.write_text(json.dumps(_plain(whole), indent=2, ensure_ascii=False) + "\n")
+    path.write_text(json.dumps(plain(whole), indent=2, ensure_ascii=False) + "\n")
 
 
 def versions() -> dict[str, str]:
@@ -63,7 +64,20 @@ def versions() -> dict[str, str]:
     import jax
 
     found = {"python": platform.python_version(), "system": platform.platform(), "device": jax.devices()[0].device_kind}
-    for package in ("hks-jax", "jax", "jaxlib", "optimistix", "numpy", "scipy", "matplotlib", "nibabel", "dipy"):
+    for package in (
+        "hks-jax",
+        "jax",
+        "jaxlib",
+        "optimistix",
+        "numpy",
+        "scipy",
+        "matplotlib",
+        "nibabel",
+        "dipy",
+        "pynrrd",
+        "vtk",
+        "meshio",
+    ):
         try:
             found[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
@@ -71,12 +85,12 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return what JSON can hold: no NaN or infinity, no tuples or NumPy scalars."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

@@ -158,5 +158,5 @@ def _check_spd(name: str, tensors: Float[np.ndarray, "*shape d d"], inside: np.n
         fail(
             bad,
             f"not positive definite, worst eigenvalue {worst:.3g}",
-            "Exclude these nodes by the grid's mask, or raise their eigenvalues",
+            "Exclude these nodes by the grid's mask, or raise their eigenvalues (hks_jax.io.repair_tensors)",
         )

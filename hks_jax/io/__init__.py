@@ -1,4 +1,4 @@
-"""Files: tensor volumes, masks and results in NIfTI and npz; tensors fitted to diffusion-weighted images."""
+"""Files: tensors, masks, meshes and results in many formats; tensors fitted to diffusion-weighted images."""
 
 from hks_jax.atomic import atomic_folder as atomic_folder
 from hks_jax.atomic import atomic_path as atomic_path
@@ -7,7 +7,11 @@ from hks_jax.io.dwi import find_example_brain as find_example_brain
 from hks_jax.io.dwi import fit_dwi as fit_dwi
 from hks_jax.io.masks import erode as erode
 from hks_jax.io.masks import read_mask as read_mask
+from hks_jax.io.mesh import read_mesh as read_mesh
 from hks_jax.io.read import read_tensors as read_tensors
+from hks_jax.io.repair import REPAIRS as REPAIRS
+from hks_jax.io.repair import find_invalid as find_invalid
+from hks_jax.io.repair import repair_tensors as repair_tensors
 from hks_jax.io.save import save as save
 from hks_jax.io.save import save_tensors as save_tensors
 from hks_jax.io.tensor_order import ORDERS as ORDERS

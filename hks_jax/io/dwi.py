@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from hks_jax.io import nifti
 from hks_jax.io.masks import as_mask, read_mask
+from hks_jax.io.provenance import digest
 from hks_jax.io.tensor_order import to_voxel_axes
 from hks_jax.io.volume import TensorVolume
 
@@ -46,7 +47,7 @@ def fit_dwi(
     path: str | os.PathLike[str],
     bval: str | os.PathLike[str],
     bvec: str | os.PathLike[str],
-    mask: str | os.PathLike[str] | Bool[np.ndarray, "*shape"],
+    mask: str | os.PathLike[str] | Bool[np.ndarray, "*shape"] | None = None,
     b_max: float | None = None,
 ) -> TensorVolume:
     """Fit diffusion tensors to diffusion-weighted images: weighted least squares on log signals (DIPY's TensorModel).
@@ -56,7 +57,8 @@ def fit_dwi(
         bval: text file of the n b-values, in s/mm².
         bvec: text file of the n directions, 3 × n or n × 3, in FSL's convention: voxel axes, the first reversed
             where the affine's determinant is positive.
-        mask: a file (see `read_mask`) or a bool array (nx, ny, nz): fit inside only; outside, tensors are zero.
+        mask: a file (see `read_mask`) or a bool array (nx, ny, nz): fit inside only; outside, tensors are zero. None:
+            what DIPY's median_otsu takes for the brain in the mean of the unweighted images, as a note says.
         b_max: leave out images with larger b; None: use all. A tensor describes b ≲ 1000–1500 s/mm² only.
 
     Returns:
@@ -68,7 +70,7 @@ def fit_dwi(
         FileNotFoundError: no such file.
         ValueError: numbers of images, b-values and directions that disagree; a mask of another shape; too few images.
     """
-    dti, gradients = _dipy()
+    dti, gradients, segmentation = _dipy()
     image = nifti.load(path)
     affine = np.asarray(image.affine, np.float64)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec))
@@ -79,9 +81,6 @@ def fit_dwi(
             f"path, bval, bvec: got an image of shape {image.shape}, {b.size} b-values and directions of shape "
             f"{directions.shape}; expected (nx, ny, nz, n), n and (n, 3)"
         )
-    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
-    if inside.shape != image.shape[:3]:
-        raise ValueError(f"mask: got shape {inside.shape}; expected the images' shape {image.shape[:3]}")
     used = np.full(b.size, True) if b_max is None else b <= b_max
     threshold = max(50.0, float(b.min()))
     weighted = int((used & (b > threshold)).sum())
@@ -90,11 +89,13 @@ def fit_dwi(
             f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
             "at least 6 and 1"
         )
+    signal = nifti.voxels(image)[..., used]
+    inside, found = _inside(mask, signal[..., b[used] <= threshold], affine, segmentation)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
-    fit = dti.TensorModel(table).fit(nifti.voxels(image)[..., used], mask=inside)
+    fit = dti.TensorModel(table).fit(signal, mask=inside)
     tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fsl", affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
-    notes = [f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)"]
+    notes = [f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)", *found]
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
     return TensorVolume(
@@ -103,18 +104,43 @@ def fit_dwi(
         (0.0, 0.0, 0.0),
         inside,
         affine,
+        order="fit",
+        frame="fsl",
         notes=tuple(notes),
         source=os.fspath(path),
+        digest=digest(path),
     )
 
 
-def _dipy() -> tuple[ModuleType, ModuleType]:
+def _inside(
+    mask: str | os.PathLike[str] | np.ndarray | None,
+    unweighted: Float[np.ndarray, "nx ny nz n"],
+    affine: Float[np.ndarray, "4 4"],
+    segmentation: ModuleType,
+) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
+    """Return the mask, given or found, and a note of how it was found."""
+    if mask is None:
+        with np.errstate(invalid="ignore"):  # where its median filter leaves nothing, it divides by zero
+            _, found = segmentation.median_otsu(unweighted.mean(axis=-1))
+        if not found.any():
+            raise ValueError("mask: DIPY's median_otsu finds nothing in the unweighted images; pass a mask")
+        return found.astype(bool), [
+            f"no mask: DIPY's median_otsu of the unweighted images keeps {int(found.sum())} voxels"
+        ]
+    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
+    if inside.shape != unweighted.shape[:3]:
+        raise ValueError(f"mask: got shape {inside.shape}; expected the images' shape {unweighted.shape[:3]}")
+    return inside, []
+
+
+def _dipy() -> tuple[ModuleType, ModuleType, ModuleType]:
     try:
         from dipy.core import gradients
         from dipy.reconst import dti
+        from dipy.segment import mask as segmentation
     except ImportError as error:
         raise ImportError('fitting tensors needs DIPY, which is not installed: pip install "hks-jax[dti]"') from error
-    return dti, gradients
+    return dti, gradients, segmentation
 
 
 def _numbers(path: str | os.PathLike[str]) -> Float[np.ndarray, "..."]:

@@ -1,28 +1,27 @@
 """Masks: which voxels belong to the domain."""
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
 
-from hks_jax.io import nifti
-from hks_jax.io.npz import load_npz
+from hks_jax.io import nifti, nrrd
+from hks_jax.io.npz import load_npy, load_npz
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
-    """Read a mask of zeros and ones: NIfTI, ``.npy``, or the array ``mask`` of an ``.npz``.
+    """Read a mask of zeros and ones: NIfTI, NRRD, ``.npy``, or the array ``mask`` of an ``.npz``.
 
     Args:
         path: the file.
-        affine: where the image lies that the mask is for; a NIfTI mask that lies elsewhere is refused.
+        affine: where the image lies that the mask is for; a mask that lies elsewhere is refused.
 
     Raises:
         FileNotFoundError: no such file.
         ValueError: an unknown kind of file, values other than 0 and 1, or a mask that lies elsewhere.
-        ImportError: NIfTI without nibabel.
+        ImportError: NIfTI without nibabel, NRRD without pynrrd.
     """
     name = os.fspath(path)
     if nifti.is_nifti(path):
@@ -37,13 +36,14 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         if "mask" not in arrays:
             raise ValueError(f"{name}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
         values = arrays["mask"]
+    elif nrrd.is_nrrd(path):
+        values, place = nrrd.read_image(path)
+        if affine is not None and place is not None:
+            _check_same_place(name, place, affine, values.shape)
     elif name.endswith(".npy"):
-        try:
-            values = np.load(nifti.existing(Path(path)), allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise ValueError(f"{name}: not a readable npy array ({error})") from error
+        values = load_npy(path)
     else:
-        raise ValueError(f"{name}: unknown kind of file; expected .nii, .nii.gz, .npz or .npy")
+        raise ValueError(f"{name}: unknown kind of file; expected .nii, .nii.gz, .nrrd, .nhdr, .npz or .npy")
     return as_mask(name, values)
 
 

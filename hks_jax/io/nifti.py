@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.io.tensor_order import FRAMES, choices, pack, to_voxel_axes, unpack
+from hks_jax.io.volume import TensorVolume
+
 SUFFIXES = (".nii", ".nii.gz")
 SYMMETRIC_MATRIX = 1005
 """NIfTI's intent code for symmetric matrices."""
@@ -73,3 +76,62 @@ def existing(path: str | os.PathLike[str]) -> Path:
         what = "is a folder; expected a file" if file.is_dir() else "no such file"
         raise FileNotFoundError(f"{file}: {what}")
     return file
+
+
+def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
+    """Read tensors; see `hks_jax.io.read_tensors`."""
+    image = load(name)
+    shape = image.shape
+    if shape[3:] not in ((6,), (1, 6)):
+        raise ValueError(
+            f"{name}: got an image of shape {shape}; expected six components per voxel, (nx, ny, nz, 1, 6) or "
+            "(nx, ny, nz, 6). Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi, or --bval and --bvec"
+        )
+    declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
+    if order is None and not declared:
+        raise ValueError(
+            f"{name}: six components, but the file does not declare their order (its NIfTI intent is not "
+            f"symmetric-matrix), and programs differ. Pass order: one of {choices()}"
+        )
+    notes, open_frame = [], order is None and frame is None
+    if order is None:
+        order = "nifti"
+    elif declared and order != "nifti":
+        notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
+    tensors = unpack(voxels(image).reshape(*shape[:3], 6), order)
+    frame = FRAMES[order] if frame is None else frame
+    affine = np.asarray(image.affine, np.float64)
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if not (np.isfinite(affine).all() and spacing.min() > 0):
+        raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
+    axes = affine[:3, :3] / spacing
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
+        notes.append("the affine's axes are not orthogonal: the shear is ignored")
+    header = np.asarray(image.header.get_zooms()[:3], np.float64)
+    if np.abs(header / spacing - 1).max() > 1e-3:
+        notes.append(f"voxel sizes {_sizes(spacing)} are those of the affine; the header's own are {_sizes(header)}")
+    if open_frame and np.linalg.det(affine[:3, :3]) > 0:
+        notes.append(
+            "NIfTI does not declare the axes of its tensors: taken for those of the voxels; if they were fitted with "
+            'FSL\'s b-vectors as they are, as DIPY does, pass frame "fsl"'
+        )
+    notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
+    return TensorVolume(
+        to_voxel_axes(tensors, frame, affine),
+        tuple(spacing.tolist()),
+        (0.0, 0.0, 0.0),
+        affine=affine,
+        order=order,
+        frame=frame,
+        notes=tuple(notes),
+        source=name,
+    )
+
+
+def _sizes(values: np.ndarray) -> str:
+    return " × ".join(f"{v:.5g}" for v in values)
+
+
+def symmetric_matrix(volume: TensorVolume) -> np.ndarray:
+    """Return the tensors as NIfTI has them, (nx, ny, nz, 1, 6), zero outside the mask."""
+    return np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)

@@ -1,16 +1,21 @@
 """Reading tensor volumes."""
 
 import os
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool
 
-from hks_jax.io import nifti
+from hks_jax.io import arrays, nifti, nrrd, vtk_image
 from hks_jax.io.masks import as_mask, read_mask
-from hks_jax.io.npz import load_npz
-from hks_jax.io.tensor_order import FRAMES, Frame, Order, choices, to_voxel_axes, unpack
+from hks_jax.io.provenance import digest
+from hks_jax.io.repair import Repair, repair_tensors
+from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.volume import TensorVolume
+
+SUFFIXES = (*nifti.SUFFIXES, *nrrd.SUFFIXES, *vtk_image.SUFFIXES, ".npz", ".npy")
+"""What tensors are read from."""
 
 
 def read_tensors(
@@ -19,121 +24,75 @@ def read_tensors(
     mask: str | os.PathLike[str] | Bool[np.ndarray, "*shape"] | None = None,
     *,
     frame: Frame | None = None,
+    array: str | None = None,
+    spacing: float | Sequence[float] | None = None,
+    confidence: float = 0.5,
+    repair: Repair | None = None,
 ) -> TensorVolume:
     """Read a field of diffusion tensors.
+
+    A file that leaves the order of components or their axes open is refused with the choices named.
 
     NIfTI (``.nii``, ``.nii.gz``): a symmetric-matrix image, (nx, ny, nz, 1, 6) with intent code 1005, whose components
     are xx xy yy xz yz zz; or any (nx, ny, nz, 6) or (nx, ny, nz, 1, 6) image whose `order` is given, because
     programs differ. The distance between voxels is that of the affine.
 
-    npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), array axis a being coordinate a and tensor index a;
-    and, optional, ``spacing`` (d,) = 1, ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4).
+    NRRD (``.nrrd``, ``.nhdr``): an axis of any of the format's kinds of matrix, 2D or 3D, symmetric or whole, masked or
+    not, at any place; or an axis of six (in the plane three) components whose `order` is given. The measurement frame
+    is heeded. The affine's axes are right, anterior, superior where the file's space is patient-based.
+
+    VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at the points or cells, along the
+    axes of space; and a mask of this name. Tensors without components across an image one voxel thick are 2×2.
+
+    npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), array axis a being coordinate a and tensor index a,
+    or six (in the plane three) components whose order is given; and, optional, ``spacing`` (d,) = 1, ``origin`` (d,)
+    = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``order``, ``frame``. npy: the tensors alone.
 
     Args:
         path: the file.
-        order: ``"nifti"`` (xx xy yy xz yz zz), ``"fsl"`` (xx xy xz yy yz zz) or ``"mrtrix"`` (xx yy zz xy xz yz);
-            None: as the file declares. Only for six components.
-        mask: a file (see `read_mask`) or a bool array of the volume's shape; None: the npz's own, or no mask.
+        order: ``"nifti"`` (xx xy yy xz yz zz), ``"fsl"`` (xx xy xz yy yz zz), ``"mrtrix"`` (xx yy zz xy xz yz) or
+            ``"vtk"`` (xx yy zz xy yz xz); None: as the file declares. Not for whole matrices.
+        mask: a file (see `read_mask`) or a bool array of the volume's shape; None: the file's own, or no mask.
         frame: the axes along which the file's components are: ``"voxel"``; ``"fsl"`` (voxel axes, the first reversed
-            where the affine's determinant is positive); ``"world"`` (the scanner axes of the affine). None: what
-            the order's programs write: voxel axes for ``"nifti"``, ``"fsl"``, and ``"world"`` for ``"mrtrix"``.
+            where the affine's determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"``
+            (NRRD's measurement frame). None: what the file declares, or what the order's programs write: voxel axes
+            for ``"nifti"``, ``"fsl"``, and ``"world"`` for ``"mrtrix"``, ``"vtk"``; for NumPy's files voxel axes.
+        array: the name of the tensors' array in an npz or VTK file, where there are several.
+        spacing: for NumPy's files without one.
+        confidence: voxels of NRRD's masked kinds are inside where their confidence is larger.
+        repair: what to do with tensors inside the mask that are not positive definite: see `repair_tensors`. None:
+            nothing; a metric made of them is refused.
 
     Returns:
         The tensors along the voxel axes.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: an unreadable or unknown kind of file; six components of undeclared order; shapes that disagree.
-        ImportError: NIfTI without nibabel.
+        ValueError: an unreadable or unknown kind of file; an order or a frame that is not declared; shapes that
+            disagree; tensors that `repair` cannot mend.
+        ImportError: an optional library is missing; says what to install.
     """
     name = os.fspath(path)
+    numpys = name.lower().endswith((".npz", ".npy"))
+    if array is not None and not (numpys or vtk_image.is_vtk_image(name)):
+        raise ValueError(f"array: got {array!r}; only npz and VTK files have arrays by name")
+    if spacing is not None and not numpys:
+        raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
     if nifti.is_nifti(path):
-        volume = _from_nifti(name, order, frame)
-    elif name.lower().endswith(".npz"):
-        if order is not None or frame is not None:
-            raise ValueError("order, frame: an npz holds whole matrices along the grid's axes; leave these out")
-        volume = _from_npz(name)
+        volume = nifti.read_tensors(name, order, frame)
+    elif nrrd.is_nrrd(path):
+        volume = nrrd.read_tensors(name, order, frame, confidence)
+    elif vtk_image.is_vtk_image(path):
+        volume = vtk_image.read_tensors(name, order, frame, array)
+    elif numpys:
+        volume = arrays.read_tensors(name, order, frame, array, spacing)
     else:
-        raise ValueError(f"{name}: unknown kind of file; expected .nii, .nii.gz or .npz")
-    if mask is None:
-        return volume
-    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, volume.affine)
-    if inside.shape != volume.shape:
-        raise ValueError(f"mask: got shape {inside.shape}; expected the tensors' shape {volume.shape}")
-    return volume.with_mask(inside)
-
-
-def _from_nifti(name: str, order: str | None, frame: str | None) -> TensorVolume:
-    image = nifti.load(name)
-    shape = image.shape
-    if shape[3:] not in ((6,), (1, 6)):
-        raise ValueError(
-            f"{name}: got an image of shape {shape}; expected six components per voxel, (nx, ny, nz, 1, 6) or "
-            "(nx, ny, nz, 6). Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi"
-        )
-    declared = int(image.header["intent_code"]) == nifti.SYMMETRIC_MATRIX
-    if order is None and not declared:
-        raise ValueError(
-            f"{name}: six components, but the file does not declare their order (its NIfTI intent is not "
-            f"symmetric-matrix), and programs differ. Pass order: one of {choices()}"
-        )
-    notes = []
-    if order is None:
-        order = "nifti"
-    elif declared and order != "nifti":
-        notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
-    tensors = unpack(nifti.voxels(image).reshape(*shape[:3], 6), order)
-    frame = FRAMES[order] if frame is None else frame
-    affine = np.asarray(image.affine, np.float64)
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if not (np.isfinite(affine).all() and spacing.min() > 0):
-        raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
-    axes = affine[:3, :3] / spacing
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
-        notes.append("the affine's axes are not orthogonal: the shear is ignored")
-    header = np.asarray(image.header.get_zooms()[:3], np.float64)
-    if np.abs(header / spacing - 1).max() > 1e-3:
-        notes.append(f"voxel sizes {_sizes(spacing)} are those of the affine; the header's own are {_sizes(header)}")
-    notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
-    return TensorVolume(
-        to_voxel_axes(tensors, frame, affine),
-        tuple(spacing.tolist()),
-        (0.0, 0.0, 0.0),
-        affine=affine,
-        order=order,
-        notes=tuple(notes),
-        source=name,
-    )
-
-
-def _from_npz(name: str) -> TensorVolume:
-    arrays = load_npz(name)
-    if "tensors" not in arrays:
-        raise ValueError(
-            f"{name}: has no array 'tensors' (it has {', '.join(sorted(arrays)) or 'none'}); expected 'tensors' of "
-            "shape (*shape, d, d) and, optional, 'spacing', 'origin', 'mask', 'affine'"
-        )
-    tensors = arrays["tensors"]
-    if tensors.dtype not in (np.float32, np.float64):
-        if tensors.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: 'tensors' has dtype {tensors.dtype}; expected real numbers")
-        tensors = tensors.astype(np.float64)
-    d = tensors.shape[-1] if tensors.ndim else 0
-    affine, mask = arrays.get("affine"), arrays.get("mask")
-    return TensorVolume(
-        tensors,
-        _per_axis(arrays.get("spacing", 1.0), d),
-        _per_axis(arrays.get("origin", 0.0), d),
-        None if mask is None else as_mask(f"{name}: mask", mask),
-        None if affine is None else np.asarray(affine, np.float64),
-        source=name,
-    )
-
-
-def _per_axis(value: Any, d: int) -> tuple[float, ...]:
-    array = np.asarray(value, np.float64)
-    return tuple((np.full(d, array) if array.ndim == 0 else array.ravel()).tolist())
-
-
-def _sizes(values: np.ndarray) -> str:
-    return " × ".join(f"{v:.5g}" for v in values)
+        raise ValueError(f"{name}: unknown kind of file; expected {', '.join(SUFFIXES)}")
+    if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
+        volume = replace(volume, digest=digest(name))
+    if mask is not None:
+        inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, volume.affine)
+        if inside.shape != volume.shape:
+            raise ValueError(f"mask: got shape {inside.shape}; expected the tensors' shape {volume.shape}")
+        volume = volume.with_mask(inside)
+    return volume if repair is None else repair_tensors(volume, repair)

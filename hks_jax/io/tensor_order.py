@@ -1,4 +1,4 @@
-"""How programs lay out the six components of a symmetric 3×3 tensor, and along which axes.
+"""How programs lay out the components of a symmetric tensor, and along which axes.
 
 Two files with the same numbers mean different tensors when their programs differ in either:
 
@@ -8,7 +8,11 @@ order      components         axes
 "nifti"    xx xy yy xz yz zz  NIfTI's symmetric matrix, DIPY, ANTs; here along the voxel axes
 "fsl"      xx xy xz yy yz zz  FSL: voxel axes, the first reversed where the affine keeps orientation
 "mrtrix"   xx yy zz xy xz yz  MRtrix: scanner axes
+"vtk"      xx yy zz xy yz xz  VTK, ParaView: the axes of space
 =========  =================  =======================================================================
+
+The three components of a 2×2 tensor follow each other as they do among the six. NRRD's kinds of
+matrix have xx xy xz yy yz zz, along the measurement frame.
 """
 
 from typing import Literal
@@ -16,61 +20,72 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-Order = Literal["nifti", "fsl", "mrtrix"]
-Frame = Literal["voxel", "fsl", "world"]
+Order = Literal["nifti", "fsl", "mrtrix", "vtk"]
+Frame = Literal["voxel", "fsl", "world", "measurement"]
 
 ORDERS: dict[str, tuple[str, ...]] = {
     "nifti": ("xx", "xy", "yy", "xz", "yz", "zz"),
     "fsl": ("xx", "xy", "xz", "yy", "yz", "zz"),
     "mrtrix": ("xx", "yy", "zz", "xy", "xz", "yz"),
+    "vtk": ("xx", "yy", "zz", "xy", "yz", "xz"),
 }
 """The components of each order, as they follow each other in a file."""
 
-FRAMES: dict[str, Frame] = {"nifti": "voxel", "fsl": "fsl", "mrtrix": "world"}
+FRAMES: dict[str, Frame] = {"nifti": "voxel", "fsl": "fsl", "mrtrix": "world", "vtk": "world"}
 """The axes along which the programs of each order give their components."""
 
 
-def unpack(components: Float[np.ndarray, "*shape 6"], order: str) -> Float[np.ndarray, "*shape 3 3"]:
-    """Return the matrices of six components in the given order."""
-    tensors = np.empty((*components.shape[:-1], 3, 3), components.dtype)
-    for c, (i, j) in enumerate(_indices(order)):
+def unpack(components: Float[np.ndarray, "*shape n"], order: str) -> Float[np.ndarray, "*shape d d"]:
+    """Return the matrices of components in the given order: six of 3×3 matrices, or three of 2×2."""
+    d = 3 if components.shape[-1] == 6 else 2
+    tensors = np.empty((*components.shape[:-1], d, d), components.dtype)
+    for c, (i, j) in enumerate(_indices(order, d)):
         tensors[..., i, j] = tensors[..., j, i] = components[..., c]
     return tensors
 
 
-def pack(tensors: Float[np.ndarray, "*shape 3 3"], order: str) -> Float[np.ndarray, "*shape 6"]:
-    """Return the six components of symmetric matrices in the given order."""
-    return np.stack([tensors[..., i, j] for i, j in _indices(order)], axis=-1)
+def pack(tensors: Float[np.ndarray, "*shape d d"], order: str) -> Float[np.ndarray, "*shape n"]:
+    """Return the components of symmetric matrices in the given order: six, or three of 2×2 matrices."""
+    return np.stack([tensors[..., i, j] for i, j in _indices(order, tensors.shape[-1])], axis=-1)
 
 
 def to_voxel_axes(
-    tensors: Float[np.ndarray, "*shape 3 3"], frame: str, affine: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "*shape 3 3"]:
+    tensors: Float[np.ndarray, "*shape d d"], frame: str, affine: Float[np.ndarray, "d+1 d+1"]
+) -> Float[np.ndarray, "*shape d d"]:
     """Return the tensors with components along the voxel axes, from components along those of `frame`.
 
     Args:
-        tensors: (*shape, 3, 3).
+        tensors: (*shape, d, d).
         frame: ``"voxel"``: unchanged; ``"fsl"``: the first axis is reversed where det(affine) > 0; ``"world"``: along
             the axes that the affine maps to, D_voxel = RᵀDR with R the rotation (or reflection) nearest to the affine.
         affine: voxel indices to world coordinates.
     """
     if frame == "voxel":
         return tensors
-    linear = affine[:3, :3]
+    d = tensors.shape[-1]
+    linear = affine[:d, :d]
     if frame == "fsl":
-        sign = np.array([-1.0 if np.linalg.det(linear) > 0 else 1.0, 1.0, 1.0])
+        sign = np.array([-1.0 if np.linalg.det(linear) > 0 else 1.0, 1.0, 1.0])[:d]
         return tensors * np.outer(sign, sign).astype(tensors.dtype)
     if frame == "world":
-        u, _, vt = np.linalg.svd(linear / np.linalg.norm(linear, axis=0))
-        rotation = (u @ vt).astype(tensors.dtype)
+        rotation = nearest_rotation(linear).astype(tensors.dtype)
         return rotation.T @ tensors @ rotation
-    raise ValueError(f'frame: got {frame!r}; expected "voxel", "fsl" or "world"')
+    raise ValueError(
+        f'frame: got {frame!r}; expected "voxel", "fsl" or "world" ("measurement" is for NRRD files that have one)'
+    )
 
 
-def _indices(order: str) -> list[tuple[int, int]]:
+def nearest_rotation(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """Return the rotation or reflection nearest to the directions of the columns."""
+    u, _, vt = np.linalg.svd(linear / np.linalg.norm(linear, axis=0))
+    return u @ vt
+
+
+def _indices(order: str, d: int) -> list[tuple[int, int]]:
     if order not in ORDERS:
         raise ValueError(f"order: got {order!r}; expected {choices()}")
-    return [("xyz".index(pair[0]), "xyz".index(pair[1])) for pair in ORDERS[order]]
+    pairs = [("xyz".index(pair[0]), "xyz".index(pair[1])) for pair in ORDERS[order]]
+    return [pair for pair in pairs if max(pair) < d]
 
 
 def choices() -> str:

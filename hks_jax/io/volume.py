@@ -1,7 +1,8 @@
 """A field of diffusion tensors as it came from a file: NumPy arrays and where they lie in space."""
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,8 +24,11 @@ class TensorVolume:
         affine: (4, 4) voxel indices to world coordinates, or None; for a slice, those of a volume one voxel thick.
         slice_axis: for a slice, the axis of the volume that it cuts; None for a volume.
         order: the order of components in the file, ``"matrix"`` if they were whole matrices.
+        frame: the axes along which the file's components were.
         notes: what the reader decided, in sentences.
         source: the file.
+        digest: the SHA-256 of the file; empty where the data are in more than one.
+        repair: what was done to tensors that are not positive definite, for reports; empty if nothing was.
 
     Raises:
         ValueError: shapes that do not agree.
@@ -37,8 +41,11 @@ class TensorVolume:
     affine: Float[np.ndarray, "4 4"] | None = None
     slice_axis: int | None = None
     order: str = "matrix"
+    frame: str = "voxel"
     notes: tuple[str, ...] = ()
     source: str = ""
+    digest: str = ""
+    repair: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         shape, d = self.tensors.shape[:-2], self.tensors.shape[-1]
@@ -63,6 +70,11 @@ class TensorVolume:
     def dimension(self) -> int:
         """The number of axes d: 3 for a volume, 2 for a slice."""
         return len(self.shape)
+
+    @property
+    def inside(self) -> Bool[np.ndarray, "*shape"]:
+        """The mask, or True everywhere."""
+        return np.ones(self.shape, bool) if self.mask is None else self.mask
 
     def grid(self, components: Literal["raise", "largest", "all"] = "raise") -> Grid:
         """Return the grid of the voxel centres, with the mask. See `hks_jax.Grid` for `components`."""

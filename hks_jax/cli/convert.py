@@ -1,0 +1,54 @@
+"""``hks-jax convert FILE OUT``: tensors from any format that is read to any that is written."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import add_arguments, read
+from hks_jax.io import find_invalid, save_tensors
+from hks_jax.io.save import SUFFIXES
+
+EPILOG = """\
+examples:
+  hks-jax convert dti.nrrd tensor.nii.gz
+  hks-jax convert dti_tensor.nii.gz tensor.vti --order fsl --mask mask.nii.gz --repair nearest
+  hks-jax convert dwi.nii.gz tensor.nii.gz --bval dwi.bval --bvec dwi.bvec --b-max 1000
+"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand's parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "convert",
+        help="write the tensors of a file in another format",
+        description="Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT in the "
+        f"format of its suffix: {', '.join(SUFFIXES)}. Components are turned to the axes that the format has them in.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_arguments(parser)
+    parser.add_argument("output", metavar="OUT", type=Path, help="the file to write; an existing one is replaced")
+    return parser
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the subcommand."""
+    if not args.output.name.lower().endswith(SUFFIXES):
+        raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(SUFFIXES)}")
+    if args.output.is_dir():
+        raise IsADirectoryError(f"OUT: {args.output} is a folder; expected a file")
+    if args.output.exists() and args.output.samefile(args.file):
+        raise ValueError(f"OUT: {args.output} is FILE itself; choose another name")
+    progress = Progress(args.quiet)
+    with progress.catching_warnings():
+        with progress.stage("reading", str(args.file)):
+            volume = read(args, progress)
+        invalid = int(find_invalid(volume).sum())
+        if invalid:
+            progress.warn(f"{invalid} tensors are not positive definite and are written as they are; see --repair")
+        with progress.stage("writing", str(args.output)):
+            save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
+    if not args.quiet:
+        print(args.output)

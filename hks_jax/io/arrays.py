@@ -1,0 +1,77 @@
+"""Tensors in NumPy's own files, .npz and .npy."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from hks_jax.io.masks import as_mask
+from hks_jax.io.npz import load_npy, load_npz
+from hks_jax.io.tensor_order import choices, to_voxel_axes, unpack
+from hks_jax.io.volume import TensorVolume
+
+
+def read_tensors(
+    name: str, order: str | None, frame: str | None, array: str | None, spacing: float | Sequence[float] | None
+) -> TensorVolume:
+    """Read tensors; see `hks_jax.io.read_tensors`."""
+    wanted = array or "tensors"
+    if name.lower().endswith(".npy"):
+        arrays: Mapping[str, Any] = {wanted: load_npy(name)}
+    else:
+        arrays = load_npz(name)
+    if wanted not in arrays:
+        raise ValueError(
+            f"{name}: has no array {wanted!r} (it has {', '.join(sorted(arrays)) or 'none'}); expected {wanted!r} of "
+            "shape (*shape, d, d) and, optional, 'spacing', 'origin', 'mask', 'affine', 'order', 'frame'"
+        )
+    values = arrays[wanted]
+    if values.dtype not in (np.float32, np.float64):
+        if values.dtype.kind not in "fiu":
+            raise ValueError(f"{name}: {wanted!r} has dtype {values.dtype}; expected real numbers")
+        values = values.astype(np.float64)
+    tensors, order = _matrices(name, values, order or _text(arrays, "order"))
+    d = tensors.shape[-1] if tensors.ndim else 0
+    affine, mask = arrays.get("affine"), arrays.get("mask")
+    affine = None if affine is None else np.asarray(affine, np.float64)
+    frame = frame or _text(arrays, "frame") or "voxel"
+    if frame != "voxel":
+        if affine is None or d != 3:
+            raise ValueError(f'frame: {name} has no 3×3 tensors with an affine; expected "voxel", the grid\'s own axes')
+        tensors = to_voxel_axes(tensors, frame, affine)
+    if spacing is not None and "spacing" in arrays:
+        raise ValueError(f"spacing: {name} has its own, {np.asarray(arrays['spacing']).tolist()}; leave this out")
+    return TensorVolume(
+        tensors,
+        _per_axis(arrays.get("spacing", 1.0) if spacing is None else spacing, d),
+        _per_axis(arrays.get("origin", 0.0), d),
+        None if mask is None else as_mask(f"{name}: mask", mask),
+        affine,
+        order=order,
+        frame=frame,
+        source=name,
+    )
+
+
+def _matrices(name: str, values: np.ndarray, order: str | None) -> tuple[Float[np.ndarray, "*shape d d"], str]:
+    """Return matrices from matrices, or from the six or three components of symmetric ones; and their order."""
+    if (values.ndim, values.shape[-1:]) not in ((4, (6,)), (3, (3,))):
+        if order not in (None, "matrix"):
+            raise ValueError(f"order: {name} holds whole matrices along the grid's axes; leave this out")
+        return values, "matrix"
+    if order is None:
+        raise ValueError(
+            f"{name}: {values.shape[-1]} components of undeclared order, and programs differ. Pass order, or store it "
+            f"as 'order' in an npz: one of {choices()}"
+        )
+    return unpack(values, order), order
+
+
+def _text(arrays: Mapping[str, Any], key: str) -> str | None:
+    return None if key not in arrays else str(np.asarray(arrays[key]).item())
+
+
+def _per_axis(value: Any, d: int) -> tuple[float, ...]:
+    array = np.asarray(value, np.float64)
+    return tuple((np.full(d, array) if array.ndim == 0 else array.ravel()).tolist())

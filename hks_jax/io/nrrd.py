@@ -1,0 +1,311 @@
+"""NRRD through pynrrd, which is optional: tensors of every kind that the format defines, masks and results."""
+
+import os
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hks_jax.atomic import atomic_path
+from hks_jax.io.nifti import existing
+from hks_jax.io.tensor_order import choices, nearest_rotation, pack, to_voxel_axes, unpack
+from hks_jax.io.volume import TensorVolume
+
+SUFFIXES = (".nrrd", ".nhdr")
+
+TO_RAS = {
+    "right-anterior-superior": (1.0, 1.0, 1.0),
+    "ras": (1.0, 1.0, 1.0),
+    "left-anterior-superior": (-1.0, 1.0, 1.0),
+    "las": (-1.0, 1.0, 1.0),
+    "left-posterior-superior": (-1.0, -1.0, 1.0),
+    "lps": (-1.0, -1.0, 1.0),
+}
+"""The signs that take a patient-based space to the scanner axes right, anterior, superior, as NIfTI has them."""
+
+
+class Kind(NamedTuple):
+    """What an axis of tensor components holds: d×d tensors, behind a confidence or not, symmetric or whole."""
+
+    d: int
+    masked: bool
+    symmetric: bool
+
+
+KINDS = {
+    f"{d}D-{'masked-' if masked else ''}{'symmetric-' if symmetric else ''}matrix": Kind(d, masked, symmetric)
+    for d in (2, 3)
+    for masked in (False, True)
+    for symmetric in (False, True)
+}
+
+
+class Placement(NamedTuple):
+    """Where the voxels lie.
+
+    Attributes:
+        directions: (d, d), the step along each voxel axis as a column, in the file's space.
+        origin: (d,), in the file's space.
+        signs: (d,), what takes the file's space to right, anterior, superior; None where it is not patient-based.
+        placed: whether the file gives directions at all, and not spacings alone.
+    """
+
+    directions: Float[np.ndarray, "d d"]
+    origin: Float[np.ndarray, " d"]
+    signs: Float[np.ndarray, " d"] | None
+    placed: bool
+
+    @property
+    def affine(self) -> Float[np.ndarray, "4 4"] | None:
+        """Voxel indices to world coordinates, for volumes whose place is more than spacing and origin."""
+        d = len(self.origin)
+        diagonal = np.array_equal(self.directions, np.diag(np.abs(np.diag(self.directions))))
+        if d != 3 or (self.signs is None and diagonal):
+            return None
+        affine = np.eye(4)
+        signs = np.ones(3) if self.signs is None else self.signs
+        affine[:3, :3], affine[:3, 3] = signs[:, None] * self.directions, signs * self.origin
+        return affine
+
+
+def is_nrrd(path: str | os.PathLike[str]) -> bool:
+    """Tell by the name whether a file is NRRD."""
+    return os.fspath(path).lower().endswith(SUFFIXES)
+
+
+def pynrrd() -> ModuleType:
+    """Import pynrrd.
+
+    Raises:
+        ImportError: it is not installed; says how to get it.
+    """
+    try:
+        import nrrd
+    except ImportError as error:
+        raise ImportError(
+            'reading and writing NRRD needs pynrrd, which is not installed: pip install "hks-jax[nrrd]"'
+        ) from error
+    return nrrd
+
+
+def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the array, first axis fastest in the file, in native floating point or as it is; and the header.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not an NRRD file, or a damaged one.
+    """
+    nrrd = pynrrd()
+    existing(path)
+    try:
+        data, header = nrrd.read(os.fspath(path), index_order="F")
+    except (nrrd.NRRDError, OSError, EOFError, ValueError, KeyError, IndexError, zlib.error) as error:
+        raise ValueError(f"{os.fspath(path)}: not a readable NRRD file ({error})") from error
+    return data.astype(data.dtype.newbyteorder("=")), dict(header)
+
+
+def read_image(path: str | os.PathLike[str]) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
+    """Return the voxel values of a scalar image, and its affine if it has one."""
+    data, header = load(path)
+    return data, _placement(os.fspath(path), header, list(range(data.ndim))).affine
+
+
+def read_tensors(name: str, order: str | None, frame: str | None, confidence: float) -> TensorVolume:
+    """Read tensors; see `hks_jax.io.read_tensors`."""
+    data, header = load(name)
+    axis, label = _tensor_axis(name, data.shape, header)
+    domain = [a for a in range(data.ndim) if a != axis]
+    components = np.moveaxis(data, axis, -1)
+    components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
+    notes, mask = [], None
+    if label is None:
+        if order is None:
+            raise ValueError(
+                f"{name}: {components.shape[-1]} components along axis {axis}, but the file does not declare their "
+                f"order (its kind is no kind of tensor), and programs differ. Pass order: one of {choices()}"
+            )
+        tensors, used = unpack(components, order), order
+    else:
+        kind, used = KINDS[label], order or "nrrd"
+        if kind.masked:
+            mask, components = components[..., 0] > confidence, components[..., 1:]
+            notes.append(f"inside where the file's confidence exceeds {confidence:g}: {int(mask.sum())} voxels")
+        if not kind.symmetric:
+            if order is not None:
+                raise ValueError(f"order: {name} holds whole matrices ({label}); leave this out")
+            tensors, used = components.reshape(*components.shape[:-1], kind.d, kind.d), "matrix"
+        elif order is None:
+            tensors = unpack(components, "fsl")  # xx xy xz yy yz zz: the components alone, not FSL's frame
+        else:
+            notes.append(f'read in order "{order}" as asked, though the file declares {label}')
+            tensors = unpack(components, order)
+    d = tensors.shape[-1]
+    if len(domain) != d:
+        raise ValueError(f"{name}: {d}×{d} tensors on {len(domain)} axes of voxels; expected {d} axes")
+    place = _placement(name, header, domain)
+    spacing = np.linalg.norm(place.directions, axis=0)
+    affine = place.affine
+    tensors, frame = _to_voxel_axes(name, tensors, frame, place, header.get("measurement frame"), notes)
+    if affine is not None and place.signs is None:
+        notes.append(f"space {header.get('space', 'unnamed')!r}: the affine's axes are those of the file")
+    elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
+        notes.append("the grid's axes are those of the voxels; their directions in the plane are not kept")
+    what = "whole matrices" if used == "matrix" else f'components in order "{used}"'
+    notes.append(f"{what} ({label or 'as asked'}), given along the {frame} axes, taken to the voxel axes")
+    return TensorVolume(
+        np.ascontiguousarray(tensors),
+        tuple(spacing.tolist()),
+        tuple((place.origin if affine is None else np.zeros(d)).tolist()),
+        mask,
+        affine,
+        order=used,
+        frame=frame,
+        notes=tuple(notes),
+        source=name,
+    )
+
+
+def write(
+    path: str | os.PathLike[str],
+    array: np.ndarray,
+    volume: TensorVolume,
+    record: str,
+    *,
+    kind: str | None = None,
+    more: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
+
+    Args:
+        path: ``.nrrd``.
+        array: (*shape,), or with one more axis: first for tensor components of a `kind`, last for times.
+        volume: where the voxels lie; a slice that has an affine must come one voxel thick.
+        record: the provenance.
+        kind: of the components' axis; None: scalars.
+        more: arrays for the header, as text.
+    """
+    if not os.fspath(path).lower().endswith(".nrrd"):
+        raise ValueError(f"path: got {os.fspath(path)!r}; NRRD is written as one file, .nrrd")
+    nrrd = pynrrd()
+    placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
+    if placed:
+        d, linear, origin = 3, volume.volume_affine[:3, :3], volume.volume_affine[:3, 3]
+    else:
+        d = volume.dimension
+        linear, origin = np.diag(volume.spacing), np.asarray(volume.origin)
+    # pynrrd writes a direction of NaN as "none", which is what axes have that are not in space.
+    directions, kinds, none = linear.T, ["space"] * d, np.full((1, d), np.nan)
+    header: dict[str, Any] = {"space": "right-anterior-superior"} if placed else {"space dimension": d}
+    if kind is not None:
+        directions, kinds = np.concatenate([none, directions]), [kind, *kinds]
+        header["measurement frame"] = nearest_rotation(linear).T  # its vectors, which are the matrix's columns
+    elif array.ndim > d:
+        directions, kinds = np.concatenate([directions, none]), [*kinds, "list"]
+    if placed:
+        header["space units"] = ["mm"] * d
+    header |= {"space directions": directions, "space origin": origin, "kinds": kinds, "encoding": "gzip"}
+    header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in (more or {}).items()}
+    if array.dtype not in (np.float32, np.float64):
+        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
+    with atomic_path(path) as temporary:
+        nrrd.write(str(temporary), array, {**header, "provenance": record}, index_order="F")
+    return Path(path)
+
+
+def write_tensors(path: str | os.PathLike[str], volume: TensorVolume, record: str) -> Path:
+    """Write tensors as masked symmetric matrices, the mask as confidence, the voxel axes as measurement frame."""
+    confidence = volume.inside[..., None].astype(volume.tensors.dtype)
+    components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
+    kind = f"{volume.dimension}D-masked-symmetric-matrix"
+    return write(path, np.moveaxis(components, -1, 0), volume, record, kind=kind)
+
+
+def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -> tuple[int, str | None]:
+    """Return the axis of the components, and its kind; None where the file leaves the kind open."""
+    kinds = header.get("kinds", ["???"] * len(shape))
+    found = [(axis, kind) for axis, kind in enumerate(kinds) if kind in KINDS]
+    if len(found) == 1:
+        axis, kind = found[0]
+        n = KINDS[kind].d
+        expected = (n * (n + 1) // 2 if KINDS[kind].symmetric else n * n) + KINDS[kind].masked
+        if shape[axis] != expected:
+            raise ValueError(f"{name}: axis {axis} is a {kind} of {shape[axis]} components; expected {expected}")
+        return axis, kind
+    count = {4: 6, 3: 3}.get(len(shape))
+    rows = _rows(header, len(shape))
+    outside = [a for a in range(len(shape)) if shape[a] == count and rows is not None and np.isnan(rows[a]).all()]
+    outside = outside or [a for a in (0, len(shape) - 1) if shape[a] == count]
+    if found or len(outside) != 1:
+        raise ValueError(
+            f"{name}: got axes of sizes {tuple(shape)} and kinds {list(kinds)}; expected one axis of components, "
+            f"whose kind is one of {', '.join(KINDS)}; or one of six components, or three in the plane"
+        )
+    return outside[0], None
+
+
+def _rows(header: Mapping[str, Any], n: int) -> Float[np.ndarray, "n d"] | None:
+    """Return the direction of each axis, NaN where it has none; None if the file gives no directions."""
+    given = header.get("space directions")
+    if given is None:
+        return None
+    d = next((len(row) for row in given if row is not None), 0)
+    return np.array([np.full(d, np.nan) if row is None else row for row in given], np.float64).reshape(n, d)
+
+
+def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Placement:
+    d, rows = len(domain), _rows(header, int(header["dimension"]))
+    if rows is None:
+        spacings = np.asarray(header.get("spacings", np.full(int(header["dimension"]), np.nan)), np.float64)[domain]
+        return Placement(np.diag(np.where(np.isnan(spacings), 1.0, spacings)), np.zeros(d), None, False)
+    directions = rows[domain].T
+    if directions.shape != (d, d) or not np.isfinite(directions).all() or np.linalg.norm(directions, axis=0).min() == 0:
+        raise ValueError(
+            f"{name}: space directions {rows[domain].tolist()} of the {d} voxel axes; expected {d} vectors of {d} "
+            "finite numbers, none of them zero"
+        )
+    origin = np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
+    signs = TO_RAS.get(str(header.get("space", "")).lower().removesuffix("-time").removesuffix("t"))
+    return Placement(directions, origin, None if signs is None or d != 3 else np.array(signs), True)
+
+
+def _to_voxel_axes(
+    name: str,
+    tensors: Float[np.ndarray, "*shape d d"],
+    frame: str | None,
+    place: Placement,
+    measurement: Any,
+    notes: list[str],
+) -> tuple[Float[np.ndarray, "*shape d d"], str]:
+    """Return the tensors along the voxel axes, and the frame that they were in."""
+    d = tensors.shape[-1]
+    affine = np.eye(d + 1)
+    affine[:d, :d] = place.directions
+    if measurement is None or not np.isfinite(np.asarray(measurement, np.float64)).all():
+        if frame == "measurement":
+            raise ValueError(f'frame: {name} has no measurement frame; expected "voxel" or "world"')
+        rotation = nearest_rotation(place.directions)
+        # With all axes along or all against those of space, both readings give the same tensors.
+        same = np.allclose(rotation, np.eye(d), atol=1e-6) or np.allclose(rotation, -np.eye(d), atol=1e-6)
+        if frame is None and not same:
+            raise ValueError(
+                f"{name}: no measurement frame says along which axes the tensors are, and the voxel axes are not those "
+                'of space. Pass frame: "world" (the axes of the file\'s space, as ITK and 3D Slicer take it) or "voxel"'
+            )
+        frame = frame or ("world" if place.placed else "voxel")
+    elif frame in (None, "measurement"):
+        columns = np.asarray(measurement, np.float64).T  # the file lists the matrix by columns
+        if columns.shape != (d, d):
+            raise ValueError(f"{name}: got a measurement frame of shape {columns.shape}; expected {(d, d)}")
+        if np.abs(columns.T @ columns - np.eye(d)).max() > 1e-3:
+            notes.append("the measurement frame is not orthonormal: it scales the tensors, as NRRD defines")
+        columns = columns.astype(tensors.dtype)
+        return to_voxel_axes(columns @ tensors @ columns.T, "world", affine), "measurement"
+    else:
+        notes.append(f"the file's measurement frame is set aside for the {frame} axes, as asked")
+    if frame == "fsl" and place.signs is not None:  # FSL's rule is about the axes right, anterior, superior
+        affine[:d, :d] = place.signs[:, None] * place.directions
+    return to_voxel_axes(tensors, frame, affine), frame

@@ -1,0 +1,155 @@
+"""Tensors that are not positive definite: how many, where, and what may be done about them, if asked."""
+
+from dataclasses import replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from hks_jax.domain import spd
+from hks_jax.io.volume import TensorVolume
+
+Repair = Literal["clip", "mask", "nearest"]
+
+REPAIRS: dict[str, str] = {
+    "clip": "raise eigenvalues to a floor",
+    "mask": "leave the voxels out",
+    "nearest": "take the nearest voxel's tensor",
+}
+"""The choices, for messages."""
+
+LISTED = 20
+"""So many voxels are listed in a report."""
+
+
+def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
+    """Mark the voxels inside whose tensor is not finite and positive definite, or has an eigenvalue below `floor`."""
+    inside = volume.inside
+    bad = np.zeros(volume.shape, bool)
+    bad[inside] = ~spd.is_spd(volume.tensors[inside])
+    if floor is not None:
+        good = inside & ~bad
+        bad[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor
+    return bad
+
+
+def find_unsymmetric(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
+    """Mark the voxels inside whose matrix is unsymmetric beyond rounding, as `hks_jax.TensorField` refuses them."""
+    scale = np.abs(volume.tensors).max(axis=(-2, -1))
+    skew = np.abs(volume.tensors - np.swapaxes(volume.tensors, -1, -2)).max(axis=(-2, -1))
+    return volume.inside & (skew > 1e-5 * scale)
+
+
+def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
+    """Raise ValueError where tensors inside are not positive definite: how many, where the first is, the choices."""
+    bad = find_invalid(volume)
+    if bad.any():
+        finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
+        what = f"{int(bad.sum())} of {int(volume.inside.sum())} tensors are not positive definite"
+        if finite.any():
+            worst = np.linalg.eigvalsh(volume.tensors[finite].astype(np.float64)).min()
+            what += f", worst eigenvalue {worst:.3g}"
+        if (bad & ~finite).any():
+            what += f", {int((bad & ~finite).sum())} of them NaN or infinite"
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        choices = ", ".join(f'"{name}" ({does})' for name, does in REPAIRS.items())
+        raise ValueError(f"tensors: {what} (the first at voxel {first}). Choose {argument}: {choices}")
+
+
+def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
+    """Return the volume with the tensors inside its mask positive definite, and a report of what was done.
+
+    Args:
+        volume: the tensors. Without a mask, voxels whose tensor is exactly zero, as programs write what is outside,
+            are left out first.
+        method: what to do with tensors that are not positive definite (or have an eigenvalue below `floor`):
+            ``"clip"`` raises their eigenvalues to the floor, which gives the nearest such tensor in the Frobenius norm;
+            ``"mask"`` takes them out of the mask; ``"nearest"`` puts the tensor of the nearest valid voxel (by
+            distance in space) in their place.
+        floor: the least eigenvalue allowed, in the tensors' units. None: any positive one is allowed, and ``"clip"``
+            raises to a hundredth of the median mean eigenvalue of the valid tensors.
+
+    Returns:
+        The volume; its ``repair`` holds method, floor, how many voxels of how many, how many of them are not finite,
+        the worst eigenvalue, the box that holds them and the first indices. A note says the same in a sentence.
+
+    Raises:
+        ValueError: an unknown method, a floor that is not positive; no valid tensor at all; NaN or infinite tensors
+            for ``"clip"``.
+    """
+    if method not in get_args(Repair):
+        raise ValueError(f"repair: got {method!r}; expected {', '.join(map(repr, REPAIRS))}")
+    if floor is not None and not 0 < floor < np.inf:
+        raise ValueError(f"floor: got {floor}; expected a positive number")
+    volume = without_background(volume)
+    bad, lowest = find_invalid(volume, floor), floor
+    inside = volume.inside
+    if not bad.any():
+        return replace(volume, repair=_report(volume, bad, method, floor))
+    if (bad == inside).all():
+        raise ValueError(f"repair: none of the {int(inside.sum())} tensors is positive definite; check order and units")
+    if method == "clip":
+        typical = np.trace(volume.tensors[inside & ~bad], axis1=-2, axis2=-1) / volume.dimension
+        floor = 0.01 * float(np.median(typical)) if floor is None else floor
+    report = _report(volume, bad, method, floor)
+    wrong = f"have an eigenvalue below {lowest:g}" if lowest else "are not positive definite"
+    worst = "" if report["worst_eigenvalue"] is None else f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})"
+    done = {
+        "clip": f"eigenvalues raised to {floor or 0:.3g}",
+        "mask": "left out",
+        "nearest": "replaced by the nearest valid one",
+    }
+    note = f"repair: {report['voxels']} of {report['of']} tensors {wrong}{worst}: {done[method]}"
+    changed = replace(volume, repair=report, notes=(*volume.notes, note))
+    if method == "mask":
+        return changed.with_mask(inside & ~bad)
+    tensors = volume.tensors.copy()
+    if method == "clip":
+        if report["not_finite"]:
+            raise ValueError(
+                f"repair: {report['not_finite']} tensors are NaN or infinite and have no eigenvalues to clip; "
+                'choose "mask" or "nearest"'
+            )
+        assert floor is not None
+        tensors[bad] = _clip(tensors[bad], floor)
+    else:
+        nearest = ndimage.distance_transform_edt(
+            bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
+        )
+        tensors[bad] = volume.tensors[tuple(index[bad] for index in nearest)]
+    return replace(changed, tensors=tensors)
+
+
+def without_background(volume: TensorVolume) -> TensorVolume:
+    """Take voxels whose tensor is exactly zero, which is how programs write the background, as outside."""
+    if volume.mask is not None:
+        return volume
+    inside = np.any(volume.tensors != 0, axis=(-2, -1))
+    if inside.all() or not inside.any():
+        return volume
+    note = f"no mask: the {int((~inside).sum())} voxels whose tensor is zero count as outside"
+    return replace(volume, mask=inside, notes=(*volume.notes, note))
+
+
+def _clip(tensors: Float[np.ndarray, "n d d"], floor: float) -> Float[np.ndarray, "n d d"]:
+    symmetric = 0.5 * (tensors + np.swapaxes(tensors, -1, -2)).astype(np.float64)
+    values, vectors = np.linalg.eigh(symmetric)
+    clipped = (vectors * np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return (0.5 * (clipped + np.swapaxes(clipped, -1, -2))).astype(tensors.dtype)
+
+
+def _report(volume: TensorVolume, bad: np.ndarray, method: str, floor: float | None) -> dict[str, Any]:
+    finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
+    where = np.argwhere(bad)
+    worst = float(np.linalg.eigvalsh(volume.tensors[finite].astype(np.float64)).min()) if finite.any() else None
+    return {
+        "method": method,
+        "floor": floor,
+        "voxels": len(where),
+        "of": int(volume.inside.sum()),
+        "not_finite": int((bad & ~finite).sum()),
+        "worst_eigenvalue": worst,
+        "box": [where.min(0).tolist(), where.max(0).tolist()] if len(where) else None,
+        "first": where[:LISTED].tolist(),
+    }

@@ -1,0 +1,249 @@
+"""The command line on files: what is in them, other formats, and scans to signatures."""
+
+import json
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+import hks_jax as hj
+from hks_jax.cli import main
+from hks_jax.cli.job import Result
+from hks_jax.cli.outputs import write_outputs
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import image_suffix
+from hks_jax.io import TensorVolume, read_tensors, save_tensors
+
+SHAPE = (14, 12, 5)
+AFFINE = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
+D = 1e-3 * np.array([[1.5, 0.2, 0.1], [0.2, 0.8, 0.0], [0.1, 0.0, 0.6]])
+
+
+def disc():
+    i, j, _ = (a / (n - 1) - 0.5 for a, n in zip(np.indices(SHAPE), SHAPE, strict=True))
+    return i**2 + j**2 < 0.24
+
+
+@pytest.fixture
+def tensors(tmp_path):
+    field = np.where(disc()[..., None, None], D * (1 + 0.1 * np.indices(SHAPE)[0][..., None, None]), 0)
+    return save_tensors(tmp_path / "t.nii.gz", TensorVolume(field, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE))
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A noise-free scan of the tensor D in the disc, but for one voxel that no diffusion explains."""
+    directions = np.random.default_rng(0).normal(size=(13, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    b = np.array([0.0] + [1000.0] * 12)
+    signal = 1000 * np.exp(-b * np.einsum("na,ab,nb->n", directions, D, directions))
+    images = np.where(disc()[..., None], signal, 5.0)
+    impossible = np.diag([-5e-4, 8e-4, 8e-4])
+    images[7, 6, 3] = 1000 * np.exp(-b * np.einsum("na,ab,nb->n", directions, impossible, directions))
+    nib.save(nib.Nifti1Image(images, AFFINE), tmp_path / "d.nii.gz")
+    nib.save(nib.Nifti1Image(disc().astype(np.uint8), AFFINE), tmp_path / "m.nii.gz")
+    np.savetxt(tmp_path / "b", b[None])
+    np.savetxt(tmp_path / "g", (directions * [-1 if np.linalg.det(AFFINE) > 0 else 1, 1, 1]).T)
+    return [str(tmp_path / "d.nii.gz"), "--bval", str(tmp_path / "b"), "--bvec", str(tmp_path / "g")]
+
+
+def error_of(capsys, arguments):
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    errors = [line for line in lines if "error: " in line]
+    assert len(errors) == 1
+    assert "Traceback" not in "".join(lines)
+    return errors[0]
+
+
+def test_a_scan_to_pictures_by_one_command(scan, tmp_path):
+    out, mask = tmp_path / "out", str(tmp_path / "m.nii.gz")
+    arguments = ["--mask", mask, "--slice", "z=3", "--metric", "inverse", "-k", "10", "--times", "2e4", "4e4"]
+    arguments += ["--repair", "nearest:1e-6"]
+    assert main(["hks", *scan, "-o", str(out), "-q", *arguments]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["hks.nii.gz", "hks.npz", "hks.png", "report.json"]
+    report = json.loads((out / "report.json").read_text())
+    assert report["input"]["order"] == "fit"
+    assert report["input"]["notes"][0] == "weighted least squares on 13 of 13 images (b ≤ 1000 s/mm²)"
+    repair = report["input"]["repair"]
+    assert (repair["method"], repair["voxels"], repair["first"]) == ("nearest", 1, [[7, 6]])
+    assert (
+        report["input"]["notes"][1]
+        == f"1 of {disc().sum()} fits are not positive definite; DIPY clips their eigenvalues"
+    )
+    grid = hj.Grid(SHAPE[:2], 2.0, mask=disc()[..., 0])
+    field = hj.TensorField.from_diffusion(grid, np.broadcast_to(D[:2, :2], (*SHAPE[:2], 2, 2)), "inverse")
+    expected = hj.hks(hj.eigenpairs(field, 10), [2e4, 4e4])
+    with np.load(out / "hks.npz") as read:
+        np.testing.assert_allclose(read["hks"], expected, rtol=1e-4)
+
+
+def test_options_of_scans_and_tensors_do_not_mix(scan, tensors, tmp_path, capsys):
+    out = ["-o", str(tmp_path / "out"), "--metric", "inverse"]
+    assert "diffusion-weighted images need both" in error_of(capsys, ["hks", *scan[:3], *out])
+    assert "--order: it is for files of tensors" in error_of(capsys, ["hks", *scan, *out, "--order", "fsl"])
+    assert "--b-max: it is for diffusion-weighted" in error_of(capsys, ["hks", str(tensors), *out, "--b-max", "9"])
+    assert "--bval and --bvec" in error_of(capsys, ["hks", scan[0], *out])
+
+
+# ---------------------------------------------------------------------------------------------------- info
+
+
+def test_info_of_tensors(tensors, tmp_path, capsys):
+    assert main(["info", str(tensors), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["format"], found["shape"], found["order"], found["frame"]) == (
+        ".nii.gz",
+        list(SHAPE),
+        "nifti",
+        "voxel",
+    )
+    assert found["inside"] == disc().sum()
+    assert (found["components"], found["not_positive_definite"]) == (1, 0)
+    assert any("whose tensor is zero count as outside" in note for note in found["notes"])
+    values = np.linalg.eigvalsh(D)
+    assert found["eigenvalues"]["least"] == pytest.approx(1.1 * values[0], rel=1e-5)
+    assert found["eigenvalues"]["largest"] == pytest.approx(2.2 * values[-1], rel=1e-5)
+    assert main(["info", str(tensors), "--slice", "z=1"]) == 0
+    text = capsys.readouterr().out
+    for words in (
+        "tensors         14 × 12",
+        "order, frame    nifti, voxel axes",
+        "invalid         0",
+        "metric inverse",
+    ):
+        assert words in text
+
+
+def test_the_times_that_info_names_are_those_of_the_spectrum(tmp_path, capsys):
+    """Against the eigenvalues of a flat rectangle, π²(i²/a² + j²/b²); Weyl's law leaves out a boundary term."""
+    metric = np.broadcast_to(np.diag([2.0, 0.5]), (60, 80, 2, 2))
+    np.savez(tmp_path / "t.npz", tensors=metric, spacing=[0.1, 0.2])
+    assert main(["info", str(tmp_path / "t.npz"), "--json"]) == 0
+    suits = json.loads(capsys.readouterr().out)["suits"]["tensor"]
+    a, b = 59 * 0.1 * np.sqrt(2), 79 * 0.2 * np.sqrt(0.5)
+    i, j = np.indices((100, 100))
+    eigenvalues = np.sort((np.pi**2 * ((i / a) ** 2 + (j / b) ** 2)).ravel())
+    assert suits["k"] == 200
+    assert suits["least_time_of_k"] == pytest.approx(4.6 / eigenvalues[200], rel=0.2)  # where the tail is 1 %
+    assert suits["largest_time"] == pytest.approx(4 * np.log(10) / eigenvalues[1], rel=0.1)
+    assert suits["least_time"] == pytest.approx(6 * max(2 * 0.1**2, 0.5 * 0.2**2))
+    needed = np.searchsorted(eigenvalues, 4.6 / suits["least_time"])
+    assert suits["k_for_least_time"] == pytest.approx(needed, rel=0.2)
+
+
+def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
+    field = np.broadcast_to(np.eye(2), (6, 6, 2, 2)).copy()
+    field[2, 2] *= -1
+    mask = np.ones((6, 6), bool)
+    mask[3] = False
+    np.savez(tmp_path / "t.npz", tensors=field, mask=mask)
+    assert main(["info", str(tmp_path / "t.npz")]) == 0
+    text = capsys.readouterr().out
+    assert "1 tensors are not positive definite: see --repair" in text
+    assert "components      2 (18, 12 nodes)" in text
+    meshio = pytest.importorskip("meshio")
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    meshio.Mesh(square, [("triangle", np.array([[0, 1, 2], [0, 2, 3]]))]).write(tmp_path / "m.vtk")
+    assert main(["info", str(tmp_path / "m.vtk")]) == 0
+    text = capsys.readouterr().out
+    assert "mesh            4 vertices, 2 triangles" in text
+    assert "area            1" in text
+    assert "boundary        4 vertices" in text
+    assert "absent.nii: no such file" in error_of(capsys, ["info", str(tmp_path / "absent.nii")])
+
+
+# ---------------------------------------------------------------------------------------------------- convert
+
+
+def test_convert_to_every_format_and_back(tensors, tmp_path, capsys):
+    original = read_tensors(tensors)
+    for library, name in (("nrrd", "t.nrrd"), ("vtkmodules", "t.vti"), ("numpy", "t.npz"), ("nibabel", "t.nii")):
+        try:
+            __import__(library)
+        except ImportError:
+            continue
+        assert main(["convert", str(tensors), str(tmp_path / name), "-q"]) == 0
+        read = read_tensors(tmp_path / name)
+        np.testing.assert_allclose(read.tensors, original.tensors, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(read.affine, original.affine)
+        if name != "t.nii":
+            np.testing.assert_array_equal(read.mask, disc())
+    assert capsys.readouterr().err == ""
+
+
+def test_convert_orders_masks_and_repairs(tmp_path, capsys):
+    field = np.broadcast_to(D, (*SHAPE, 3, 3)).copy()
+    field[7, 6, 2] *= -1
+    fsl = [field[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+    nib.save(nib.Nifti1Image(np.stack(fsl, -1), AFFINE), tmp_path / "fsl.nii.gz")
+    np.save(tmp_path / "m.npy", disc())
+    arguments = ["convert", str(tmp_path / "fsl.nii.gz"), str(tmp_path / "t.nii.gz")]
+    assert "does not declare their order" in error_of(capsys, arguments)
+    arguments += ["--order", "fsl", "--mask", str(tmp_path / "m.npy")]
+    assert main(arguments) == 0
+    captured = capsys.readouterr()
+    assert "warning: 1 tensors are not positive definite and are written as they are; see --repair" in captured.err
+    assert captured.out == f"{tmp_path / 't.nii.gz'}\n"
+    assert main([*arguments, "--repair", "nearest", "-q"]) == 0
+    image = nib.load(tmp_path / "t.nii.gz")
+    assert int(image.header["intent_code"]) == 1005
+    read = read_tensors(tmp_path / "t.nii.gz")
+    sign = np.array([-1.0 if np.linalg.det(AFFINE) > 0 else 1.0, 1, 1])  # FSL's first axis
+    np.testing.assert_allclose(read.tensors[7, 6, 2], D * np.outer(sign, sign), rtol=1e-6)
+    assert not read.tensors[~disc()].any()
+    record = json.loads(image.header.extensions[0].get_content())
+    assert (record["order"], record["frame"], record["repair"]["voxels"]) == ("fsl", "fsl", 1)
+
+
+def test_convert_fits_scans_and_refuses_what_cannot_be(scan, tmp_path, capsys):
+    target = tmp_path / "t.npz"
+    assert (
+        main(["convert", *scan, str(target), "--mask", str(tmp_path / "m.nii.gz"), "--repair", "nearest:1e-6", "-q"])
+        == 0
+    )
+    np.testing.assert_allclose(
+        read_tensors(target).tensors[disc()], np.broadcast_to(D, (disc().sum(), 3, 3)), rtol=1e-4, atol=1e-12
+    )
+    assert "expected a name that ends in .npz" in error_of(capsys, ["convert", str(target), str(tmp_path / "t.mif")])
+    assert "is FILE itself" in error_of(capsys, ["convert", str(target), str(target)])
+    before = sorted(tmp_path.iterdir())
+    arguments = ["convert", str(target), str(tmp_path / "s.nii.gz"), "--slice", "z=1"]
+    assert "NIfTI has no 2×2 tensors" in error_of(capsys, arguments)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_numpy_files_and_unsymmetric_matrices(tmp_path, capsys):
+    field = np.broadcast_to(D, (*SHAPE, 3, 3)).copy()
+    field[1, 2, 3, 0, 1] = 0
+    np.save(tmp_path / "t.npy", field)
+    assert main(["info", str(tmp_path / "t.npy"), "--spacing", "1", "2", "3"]) == 0
+    text = capsys.readouterr().out
+    assert "spacing         1 × 2 × 3" in text
+    assert "1 tensors are not symmetric" in text
+    error = error_of(capsys, ["convert", str(tmp_path / "t.npy"), str(tmp_path / "t.nii.gz")])
+    assert "1 tensors are unsymmetric, and this format keeps one half of them only" in error
+
+
+@pytest.mark.parametrize(("library", "suffix"), [("nrrd", ".nrrd"), ("vtkmodules", ".vti"), ("nibabel", ".nii.gz")])
+def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library, suffix):
+    pytest.importorskip(library)
+    volume = read_tensors(tensors)
+    assert image_suffix(tmp_path / f"t{suffix}") == suffix
+    report = {"settings": {"k": 3, "metric": "inverse"}}
+    result = Result(volume, np.array([1.0, 2.0]), np.ones((2, *SHAPE)), np.arange(3.0), report)
+    out = tmp_path / "out"
+    write_outputs(out, result, Progress(quiet=True), Path.touch, suffix, ["hks-jax", "hks"])
+    assert sorted(file.name for file in out.iterdir()) == sorted([f"hks{suffix}", "hks.npz", "hks.png", "report.json"])
+    assert b"hks-jax " in (out / f"hks{suffix}").read_bytes() or suffix != ".nrrd"  # headers are text
+    with np.load(out / "hks.npz") as read:
+        record = json.loads(str(read["provenance"]))
+    assert (record["command"], record["settings"], record["times"]) == (["hks-jax", "hks"], report["settings"], [1, 2])
+    assert record["source"] == str(tensors)
+
+
+def test_help(capsys):
+    for command in ("info", "convert", "hks"):
+        assert main([command, "--help"]) == 0
+        assert "examples:" in capsys.readouterr().out
