@@ -19,6 +19,7 @@ from hks_jax.domain.grid import Grid as Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
 from hks_jax.eigen.block_lanczos import BlockLanczos as BlockLanczos
+from hks_jax.eigen.chebyshev_filter import ChebyshevFilter as ChebyshevFilter
 from hks_jax.eigen.count import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs

@@ -10,6 +10,7 @@ from hks_jax.accuracy import AccuracyWarning
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.block_lanczos import BlockLanczos
+from hks_jax.eigen.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.mirror import solve_mirror
@@ -23,7 +24,9 @@ from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.traced import is_traced
 
-SOLVERS: dict[str, Callable[[], Eigensolver]] = {solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos)}
+SOLVERS: dict[str, Callable[[], Eigensolver]] = {
+    solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos, ChebyshevFilter)
+}
 
 _LARGE = 4_000_000
 """Unknowns times pairs from which on block Lanczos wins even if it has to be compiled first."""
@@ -48,8 +51,8 @@ def eigenpairs(
             constants of natural components, and so must its perturbations).
         k: how many pairs, 1 … number of degrees of freedom.
         boundary: see `assemble`; belongs to the pencil if one is given.
-        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (grids), or a solver with
-            its settings, such as ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
+        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (grids), ``"chebyshev-filter"``
+            (grids, above all 3D), or a solver with its settings, such as ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts. ``"report"`` warns; ``"drop"`` leaves its copies
             out of every signature; ``"complete"`` computes 8 pairs more and takes the missing copies in (or drops

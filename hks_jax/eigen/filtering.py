@@ -1,0 +1,148 @@
+"""Rounds of filtering: what a subspace gains from Chebyshev polynomials, and Rayleigh–Ritz after each."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.eigen.chebyshev import Band, correction, degree_for, weyl
+from hks_jax.eigen.coarsening import Level, interpolate
+from hks_jax.eigen.subspace import block_of, measure, rayleigh_ritz
+from hks_jax.fem.columns import stencil_product, to_rows
+
+_GAIN = 40.0
+"""How far one round damps what is not wanted: much more, and the lumped mass in the filter is what limits it."""
+_SPREAD = 1e5
+"""How much more than a mode at the edge of the band the lowest may grow: beyond it, rounding does."""
+_LEAST_DEGREE = 4
+
+
+class Plan(NamedTuple):
+    """The sizes of a computation; static.
+
+    Attributes:
+        wanted: how many eigenpairs.
+        size: how many vectors, whole blocks.
+        block: vectors filtered together.
+        n_null: zero eigenvalues.
+        tolerance: relative residual that counts as converged.
+        single_precision: whether filters run in float32.
+    """
+
+    wanted: int
+    size: int
+    block: int
+    n_null: int
+    tolerance: float
+    single_precision: bool
+
+
+class State(NamedTuple):
+    """What is known between two rounds.
+
+    Attributes:
+        values: (m,) Ritz values θ, ascending.
+        vectors: (m, nodes) M-orthonormal Ritz vectors.
+        defects: (m,) ‖Kx − θMx‖/‖Mx‖.
+        lumped_values: (m,) xᵀKx / xᵀDx with the lumped mass D.
+        rounds: rounds so far on this grid.
+    """
+
+    values: Float[Array, " m"]
+    vectors: Float[Array, "m nodes"]
+    defects: Float[Array, " m"]
+    lumped_values: Float[Array, " m"]
+    rounds: Int[Array, ""]
+
+
+def unconverged(plan: Plan, rounding: Float[Array, ""], state: State) -> Int[Array, ""]:
+    """Return how many of the wanted pairs have not converged."""
+    return jnp.sum(~_converged(plan, rounding, state)[: plan.wanted])
+
+
+def _converged(plan: Plan, rounding: Float[Array, ""], state: State) -> Bool[Array, " m"]:
+    scale = jnp.maximum(state.values, state.values[plan.n_null])
+    return state.defects <= jnp.maximum(plan.tolerance * scale, jnp.minimum(rounding, 0.01 * scale))
+
+
+@partial(jax.jit, static_argnames=("periodic", "plan"))
+def from_random(
+    level: Level, periodic: tuple[bool, ...], plan: Plan, high: Float[Array, ""], volume: Float[Array, ""]
+) -> State:
+    """Return the state after filtering random functions."""
+    low = jnp.minimum(1.3 * weyl(plan.size, volume, len(level.shape)).astype(high.dtype), high / 3)
+    band = Band(low, high)
+    degree = jnp.ceil(degree_for(band, jnp.zeros_like(low), _SPREAD)).astype(int)
+
+    def damped(key: Array) -> Float[Array, "b nodes"]:
+        x = jnp.where(level.free[..., None], jax.random.normal(key, (*level.shape, plan.block), high.dtype), 0)
+        residual = stencil_product(level.stiffness, x, periodic) - low * level.lumped[..., None] * x
+        return to_rows(x + correction(level, periodic, band, residual, jnp.full(plan.block, low), degree))
+
+    keys = jax.random.split(jax.random.key(0), plan.size // plan.block)
+    vectors = jax.lax.map(damped, keys).reshape(plan.size, -1)
+    return _ritz(level, periodic, plan, vectors, jnp.zeros((), int))
+
+
+@partial(jax.jit, static_argnames=("periodic", "plan", "coarse_shape"))
+def from_coarse(
+    level: Level, periodic: tuple[bool, ...], plan: Plan, coarse_shape: tuple[int, ...], coarse: State
+) -> State:
+    """Return the state that interpolation from the next coarser grid gives."""
+
+    def of_block(number: Array) -> Float[Array, "b nodes"]:
+        return to_rows(interpolate(block_of(coarse.vectors, number, plan.block, coarse_shape), level, periodic))
+
+    vectors = jax.lax.map(of_block, jnp.arange(plan.size // plan.block)).reshape(plan.size, -1)
+    return _ritz(level, periodic, plan, vectors, jnp.zeros((), int))
+
+
+@partial(jax.jit, static_argnames=("periodic", "plan"), donate_argnames="state")
+def improve(
+    level: Level,
+    periodic: tuple[bool, ...],
+    plan: Plan,
+    high: Float[Array, ""],
+    rounding: Float[Array, ""] | None,
+    state: State,
+) -> State:
+    """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz."""
+    lumped = state.lumped_values
+    low = jnp.minimum(jnp.max(lumped), high / 2)
+    band, index = Band(low, high), jnp.arange(plan.size)
+    spare = index >= plan.wanted
+    left = spare | (True if rounding is None else ~_converged(plan, rounding, state))
+    # The spare vectors need no more than the last wanted one.
+    goal = jnp.where(spare, lumped[plan.wanted - 1], lumped)
+    most = degree_for(band, jnp.zeros_like(low), _SPREAD)
+    degrees = jnp.ceil(jnp.clip(degree_for(band, goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
+    degrees = jnp.max(jnp.where(left, degrees, 0).reshape(-1, plan.block), axis=1).astype(int)
+    dtype = jnp.float32 if plan.single_precision else lumped.dtype
+
+    def filtered(number: Array, vectors: Float[Array, "m nodes"]) -> Float[Array, "m nodes"]:
+        x = block_of(vectors, number, plan.block, level.shape)
+        theta, zeta = (jax.lax.dynamic_slice_in_dim(v, number * plan.block, plan.block) for v in (state.values, lumped))
+        inside = zeta > low
+        moved = theta * stencil_product(level.mass, x, periodic)
+        # What is in the band itself has no residual worth the name: it is damped as it is.
+        moved = jnp.where(inside, low * level.lumped[..., None] * x, moved)
+        residual = stencil_product(level.stiffness, x, periodic) - moved
+        z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number]).astype(x.dtype)
+        scale = jnp.where(inside | (theta <= 0), 1, jnp.clip(zeta / theta, 0, 1))
+        return jax.lax.dynamic_update_slice_in_dim(vectors, to_rows(x + scale * z), number * plan.block, axis=0)
+
+    def step(number: Array, vectors: Float[Array, "m nodes"]) -> Float[Array, "m nodes"]:
+        return jax.lax.cond(degrees[number] > 0, filtered, lambda _, unchanged: unchanged, number, vectors)
+
+    vectors = jax.lax.fori_loop(0, plan.size // plan.block, step, state.vectors)
+    return _ritz(level, periodic, plan, vectors, state.rounds + 1)
+
+
+def _ritz(
+    level: Level, periodic: tuple[bool, ...], plan: Plan, vectors: Float[Array, "m nodes"], rounds: Int[Array, ""]
+) -> State:
+    values, vectors = rayleigh_ritz(level, periodic, plan.block, vectors)
+    measured = measure(level, periodic, plan.block, values, vectors)
+    return State(values, vectors, measured.defects, measured.lumped_values, rounds)

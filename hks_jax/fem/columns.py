@@ -1,0 +1,40 @@
+"""Products of stencils with blocks of columns: nodal arrays (*shape, b), the column innermost.
+
+In this layout each coefficient is read once for all columns: in 3D it is about twice as fast as row after row.
+"""
+
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def stencil_product(
+    coefficients: Float[Array, "offsets *shape"], x: Float[Array, "*shape b"], periodic: tuple[bool, ...]
+) -> Float[Array, "*shape b"]:
+    """Return y[i] = Σₒ coefficients[o, i] x[i + o], offsets in the order of ``product((-1, 0, 1), repeat=d)``.
+
+    A single coefficient per node is a diagonal.
+    """
+    if coefficients.shape[0] == 1:
+        return coefficients[0][..., None] * x
+    shape = x.shape[:-1]
+    for axis, wraps in enumerate(periodic):
+        widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
+        x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
+    y = jnp.zeros((), x.dtype)
+    for c, start in zip(coefficients, product((0, 1, 2), repeat=len(shape)), strict=True):
+        stop = [s + n for s, n in zip(start, shape, strict=True)]
+        y = y + c[..., None] * jax.lax.slice(x, (*start, 0), (*stop, x.shape[-1]))
+    return y
+
+
+def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
+    """Return rows of flat nodal arrays as a block of columns."""
+    return jnp.moveaxis(rows.reshape(-1, *shape), 0, -1)
+
+
+def to_rows(columns: Float[Array, "*shape b"]) -> Float[Array, "b nodes"]:
+    """Return a block of columns as rows of flat nodal arrays."""
+    return jnp.moveaxis(columns, -1, 0).reshape(columns.shape[-1], -1)
