@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.eigen.coarsening import Level
 from hks_jax.fem.columns import stencil_product
@@ -36,12 +36,17 @@ class Band(NamedTuple):
 #
 #     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · λ/ζ + ….
 #
+# Where the mesh is coarse in one direction only, β depends on the direction of a mode as well, and near the edge of the
+# band the order by βμ may not be that by μ. Then one more term of Neumann's series, W = D⁻¹ + (I − D⁻¹M)D⁻¹, takes the
+# place of D⁻¹: βμ becomes (1 − (1 − β)²)μ, at most twice as large, and the scale 1 − 2(1 − β)².
+#
 # With the three-term recurrence of p in s(z) = (z − c)/e, c and e the band's centre and half width, and z_j = q_j w,
 # w = D⁻¹r, everything divided by p_j(ζ), whose ratios are σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}):
 #
 #     z_{j+1} = (2σ_j/e) ((D⁻¹K − c) z_j + w) − σ_j σ_{j−1} z_{j−1},    z_0 = 0,   z_1 = (σ_0/e) w,   σ_0 = 1/s(ζ).
 #
-# q < 0 on both sides of ζ, so that −q(D⁻¹K)D⁻¹ is also a symmetric positive definite preconditioner for K − λM.
+# D⁻¹ may be W throughout. q < 0 on both sides of ζ, so that −q(D⁻¹K)D⁻¹ is also a symmetric positive definite
+# preconditioner for K − λM.
 def correction(
     level: Level,
     periodic: tuple[bool, ...],
@@ -49,18 +54,29 @@ def correction(
     residual: Float[Array, "*shape b"],
     value: Float[Array, " b"],
     degree: Int[Array, ""],
+    sharp: Bool[Array, ""] | bool = False,
 ) -> Float[Array, "*shape b"]:
-    """Return q(D⁻¹K) D⁻¹ residual with the polynomial that belongs to ``value`` ζ (at most the band's low end)."""
+    """Return q(D⁻¹K) D⁻¹ residual with the polynomial that belongs to ``value`` ζ (at most the band's low end).
+
+    With ``sharp``, W in place of D⁻¹; value and band are then those of WK.
+    """
     dtype = residual.dtype
     centre, half = (band.high + band.low) / 2, (band.high - band.low) / 2
     stiffness = (level.stiffness / level.lumped).astype(dtype)
-    w = residual / level.lumped[..., None].astype(dtype)
+    mass = (level.mass / level.lumped).astype(dtype)
+
+    def sharpened(y: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
+        if mass.shape[0] == 1:
+            return y
+        return jax.lax.cond(sharp, lambda: 2 * y - stencil_product(mass, y, periodic), lambda: y)
+
+    w = sharpened(residual / level.lumped[..., None].astype(dtype))
     s = (jnp.minimum(value, band.low) - centre) / half
 
     def step(_: Int[Array, ""], state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         before, z, ratio = state
         following = 1 / (2 * s - ratio)
-        grown = stencil_product(stiffness, z, periodic) - centre.astype(dtype) * z + w
+        grown = sharpened(stencil_product(stiffness, z, periodic)) - centre.astype(dtype) * z + w
         after = (2 * following / half).astype(dtype) * grown - (following * ratio).astype(dtype) * before
         return z, after, following
 

@@ -17,6 +17,8 @@ _GAIN = 40.0
 _SPREAD = 1e5
 """How much more than a mode at the edge of the band the lowest may grow: beyond it, rounding does."""
 _LEAST_DEGREE = 4
+_SPLIT = 0.06
+"""How far the lumped mass may shift modes of like eigenvalues apart before the filter needs a better inverse."""
 
 
 class Plan(NamedTuple):
@@ -109,29 +111,38 @@ def improve(
     state: State,
 ) -> State:
     """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz."""
-    lumped = state.lumped_values
-    low = jnp.minimum(jnp.max(lumped), high / 2)
-    band, index = Band(low, high), jnp.arange(plan.size)
-    spare = index >= plan.wanted
+    spare = jnp.arange(plan.size) >= plan.wanted
+    # β of the modes: what the lumped mass makes of their eigenvalues.
+    ratio = jnp.where(state.values > 0, state.lumped_values / jnp.where(state.values > 0, state.values, 1), 1)
+    near = state.values >= state.values[plan.wanted - 1] / 2
+    sharp = jnp.ptp(jnp.where(near & (ratio > 0.5), ratio, ratio[plan.wanted - 1])) > _SPLIT
+    filtered_values = jnp.where(sharp, state.values * (1 - (1 - ratio) ** 2), state.lumped_values)
+    factor = jnp.where(sharp, 1 - 2 * (1 - ratio) ** 2, ratio)
+    high = jnp.where(sharp, 2, 1) * high
+    low = jnp.minimum(jnp.max(filtered_values), high / 2)
+    band = Band(low, high)
     left = spare | (True if rounding is None else ~_converged(plan, rounding, state))
     # The spare vectors need no more than the last wanted one.
-    goal = jnp.where(spare, lumped[plan.wanted - 1], lumped)
+    goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
     most = degree_for(band, jnp.zeros_like(low), _SPREAD)
     degrees = jnp.ceil(jnp.clip(degree_for(band, goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
     degrees = jnp.max(jnp.where(left, degrees, 0).reshape(-1, plan.block), axis=1).astype(int)
-    dtype = jnp.float32 if plan.single_precision else lumped.dtype
+    dtype = jnp.float32 if plan.single_precision else state.values.dtype
 
     def filtered(number: Array, vectors: Float[Array, "m nodes"]) -> Float[Array, "m nodes"]:
         x = block_of(vectors, number, plan.block, level.shape)
-        theta, zeta = (jax.lax.dynamic_slice_in_dim(v, number * plan.block, plan.block) for v in (state.values, lumped))
+        theta, zeta, scale = (
+            jax.lax.dynamic_slice_in_dim(v, number * plan.block, plan.block)
+            for v in (state.values, filtered_values, factor)
+        )
         inside = zeta > low
         moved = theta * stencil_product(level.mass, x, periodic)
         # What is in the band itself has no residual worth the name: it is damped as it is.
         moved = jnp.where(inside, low * level.lumped[..., None] * x, moved)
         residual = stencil_product(level.stiffness, x, periodic) - moved
-        z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number]).astype(x.dtype)
-        scale = jnp.where(inside | (theta <= 0), 1, jnp.clip(zeta / theta, 0, 1))
-        return jax.lax.dynamic_update_slice_in_dim(vectors, to_rows(x + scale * z), number * plan.block, axis=0)
+        z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number], sharp)
+        x = x + jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
+        return jax.lax.dynamic_update_slice_in_dim(vectors, to_rows(x), number * plan.block, axis=0)
 
     def step(number: Array, vectors: Float[Array, "m nodes"]) -> Float[Array, "m nodes"]:
         return jax.lax.cond(degrees[number] > 0, filtered, lambda _, unchanged: unchanged, number, vectors)

@@ -51,8 +51,9 @@ def eigenpairs(
             constants of natural components, and so must its perturbations).
         k: how many pairs, 1 … number of degrees of freedom.
         boundary: see `assemble`; belongs to the pencil if one is given.
-        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (grids), ``"chebyshev-filter"``
-            (grids, above all 3D), or a solver with its settings, such as ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
+        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (grids, above all 2D),
+            ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
+            ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts. ``"report"`` warns; ``"drop"`` leaves its copies
             out of every signature; ``"complete"`` computes 8 pairs more and takes the missing copies in (or drops

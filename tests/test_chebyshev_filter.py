@@ -1,0 +1,173 @@
+"""The matrix-free eigensolver for grids against dense linear algebra: grids, polynomials, pairs, derivatives."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from fields import flat, random_spd
+
+import hks_jax as hj
+from hks_jax.eigen.chebyshev import Band, correction, degree_for, upper_end
+from hks_jax.eigen.coarsening import coarsen, finest_level, interpolate
+from hks_jax.fem.columns import stencil_product, to_columns, to_rows
+
+
+def masked(shape):
+    inside = np.ones(shape, bool)
+    inside[:3, :4] = False
+    inside[shape[0] // 2 + 2, 5:7] = False
+    return inside
+
+
+CASES = {
+    "neumann": ((14, 13, 12), "neumann", "consistent"),
+    "torus, lumped": ((12, 13, 11), "periodic", "lumped"),
+    "mixed, mask": ((13, 15, 12), ("neumann", ("dirichlet", "neumann"), "periodic"), "consistent"),
+    "2d": ((40, 37), ("periodic", "neumann"), "consistent"),
+}
+
+
+def problem(name, dtype=np.float64):
+    shape, boundary, mass = CASES[name]
+    grid = hj.Grid(shape, 0.1, mask=masked(shape) if "mask" in name else None)
+    x = grid.nodes
+    waves = [np.sin(3 * x[..., a] + (a + 1) * x[..., a - 1]) for a in range(len(shape))]
+    factor = np.exp(0.5 * np.stack(waves, -1))[..., None] * np.eye(len(shape))
+    factor[..., 0, 1] = 0.6 * waves[0]
+    tensors = (np.swapaxes(factor, -1, -2) @ factor).astype(dtype)
+    return hj.assemble(hj.TensorField(grid, tensors), boundary, mass)
+
+
+def dense_matrices(pencil):
+    return np.asarray(pencil.stiffness.to_dense()), np.asarray(pencil.mass.to_dense())
+
+
+def test_products_in_columns_equal_the_operators(rng):
+    pencil = problem("mixed, mask")
+    space = pencil.space
+    x = rng.standard_normal((3, space.n_dof))
+    columns = to_columns(space.extend(jnp.asarray(x), outside=0.0).reshape(3, -1), space.node_shape)
+    y = stencil_product(pencil.stiffness.coefficients, columns, space.periodic)
+    again = space.restrict(to_rows(y).reshape(3, *space.node_shape))
+    np.testing.assert_allclose(again, pencil.stiffness.apply(jnp.asarray(x)), atol=1e-13)
+
+
+@pytest.mark.parametrize("shape", [(6, 9), (7, 8), (13, 10)])
+@pytest.mark.parametrize("boundary", ["neumann", "periodic", (("dirichlet", "neumann"), "periodic")])
+def test_a_coarse_pencil_is_the_fine_one_between_interpolated_functions(rng, shape, boundary):
+    mask = np.ones(shape, bool)
+    mask[2:4, 3] = False
+    grid = hj.Grid(shape, 0.1, mask=mask)
+    pencil = hj.assemble(hj.TensorField(grid, random_spd(rng, shape)), boundary)
+    periodic = pencil.space.periodic
+    fine = finest_level(pencil)
+    coarse = coarsen(fine, periodic)
+    n = coarse.free.size
+    basis = interpolate(jnp.eye(n).reshape(*coarse.shape, n), fine, periodic)
+    for of_fine, of_coarse in ((fine.stiffness, coarse.stiffness), (fine.mass, coarse.mass)):
+        image = stencil_product(of_fine, basis, periodic)
+        expected = basis.reshape(-1, n).T @ image.reshape(-1, n)
+        found = stencil_product(of_coarse, jnp.eye(n).reshape(*coarse.shape, n), periodic).reshape(n, n)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    # Constants, where nothing is eliminated, stay constants.
+    if boundary == "neumann":
+        constant = interpolate(jnp.ones((*coarse.shape, 1)), fine, periodic)[..., 0]
+        reached = np.asarray(constant)[np.asarray(fine.free)]
+        assert np.isin(np.round(reached, 12), [0, 1]).all()
+        assert (reached == 1).mean() > 0.9
+
+
+def test_the_correction_is_the_polynomial_it_is_derived_from(rng):
+    pencil = problem("torus, lumped")
+    level, periodic = finest_level(pencil), pencil.space.periodic
+    K, M = dense_matrices(pencil)
+    spectrum, vectors = scipy.linalg.eigh(K, M)
+    high = float(upper_end(level, periodic))
+    assert spectrum[-1] <= high < 1.2 * spectrum[-1]
+    low, value, degree = spectrum[60], spectrum[25], 9
+    band = Band(jnp.asarray(low), jnp.asarray(high))
+
+    def polynomial(z):
+        s = (2 * z - high - low) / (high - low)
+        return np.polynomial.chebyshev.chebval(s, [0] * degree + [1])
+
+    x = rng.standard_normal(spectrum.size)
+    residual = to_columns(jnp.asarray(K @ x - value * (M @ x))[None], level.shape)
+    found = x + to_rows(correction(level, periodic, band, residual, jnp.full(1, value), jnp.asarray(degree)))[0]
+    expected = vectors @ (polynomial(spectrum) / polynomial(value) * (vectors.T @ (M @ x)))
+    np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+    gain = float(degree_for(band, jnp.asarray(value), abs(polynomial(value))))
+    assert gain == pytest.approx(degree)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_pairs_equal_the_dense_ones(name):
+    pencil = problem(name)
+    k = 24
+    rounds = []
+    pairs = hj.eigenpairs(pencil, k, solver=hj.ChebyshevFilter(block=8, progress=rounds.append))
+    assert pairs.converged.all()
+    assert pairs.residuals.max() <= 1e-8
+    expected = scipy.linalg.eigh(*dense_matrices(pencil), subset_by_index=[0, k - 1])[0]
+    np.testing.assert_allclose(pairs.eigenvalues, expected, atol=1e-11 * expected[-1])
+    gram = pairs.vectors @ pencil.mass.apply(pairs.vectors).T
+    np.testing.assert_allclose(gram, np.eye(k), atol=1e-10)
+    assert any("of 25 pairs" in text for text in rounds)
+
+
+def test_multiplicities_of_a_cube_are_complete():
+    n, k = 16, 30
+    field = flat((n, n, n), (1.0, 1.0, 1.0))
+    pairs = hj.eigenpairs(field, k, solver=hj.ChebyshevFilter(block=8))
+    # Q1 on a uniform grid separates: (K₁⊗M₁⊗M₁ + …) has the sums of the intervals' own discrete eigenvalues.
+    angles = np.pi * np.arange(n) / (n - 1)
+    line = 6 * (n - 1) ** 2 * (1 - np.cos(angles)) / (2 + np.cos(angles))
+    expected = np.sort((line[:, None, None] + line[:, None] + line).ravel())[:k]
+    np.testing.assert_allclose(pairs.eigenvalues, expected, atol=1e-10 * expected[-1])
+
+
+def test_traced_batched_and_in_single_precision():
+    pencil = problem("2d")
+    k, solver = 12, hj.ChebyshevFilter(block=4)
+    plain = hj.eigenpairs(pencil, k, solver=solver).eigenvalues
+    scaled = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), pencil)
+    batch = jax.jit(jax.vmap(lambda p: hj.eigenpairs(p, k, solver=solver).eigenvalues))(scaled)
+    np.testing.assert_allclose(batch, np.stack([plain, plain]), rtol=1e-9, atol=1e-9)
+    single = hj.eigenpairs(problem("2d", np.float32), k, solver=solver)
+    assert single.eigenvalues.dtype == np.float32
+    assert single.converged.all()
+    np.testing.assert_allclose(single.eigenvalues, plain, rtol=2e-4, atol=1e-4)
+
+
+def test_gradient_equals_the_dense_one(rng):
+    shape, k, times = (9, 8, 10), 8, jnp.array([0.02, 0.1])
+    tensors = jnp.asarray(random_spd(rng, shape, 0.3))
+    weights = rng.standard_normal((2, *shape))
+
+    def loss(solver, tensors):
+        pairs = hj.eigenpairs(hj.TensorField(hj.Grid(shape, 0.1), tensors), k, solver=solver)
+        return jnp.sum(weights * hj.hks(pairs, times))
+
+    found = jax.grad(partial(loss, hj.ChebyshevFilter(block=4)))(tensors)
+    expected = jax.grad(partial(loss, "dense"))(tensors)
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_bad_settings_and_meshes_are_refused():
+    for settings in ({"block": 0}, {"max_rounds": 0}, {"spare": 0.0}, {"derivative_tolerance": 2.0}):
+        with pytest.raises(ValueError, match=next(iter(settings))):
+            hj.ChebyshevFilter(**settings)
+    mesh = hj.SurfaceMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2], [1, 3, 2]]))
+    with pytest.raises(ValueError, match="grid"):
+        hj.eigenpairs(mesh, 1, solver="chebyshev-filter")
+    with pytest.raises(ValueError, match="at most"):
+        hj.eigenpairs(problem("neumann"), 400, solver="chebyshev-filter")
+
+
+def test_too_few_rounds_are_reported():
+    with pytest.warns(hj.AccuracyWarning, match="did not converge"):
+        pairs = hj.eigenpairs(problem("neumann"), 24, solver=hj.ChebyshevFilter(block=8, max_rounds=1))
+    assert not pairs.converged.all()
