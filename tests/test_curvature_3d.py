@@ -148,7 +148,7 @@ def test_curvature_is_differentiable():
 
 
 def test_orders_that_are_not_known_are_refused():
-    with pytest.raises(ValueError, match="order: got 3; expected 0, 1 or 2, .* 3 dimensions"):
+    with pytest.raises(ValueError, match=r"order: got 3; expected 0, 1 or 2, .* 3 dimensions"):
         hj.hks_expansion(hj.TensorField.from_function(conformal(1), GRID), [0.1], 3)
 
 

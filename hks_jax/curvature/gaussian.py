@@ -6,8 +6,8 @@ from functools import partial
 import jax
 from jaxtyping import Array, Float
 
-from hks_jax.curvature.riemann import riemann
 from hks_jax.curvature.jet import Jet, metric_jet, nan_outside, wraps_per_axis
+from hks_jax.curvature.riemann import riemann
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
 

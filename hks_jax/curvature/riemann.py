@@ -20,13 +20,9 @@ def riemann(metric: Jet) -> Float[Array, "... p p"]:
     """
     planes = _PLANES[metric.value.shape[-1]]
     hessian, symbols, inverse = metric.hessian, christoffel(metric), spd.inverse(metric.value)
-    products: dict[tuple[int, ...], Array] = {}
 
-    def product(*indices: int) -> Array:  # ⟨Γ_ij, Γ_kl⟩, symmetric in ij, in kl, and in the two
-        i, j, k, m = key = tuple(sum(sorted([sorted(indices[:2]), sorted(indices[2:])]), []))
-        if key not in products:
-            products[key] = inner(inverse, symbols[..., i, j], symbols[..., k, m])
-        return products[key]
+    def product(i: int, j: int, k: int, m: int) -> Array:
+        return inner(inverse, symbols[..., i, j], symbols[..., k, m])
 
     def component(a: int, b: int, c: int, d: int) -> Array:
         linear = (

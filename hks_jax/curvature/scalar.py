@@ -6,7 +6,6 @@ from functools import partial
 import jax
 from jaxtyping import Array, Float
 
-
 from hks_jax.curvature.jet import metric_jet, nan_outside, wraps_per_axis
 from hks_jax.curvature.riemann import scalar
 from hks_jax.domain.tensor_field import TensorField
