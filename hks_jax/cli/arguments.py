@@ -1,4 +1,4 @@
-"""How the command line writes slices, boundaries and times."""
+"""How the command line writes slices, voxels, boundaries and times."""
 
 from argparse import ArgumentTypeError
 from typing import NamedTuple
@@ -22,6 +22,14 @@ def parse_slice(text: str) -> tuple[str, int]:
     if axis not in ("x", "y", "z") or not index.isdecimal():
         raise ArgumentTypeError(f"got {text!r}; expected an axis and an index from 0, such as z=14")
     return axis, int(index)
+
+
+def parse_voxel(text: str) -> tuple[int, int, int]:
+    """Read ``64,64,14``."""
+    words = text.split(",")
+    if len(words) != 3 or not all(word.isdecimal() for word in words):
+        raise ArgumentTypeError(f"got {text!r}; expected three indices from 0, such as 64,64,14")
+    return int(words[0]), int(words[1]), int(words[2])
 
 
 def parse_boundary(text: str) -> BoundarySpec:

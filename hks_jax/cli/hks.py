@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import parse_boundary, parse_slice, parse_times
+from hks_jax.cli.arguments import parse_boundary, parse_slice, parse_times, parse_voxel
 from hks_jax.cli.progress import Progress
 from hks_jax.eigen.solve import SOLVERS
 from hks_jax.io import ORDERS, TensorVolume, erode, read_mask, read_tensors
@@ -18,7 +18,10 @@ DESCRIPTION = """\
 Compute the heat kernel signature of a field of diffusion tensors. FILE is a NIfTI image of six components per voxel,
 or an npz with 'tensors' (*shape, d, d) and, optional, 'spacing', 'origin', 'mask', 'affine'.
 
-Writes to the folder OUT: hks.npz, hks.nii.gz (where FILE is NIfTI), hks.png and report.json.
+A volume is computed whole, in three dimensions, unless --slice cuts it.
+
+Writes to the folder OUT: hks.npz, hks.nii.gz (where FILE is NIfTI; times along the fourth axis), hks.png (of a volume,
+three orthogonal slices for each time) and report.json.
 """
 
 EPILOG = """\
@@ -46,6 +49,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "must be chosen for NIfTI; an npz holds the metric itself unless you choose",
     )
     add("--slice", type=parse_slice, metavar="AXIS=N", help="compute on one slice, such as z=14")
+    add(
+        "--through",
+        type=parse_voxel,
+        metavar="I,J,K",
+        help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
+    )
     add("--mask", type=Path, metavar="FILE", help="zeros and ones: .nii, .nii.gz, .npy, or .npz with 'mask'")
     add("--erode", type=int, default=0, metavar="N", help="peel N voxels off the mask's rim")
     add(
@@ -68,7 +77,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         metavar="T",
         help="positive numbers, or auto, or auto:N for N times that suit the eigenvalues (default auto:6)",
     )
-    add("-k", type=int, help="number of eigenpairs (default 200, or a quarter of the unknowns if that is less)")
+    add(
+        "-k",
+        type=int,
+        help="number of eigenpairs (default 200, for a volume 100, or a quarter of the unknowns if that is less)",
+    )
     add("--order", choices=tuple(ORDERS), help="order of the six components, where a NIfTI file does not declare it")
     add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
     add(
@@ -91,7 +104,7 @@ def run(args: argparse.Namespace) -> None:
         )
     from hks_jax.cli.job import Settings, compute
     from hks_jax.cli.outputs import check_folder, write_outputs
-    from hks_jax.cli.picture import draw
+    from hks_jax.cli.picture import draw, draw_volume
 
     check_folder(args.output)
     progress = Progress(args.quiet)
@@ -113,7 +126,7 @@ def run(args: argparse.Namespace) -> None:
             args.output,
             result,
             progress,
-            draw=lambda path: draw(result, path),
+            draw=lambda path: draw(result, path) if volume.dimension == 2 else draw_volume(result, path, args.through),
             nifti=is_nifti(args.file),
             command=sys.argv,
         )
@@ -140,7 +153,21 @@ def _read(args: argparse.Namespace, progress: Progress) -> TensorVolume:
     if args.erode:
         inside = np.ones(volume.shape, bool) if volume.mask is None else volume.mask
         volume = volume.with_mask(erode(inside, args.erode))
+    if args.through is not None:
+        _check_voxel(args.through, volume)
     return volume
+
+
+def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
+    """Raise ValueError, before the long computation, for a voxel through which no slices can be drawn."""
+    text = ",".join(map(str, voxel))
+    if volume.dimension != 3:
+        raise ValueError(f"--through: got {text}; only the picture of a volume has slices, not that of one slice")
+    if not all(i < n for i, n in zip(voxel, volume.shape, strict=True)):
+        raise ValueError(f"--through: got {text}; expected a voxel of the volume, whose shape is {volume.shape}")
+    if volume.mask is not None and not volume.mask[voxel]:
+        middle = ",".join(map(str, np.argwhere(volume.mask)[volume.mask.sum() // 2]))
+        raise ValueError(f"--through: voxel {text} is outside the mask; {middle}, for one, is inside")
 
 
 def _without_background(volume: TensorVolume, progress: Progress) -> TensorVolume:
