@@ -11,7 +11,7 @@ import pytest
 
 import hks_jax as hj
 from hks_jax import paper
-from hks_jax.cli import demo, main
+from hks_jax.cli import demo, main, picture
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.arguments import Times, parse_boundary, parse_times
@@ -133,14 +133,55 @@ def test_nifti_slice_end_to_end_keeps_the_affine(nifti, tmp_path):
     assert (data[np.isfinite(data)] > 0).all()
 
 
-def test_small_volumes_work_in_three_dimensions(nifti, tmp_path):
+def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
+    out, mask = tmp_path / "out", np.broadcast_to(disc()[..., None], (*SHAPE, 5)).copy()
+    mask[:4, :, 0] = False
+    np.save(tmp_path / "mask.npy", mask)
+    arguments = ["--metric", "inverse", "--mask", str(tmp_path / "mask.npy"), "-k", "12", "--through", "8,5,3"]
+    drawn, draw = [], picture.volume_panels
+    monkeypatch.setattr(picture, "volume_panels", lambda *args, **more: drawn.append(draw(*args, **more)))
+    assert main(["hks", str(nifti), "-o", str(out), "-q", *arguments, "--times", "20000", "50000"]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["hks.nii.gz", *QUIET_FILES]
+
+    tensors = read_tensors(nifti).tensors.astype(float)
+    grid = hj.Grid((*SHAPE, 5), (2.0, 2.0, 3.0), mask=mask)
+    expected = hj.hks(hj.eigenpairs(hj.TensorField.from_diffusion(grid, tensors, "inverse"), 12), [20000.0, 50000.0])
+    with np.load(out / "hks.npz") as read:
+        np.testing.assert_allclose(read["hks"], expected, rtol=1e-5)  # the file's tensors are float32
+        np.testing.assert_array_equal(read["mask"], mask)
+        image = nib.load(out / "hks.nii.gz")
+        assert image.shape == (*SHAPE, 5, 2)
+        np.testing.assert_allclose(image.affine, nib.load(nifti).affine)
+        np.testing.assert_array_equal(image.get_fdata(), np.moveaxis(read["hks"], 0, -1))
+    # Two columns of three slices with a colour bar each; the lines cross at voxel (8, 5, 3), in mm.
+    panels = drawn[0].axes
+    assert len(panels) == 8
+    assert [line.get_xdata()[0] for line in panels[0].lines][:1] == [16.0]
+    assert "t^{-3/2}" in panels[6].get_xlabel()
+
+
+def test_a_volume_without_a_mask_and_its_default_k(nifti, tmp_path):
     out = tmp_path / "out"
-    arguments = ["--metric", "tensor", "-k", "10", "--times", "auto:1", "--boundary", "neumann,neumann,periodic"]
+    arguments = ["--metric", "tensor", "--times", "auto:1", "--boundary", "neumann,neumann,periodic"]
     assert main(["hks", str(nifti), "-o", str(out), "-q", *arguments]) == 0
-    assert nib.load(out / "hks.nii.gz").shape == (*SHAPE, 5, 1)
     report = json.loads((out / "report.json").read_text())
+    assert report["settings"]["k"] == 100
     assert report["settings"]["boundary"] == ["neumann", "neumann", "periodic"]
     assert any("whose tensor is zero count as outside" in note for note in report["input"]["notes"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--through", "7,6"], ["--through", "three indices from 0"]),
+        (["--through", "7,6,5"], ["--through: got 7,6,5", "shape is (14, 12, 5)"]),
+        (["--through", "0,0,0"], ["voxel 0,0,0 is outside the mask"]),
+        (["--through", "7,6,2", "--slice", "z=1"], ["only the picture of a volume"]),
+    ],
+)
+def test_bad_voxels_are_refused_before_anything_is_computed(nifti, tmp_path, capsys, arguments, words):
+    code = main(["hks", str(nifti), "-o", str(tmp_path / "out"), "--metric", "inverse", *arguments])
+    assert one_error(capsys, code, *words) == 2
 
 
 @pytest.mark.parametrize(
@@ -385,7 +426,16 @@ def test_picture_helpers():
     assert bounding_box(inside) == (slice(3, 37), slice(0, 40))
     assert not away_from_rim(inside)[5:10].any()
     assert away_from_rim(inside)[10:30, 6:33].all()
-    np.testing.assert_array_equal(away_from_rim(inside[4:12]), inside[4:12])  # too thin: all of it
+    flat = away_from_rim(inside[4:12])  # seven nodes wide: what leaves a third of them
+    assert inside.sum() > 3 * 7 > flat.sum() / 37 > 7 / 3
+    assert not flat[[1, 7]].any()
+    np.testing.assert_array_equal(away_from_rim(inside[4:7]), inside[4:7])  # too thin: all of it
+    solid = np.zeros((30, 30, 9), bool)
+    solid[4:26, 4:26, 1:8] = True
+    assert bounding_box(solid, 1) == (slice(3, 27), slice(3, 27), slice(0, 9))
+    deep = away_from_rim(solid)
+    assert deep.sum() > solid.sum() / 3
+    assert not deep[..., 1].any()
 
 
 # ---------------------------------------------------------------------------------------------------- fits

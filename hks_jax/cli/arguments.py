@@ -1,4 +1,4 @@
-"""How the command line writes slices, repairs, boundaries and times."""
+"""How the command line writes slices, voxels, repairs, boundaries and times."""
 
 import math
 from argparse import ArgumentTypeError
@@ -36,6 +36,14 @@ def parse_repair(text: str) -> tuple[Repair, float | None]:
     if name not in REPAIRS or not (floor is None or 0 < floor < math.inf):
         raise ArgumentTypeError(f"got {text!r}; expected {', '.join(REPAIRS)}, or one with a floor, such as clip:1e-4")
     return cast(Repair, name), floor
+
+
+def parse_voxel(text: str) -> tuple[int, int, int]:
+    """Read ``64,64,14``."""
+    words = text.split(",")
+    if len(words) != 3 or not all(word.isdecimal() for word in words):
+        raise ArgumentTypeError(f"got {text!r}; expected three indices from 0, such as 64,64,14")
+    return int(words[0]), int(words[1]), int(words[2])
 
 
 def parse_boundary(text: str) -> BoundarySpec:

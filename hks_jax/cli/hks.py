@@ -5,11 +5,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hks_jax.cli.arguments import parse_boundary, parse_times
+import numpy as np
+
+from hks_jax.cli.arguments import parse_boundary, parse_times, parse_voxel
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments as add_reading_arguments
 from hks_jax.cli.reading import image_suffix, read
 from hks_jax.eigen.solve import SOLVERS
+from hks_jax.io import TensorVolume
 from hks_jax.io.repair import require_valid
 
 DESCRIPTION = """\
@@ -17,7 +20,10 @@ Compute the heat kernel signature of a field of diffusion tensors. FILE holds te
 with 'tensors' (*shape, d, d) and, optional, 'spacing', 'origin', 'mask', 'affine', or npy; or diffusion-weighted
 images, with --bval and --bvec.
 
-Writes to the folder OUT: hks.npz, hks.nii.gz (or .nrrd, .vti, as FILE is), hks.png and report.json.
+A volume is computed whole, in three dimensions, unless --slice cuts it.
+
+Writes to the folder OUT: hks.npz, hks.nii.gz (or .nrrd, .vti, as FILE is; times along the fourth axis), hks.png (of a
+volume, three orthogonal slices for each time) and report.json.
 """
 
 EPILOG = """\
@@ -46,6 +52,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "must be chosen but for NumPy's files, which hold the metric itself unless you choose",
     )
     add(
+        "--through",
+        type=parse_voxel,
+        metavar="I,J,K",
+        help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
+    )
+    add(
         "--components",
         choices=("raise", "largest", "all"),
         default="raise",
@@ -65,7 +77,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         metavar="T",
         help="positive numbers, or auto, or auto:N for N times that suit the eigenvalues (default auto:6)",
     )
-    add("-k", type=int, help="number of eigenpairs (default 200, or a quarter of the unknowns if that is less)")
+    add(
+        "-k",
+        type=int,
+        help="number of eigenpairs (default 200, for a volume 100, or a quarter of the unknowns if that is less)",
+    )
     add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
     add(
         "--normalisation",
@@ -88,7 +104,7 @@ def run(args: argparse.Namespace) -> None:
         )
     from hks_jax.cli.job import Settings, compute
     from hks_jax.cli.outputs import check_folder, write_outputs
-    from hks_jax.cli.picture import draw
+    from hks_jax.cli.picture import draw, draw_volume
 
     check_folder(args.output)
     progress = Progress(args.quiet)
@@ -99,6 +115,8 @@ def run(args: argparse.Namespace) -> None:
                 raise ValueError(
                     f"--slice: the volume is one voxel thick; pass --slice {'xyz'[volume.shape.index(1)]}=0"
                 )
+            if args.through is not None:
+                _check_voxel(args.through, volume)
             require_valid(volume.with_mask(volume.grid(args.components).mask), "--repair")
         settings = Settings(
             metric=args.metric or "tensor",
@@ -115,9 +133,21 @@ def run(args: argparse.Namespace) -> None:
             args.output,
             result,
             progress,
-            draw=lambda path: draw(result, path),
+            draw=lambda path: draw(result, path) if volume.dimension == 2 else draw_volume(result, path, args.through),
             image=image,
             command=sys.argv,
         )
     if not args.quiet:
         print("\n".join(map(str, files)))
+
+
+def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
+    """Raise ValueError, before the long computation, for a voxel through which no slices can be drawn."""
+    text = ",".join(map(str, voxel))
+    if volume.dimension != 3:
+        raise ValueError(f"--through: got {text}; only the picture of a volume has slices, not that of one slice")
+    if not all(i < n for i, n in zip(voxel, volume.shape, strict=True)):
+        raise ValueError(f"--through: got {text}; expected a voxel of the volume, whose shape is {volume.shape}")
+    if volume.mask is not None and not volume.mask[voxel]:
+        middle = ",".join(map(str, np.argwhere(volume.mask)[volume.mask.sum() // 2]))
+        raise ValueError(f"--through: voxel {text} is outside the mask; {middle}, for one, is inside")

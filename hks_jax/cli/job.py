@@ -23,7 +23,8 @@ from hks_jax.signatures.heat import Normalisation, hks
 from hks_jax.signatures.times import default_times
 from hks_jax.signatures.truncation import truncation
 
-DEFAULT_K = 200
+DEFAULT_K = {2: 200, 3: 100}
+"""Eigenpairs by dimension. A volume's factorisations cost so much more that fewer pairs take as long."""
 
 
 class ComputationError(RuntimeError):
@@ -79,7 +80,7 @@ def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Res
         field = TensorField.from_diffusion(grid, tensors, settings.metric, name="tensors")
         pencil = assemble(field, settings.boundary)
     unknowns = sum(part.space.n_dof for part in pencil.parts)
-    k = min(DEFAULT_K, max(1, unknowns // 4)) if settings.k is None else settings.k
+    k = min(DEFAULT_K[volume.dimension], max(1, unknowns // 4)) if settings.k is None else settings.k
     solver = _reporting(settings.solver, pencil, k, progress.update)
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
         pairs = eigenpairs(pencil, k, solver=solver)

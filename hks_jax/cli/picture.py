@@ -10,8 +10,18 @@ from scipy import ndimage
 
 from hks_jax.cli.job import Result
 from hks_jax.domain.grid import Grid
-from hks_jax.plot import new_figure, number_text, save_figure, scalar_image
+from hks_jax.io.volume import TensorVolume
+from hks_jax.plot import middle_node, new_figure, number_text, save_figure, scalar_image, volume_panels
 
+SPAN = (0.002, 0.998)
+"""The quantiles, away from the boundary, that the colours span."""
+LABELS = {
+    "raw": "HKS, in units of $t^{-3/2}$",
+    "heat-trace": "HKS / heat trace, in units of $t^{-3/2}$",
+    "volume": "HKS · volume",
+    "flat": r"HKS · $(4\pi t)^{3/2}$",
+}
+"""What the colours of a volume's picture are; t has the unit of the squared lengths in the metric."""
 RIM = 5
 """Nodes from the boundary. At small t it raises a Neumann signature up to fourfold: no colours would be left inside."""
 
@@ -24,7 +34,7 @@ def draw(
     first: tuple[str, Float[np.ndarray, "*shape"]] | None = None,
     title: str = "",
 ) -> None:
-    """Draw the signature, one image per time with its own colours; of a volume, the middle slice along z.
+    """Draw the signature of a slice, one image per time with its own colours.
 
     The colours span the values away from the boundary; arrows at a colour bar's ends say that some lie beyond.
 
@@ -40,15 +50,8 @@ def draw(
         titles = [f"$t$ = {number_text(t)}" for t in result.times]
     if first is not None:
         titles, values = [first[0], *titles], np.concatenate([first[1][None], values])
-    if result.volume.dimension == 3:
-        index = middle(inside)
-        values, inside = values[..., index], inside[..., index]
-        title = f"{title}, slice z = {index}".lstrip(", ")
-    box = bounding_box(inside)
-    values, inside = values[:, *box], inside[box]
-    spacing = result.volume.spacing[:2]
-    origin = [o + h * part.start for o, h, part in zip(result.volume.origin, spacing, box, strict=False)]
-    grid = Grid(inside.shape, spacing, origin)
+    grid, box = cropped(result.volume, inside)
+    values, inside, spacing = values[:, *box], inside[box], grid.spacing
 
     rows = math.ceil(len(values) / 4)
     columns = math.ceil(len(values) / rows)
@@ -58,7 +61,7 @@ def draw(
     deep = away_from_rim(inside)
     for i, (ax, image, text) in enumerate(zip(panels, values, titles, strict=False)):
         grey = first is not None and i == 0
-        low, high = np.quantile(image[inside if grey else deep], (0.01, 0.96) if grey else (0.002, 0.998))
+        low, high = np.quantile(image[inside if grey else deep], (0.01, 0.96) if grey else SPAN)
         constant = high - low <= 1e-6 * abs(high)  # the colours of rounding errors would say nothing
         vmin, vmax = (None, None) if constant else (float(low), float(high))
         image = np.where(inside, image, np.nan)
@@ -72,23 +75,57 @@ def draw(
     save_figure(figure, path)
 
 
-def middle(inside: Bool[np.ndarray, "nx ny nz"]) -> int:
-    """Return the index along z of the slice in the middle of the domain."""
-    layers = np.flatnonzero(inside.any(axis=(0, 1)))
-    return int(layers[len(layers) // 2])
+def draw_volume(result: Result, path: Path, through: tuple[int, int, int] | None = None) -> None:
+    """Draw the signature of a volume: for each time, with its own colours, three orthogonal slices.
 
-
-def bounding_box(inside: Bool[np.ndarray, "nx ny"], margin: int = 2) -> tuple[slice, slice]:
-    """Return the slices that cut a box around the True entries, with a margin."""
-    rows, columns = (np.flatnonzero(inside.any(axis=1 - a)) for a in (0, 1))
-    first, second = (
-        slice(max(int(along[0]) - margin, 0), min(int(along[-1]) + margin + 1, n))
-        for along, n in zip((rows, columns), inside.shape, strict=True)
+    Args:
+        result: what to draw.
+        path: the picture's file.
+        through: the voxel that the slices run through, or the nearest one in the domain; None: one in the middle.
+    """
+    inside = np.isfinite(result.values[0])
+    node = middle_node(inside) if through is None else _nearest(inside, through)
+    grid, box = cropped(result.volume, inside)
+    deep = away_from_rim(inside)
+    volume_panels(
+        result.values[:, *box],
+        result.times,
+        grid,
+        node=[i - part.start for i, part in zip(node, box, strict=True)],
+        limits=[tuple(np.quantile(values[deep], SPAN).tolist()) for values in result.values],
+        length_unit="mm" if result.volume.affine is not None else "",
+        label=LABELS[result.report["settings"]["normalisation"]],
+        path=path,
     )
-    return first, second
 
 
-def away_from_rim(inside: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "nx ny"]:
-    """Mark the nodes over `RIM` nodes from the boundary, or all of them if those are few."""
-    deep = ndimage.binary_erosion(inside, iterations=RIM)
-    return deep if deep.sum() > inside.sum() / 3 else inside
+def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) -> tuple[int, ...]:
+    """Return the voxel inside that is nearest: the mask's thinnest parts are no part of the domain."""
+    voxels = np.argwhere(inside)
+    return tuple(voxels[np.argmin(np.sum((voxels - voxel) ** 2, axis=1))].tolist())
+
+
+def cropped(volume: TensorVolume, inside: Bool[np.ndarray, "*shape"]) -> tuple[Grid, tuple[slice, ...]]:
+    """Return the grid of the domain's bounding box, without a mask, and the slices that cut the box out."""
+    box = bounding_box(inside)
+    origin = [o + h * part.start for o, h, part in zip(volume.origin, volume.spacing, box, strict=True)]
+    return Grid(inside[box].shape, volume.spacing, origin), box
+
+
+def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[slice, ...]:
+    """Return the slices that cut a box around the True entries, with a margin."""
+    ends = [(int(along.min()), int(along.max()) + 1) for along in np.nonzero(inside)]
+    return tuple(
+        slice(max(low - margin, 0), min(high + margin, n)) for (low, high), n in zip(ends, inside.shape, strict=True)
+    )
+
+
+def away_from_rim(inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
+    """Mark the nodes over `RIM` nodes from the boundary, or over as many as leave a third of the nodes."""
+    deep = inside
+    for _ in range(RIM):
+        smaller = ndimage.binary_erosion(deep)
+        if smaller.sum() <= inside.sum() / 3:
+            break
+        deep = smaller
+    return deep

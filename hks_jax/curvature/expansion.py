@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.curvature import taylor
-from hks_jax.curvature.gaussian import brioschi, require_surface
+from hks_jax.curvature.gaussian import brioschi
 from hks_jax.curvature.jet import (
     at_nodes,
     domain_nodes,
@@ -22,6 +22,7 @@ from hks_jax.curvature.jet import (
     wraps_per_axis,
 )
 from hks_jax.curvature.laplace_beltrami import laplacian
+from hks_jax.curvature.volume_coefficients import volume_coefficients
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.signatures.times import checked_times
@@ -30,15 +31,26 @@ Invariants: TypeAlias = tuple[Array, ...]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
 
 
-def hks_expansion(
-    field: TensorField, times: Any, order: int = 3, periodic: bool | Sequence[bool] = False
-) -> Float[Array, "n_times *shape"]:
-    """Return the short-time expansion of the heat kernel signature of a two-dimensional metric at the nodes,
+HIGHEST_ORDER = {2: 3, 3: 2}
+"""The last coefficient that is known here, by dimension."""
 
-        k_t(x, x) ≈ (1 + u₁t + u₂t² + u₃t³)/(4πt),
+
+def hks_expansion(
+    field: TensorField, times: Any, order: int | None = None, periodic: bool | Sequence[bool] = False
+) -> Float[Array, "n_times *shape"]:
+    """Return the short-time expansion of the heat kernel signature at the nodes,
+
+        k_t(x, x) ≈ (1 + u₁t + u₂t² + u₃t³)/(4πt)^(d/2),
+
+    on a surface with the Gaussian curvature K and ∇² = div grad (Polterovich 2000; McKean and Singer 1967 to u₂)
+
         u₁ = K/3,   u₂ = (K² + ∇²K)/15,   u₃ = 4K³/315 + 2|∇K|²/105 + K∇²K/30 + ∇⁴K/140,
 
-    with the Gaussian curvature K and ∇² = div grad (Polterovich 2000; McKean and Singer 1967 to u₂). It knows of no
+    in three dimensions to u₂, with the Ricci tensor Ric and the scalar curvature R,
+
+        u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120,
+
+    which is McKean and Singer's (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, where |Riem|² = 4|Ric|² − R². It knows of no
     boundary: it holds at distances well beyond 3√t from it.
 
     Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order, h the spacing
@@ -48,23 +60,28 @@ def hks_expansion(
     keep t below some 30 h², or the order below 3.
 
     Args:
-        field: the metric, d = 2.
+        field: the metric, d = 2 or 3.
         times: (n_times,) positive, in length².
-        order: the last power of t in the bracket, 0 … 3.
+        order: the last power of t in the bracket, 0 … 3 on a surface, 0 … 2 in three dimensions; None: the last.
         periodic: whether the axes are periodic, one for all or one per axis.
 
     Returns:
-        (n_times, *shape), in 1/length²; NaN outside the mask, and where no difference stencil fits in it.
+        (n_times, *shape), in 1/lengthᵈ; NaN outside the mask, and where no difference stencil fits in it.
 
     Raises:
-        ValueError: a field that is not two-dimensional; times that are not a vector of positive numbers; order
-            other than 0 … 3; fewer than 8 nodes on an axis of a nodal field; bad `periodic`.
+        ValueError: times that are not a vector of positive numbers; an order that is not known; fewer than 8 nodes on
+            an axis of a nodal field; bad `periodic`.
     """
-    require_surface(field)
-    if order not in (0, 1, 2, 3):
-        raise ValueError(f"order: got {order!r}; expected 0, 1, 2 or 3")
+    dimension = field.grid.dimension
+    highest = HIGHEST_ORDER[dimension]
+    order = highest if order is None else order
+    if order not in range(highest + 1):
+        raise ValueError(
+            f"order: got {order!r}; expected {', '.join(map(str, range(highest)))} or {highest}, as far as the "
+            f"expansion is known here in {dimension} dimensions"
+        )
     return _hks_expansion(
-        field, checked_times("times", times, field.tensors.dtype), int(order), wraps_per_axis(periodic, 2)
+        field, checked_times("times", times, field.tensors.dtype), int(order), wraps_per_axis(periodic, dimension)
     )
 
 
@@ -72,12 +89,17 @@ def hks_expansion(
 def _hks_expansion(
     field: TensorField, times: Float[Array, " n_times"], order: int, wraps: tuple[bool, ...]
 ) -> Float[Array, "n_times *shape"]:
-    invariants, known = (_nodal if field.function is None else _exact)(field, order, wraps)
-    t = times[:, None, None].astype(invariants[0].dtype)
+    d = field.grid.dimension
+    if d == 3:
+        coefficients, known = volume_coefficients(field, order, wraps)
+    else:
+        invariants, known = (_nodal if field.function is None else _exact)(field, order, wraps)
+        coefficients = _coefficients(*invariants)[: order + 1]
+    t = jnp.expand_dims(times, tuple(range(1, d + 1))).astype(coefficients[0].dtype)
     series = jnp.zeros_like(t)
-    for u in reversed(_coefficients(*invariants)[: order + 1]):
+    for u in reversed(coefficients):
         series = series * t + u
-    return nan_outside(series / (4 * jnp.pi * t), known)
+    return nan_outside(series / (4 * jnp.pi * t) ** (d / 2), known)
 
 
 def _coefficients(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0) -> list[Array]:

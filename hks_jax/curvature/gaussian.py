@@ -6,7 +6,8 @@ from functools import partial
 import jax
 from jaxtyping import Array, Float
 
-from hks_jax.curvature.jet import Jet, christoffel, inner, metric_jet, nan_outside, wraps_per_axis
+from hks_jax.curvature.jet import Jet, metric_jet, nan_outside, wraps_per_axis
+from hks_jax.curvature.riemann import riemann
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
 
@@ -43,15 +44,11 @@ def brioschi(metric: Jet) -> Float[Array, "..."]:
     """Return the Gaussian curvature from the jet of a metric ((E, F), (F, G)).
 
     This is Brioschi's formula (Gray, Modern Differential Geometry of Curves and Surfaces, §17.1) with its two
-    determinants expanded, in Christoffel symbols of the first kind:
+    determinants expanded, in Christoffel symbols of the first kind; the right-hand side is R₁₂₁₂:
 
         K (EG − F²) = ∂₁∂₂F − ½ ∂₂∂₂E − ½ ∂₁∂₁G + ⟨Γ₁₂, Γ₁₂⟩ − ⟨Γ₁₁, Γ₂₂⟩.
     """
-    second, symbols = metric.hessian, christoffel(metric)
-    determinant, inverse = spd.determinant(metric.value), spd.inverse(metric.value)
-    linear = second[..., 0, 1, 0, 1] - (second[..., 0, 0, 1, 1] + second[..., 1, 1, 0, 0]) / 2
-    mixed = inner(inverse, symbols[..., 0, 1], symbols[..., 0, 1])
-    return (linear + mixed - inner(inverse, symbols[..., 0, 0], symbols[..., 1, 1])) / determinant
+    return riemann(metric)[..., 0, 0] / spd.determinant(metric.value)
 
 
 def require_surface(field: TensorField) -> None:

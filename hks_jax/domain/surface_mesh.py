@@ -1,59 +1,17 @@
 """A triangulated surface in space."""
 
-from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from hks_jax.domain import spd
-from hks_jax.domain.static_array import StaticArray
-from hks_jax.domain.tensor_field import checked_tensors
+from hks_jax.domain.surface_tensors import tangential_metric
+from hks_jax.domain.tensor_field import MetricChoice, checked_tensors
+from hks_jax.domain.triangulation import Triangulation
 from hks_jax.traced import is_traced
-
-
-@jax.tree_util.register_static
-class Triangulation:
-    """The connectivity of a triangle mesh: static, hashable."""
-
-    def __init__(self, faces: Int[np.ndarray, "F 3"], n_vertices: int) -> None:
-        self._faces = StaticArray(faces, dtype=np.int64)
-        self.n_vertices = n_vertices
-
-    @property
-    def faces(self) -> Int[np.ndarray, "F 3"]:
-        """Vertex indices, one row per triangle."""
-        return self._faces.value
-
-    @cached_property
-    def boundary_vertices(self) -> np.ndarray:
-        """The vertices on edges that belong to one triangle only, bool (V,)."""
-        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        unique, counts = np.unique(edges, axis=0, return_counts=True)
-        on_boundary = np.zeros(self.n_vertices, dtype=bool)
-        on_boundary[unique[counts == 1].ravel()] = True
-        return on_boundary
-
-    @cached_property
-    def labels(self) -> tuple[np.ndarray, int]:
-        """The connected component of each vertex (1 … n), and their number n."""
-        rows, cols = self.faces[:, [0, 1]].ravel(), self.faces[:, [1, 2]].ravel()
-        graph = coo_matrix((np.ones(rows.size), (rows, cols)), shape=(self.n_vertices,) * 2)
-        count, labels = connected_components(graph, directed=False)
-        return labels + 1, int(count)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (
-            isinstance(other, Triangulation) and self.n_vertices == other.n_vertices and self._faces == other._faces
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.n_vertices, self._faces))
 
 
 class SurfaceMesh(eqx.Module):
@@ -100,14 +58,55 @@ class SurfaceMesh(eqx.Module):
         self.triangulation = Triangulation(indices, n)
         self._metric = None if metric is None else _checked_metric(metric, len(indices))
 
+    @classmethod
+    def from_tensors(
+        cls,
+        vertices: Any,
+        faces: Any,
+        tensors: Any,
+        metric: MetricChoice | None = None,
+        *,
+        at: Literal["faces", "vertices"] | None = None,
+    ) -> "SurfaceMesh":
+        """Return the surface with the metric of a field of tensors D in space, of which the tangential part counts.
+
+        The tangential part of D is D as a quadratic form on the vectors of a triangle's plane: for diffusion tensors,
+        diffusion that stays in the surface, with the diffusivities that were measured in it. What metric g it stands
+        for has no default (see `TensorField.from_diffusion`): ``"tensor"``, g is the tangential part; ``"inverse"``,
+        its inverse in the plane; ``"adjugate"``, that inverse times its determinant in the plane. With D the identity
+        all three are the metric that space induces.
+
+        Tensors at the vertices are averaged, plainly, over the three of each triangle: so does linear interpolation at
+        its centre, and tensors that are tangential themselves, without an inverse, have a mean too. Differentiable
+        with respect to tensors and vertices.
+
+        Args:
+            vertices: positions (V, 3).
+            faces: vertex indices (F, 3).
+            tensors: (F, 3, 3) or (V, 3, 3), symmetric, in the axes of space, positive definite on the planes of the
+                faces that they act on.
+            metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
+            at: whether the tensors belong to ``"faces"`` or ``"vertices"``; None: their number tells, unless F = V.
+
+        Raises:
+            ValueError: a metric that is none of these; wrong shapes; tensors that are NaN or infinite, unsymmetric or
+                not positive definite on a face (with how many, and where the first is); what `SurfaceMesh` raises.
+        """
+        mesh = cls(vertices, faces)
+        return cls(mesh.vertices, mesh.faces, tangential_metric(mesh._edges, mesh.triangulation, tensors, metric, at))
+
     @property
     def metric(self) -> Float[Array, "F 2 2"]:
         """The metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀."""
         if self._metric is not None:
             return self._metric
+        return jnp.einsum("fxa,fxb->fab", self._edges, self._edges, precision="highest")
+
+    @property
+    def _edges(self) -> Float[Array, "F 3 2"]:
+        """The edges v₁ − v₀ and v₂ − v₀ of each triangle, as columns."""
         corners = self.vertices[self.faces]
-        edges = jnp.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
-        return jnp.einsum("fxa,fxb->fab", edges, edges, precision="highest")
+        return jnp.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
 
     @property
     def faces(self) -> Int[np.ndarray, "F 3"]:

@@ -70,11 +70,7 @@ class TensorField(eqx.Module):
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
         - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
         """
-        if metric not in ("tensor", "inverse", "adjugate"):
-            raise ValueError(
-                f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, the distances of diffusion), '
-                '"tensor" (g = D, as in the paper) or "adjugate" (g = |D| D⁻¹). There is no default: choose one'
-            )
+        check_metric_choice(metric)
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
         if metric == "tensor":
             return cls(grid, tensors)
@@ -93,6 +89,15 @@ class TensorField(eqx.Module):
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
         """The tensors, with the identity outside the mask: what computations read."""
         return _identity_outside(self.grid, self.tensors)
+
+
+def check_metric_choice(metric: str | None) -> None:
+    """Raise ValueError unless it names what metric diffusion tensors stand for."""
+    if metric not in ("tensor", "inverse", "adjugate"):
+        raise ValueError(
+            f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, the distances of diffusion), '
+            '"tensor" (g = D, as in the paper) or "adjugate" (g = |D| D⁻¹). There is no default: choose one'
+        )
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
@@ -134,29 +139,43 @@ def checked_tensors(
 
 def _check_spd(name: str, tensors: Float[np.ndarray, "*shape d d"], inside: np.ndarray, place: str = "node") -> None:
     """Raise ValueError unless the tensors are finite, symmetric and positive definite inside."""
-    total = int(inside.sum())
-
-    def fail(bad: np.ndarray, what: str, remedy: str) -> None:
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"{name}: {int(bad.sum())} of {total} tensors are {what} (the first at {place} {first}); "
-            f"expected symmetric positive definite tensors. {remedy}"
+    require_finite_symmetric(name, tensors, inside, place)
+    bad = inside & ~spd.is_spd(tensors)
+    if bad.any():
+        worst = np.linalg.eigvalsh(tensors[bad].astype(np.float64)).min()
+        _fail(
+            name,
+            bad,
+            inside,
+            place,
+            f"not positive definite, worst eigenvalue {worst:.3g}",
+            "Exclude these nodes by the grid's mask, or raise their eigenvalues (hks_jax.io.repair_tensors)",
         )
 
+
+def require_finite_symmetric(
+    name: str,
+    tensors: Float[np.ndarray, "*shape d d"],
+    inside: np.ndarray,
+    place: str,
+    remedy: str = "Exclude these nodes by the grid's mask",
+) -> None:
+    """Raise ValueError unless the tensors are finite and symmetric inside; `remedy` is for NaN."""
     finite = np.isfinite(tensors).all(axis=(-2, -1))
     bad = inside & ~finite
     if bad.any():
-        fail(bad, "NaN or infinite", "Exclude these nodes by the grid's mask")
+        _fail(name, bad, inside, place, "NaN or infinite", remedy)
     scale = np.abs(tensors).max(axis=(-2, -1))
     skew = np.abs(tensors - np.swapaxes(tensors, -1, -2)).max(axis=(-2, -1))
     bad = inside & (skew > 1e-5 * scale)
     if bad.any():
-        fail(bad, "unsymmetric", "Pass (T + Tᵀ)/2 if the difference is noise, or check the component order")
-    bad = inside & ~spd.is_spd(tensors)
-    if bad.any():
-        worst = np.linalg.eigvalsh(tensors[bad].astype(np.float64)).min()
-        fail(
-            bad,
-            f"not positive definite, worst eigenvalue {worst:.3g}",
-            "Exclude these nodes by the grid's mask, or raise their eigenvalues (hks_jax.io.repair_tensors)",
-        )
+        what = "Pass (T + Tᵀ)/2 if the difference is noise, or check the component order"
+        _fail(name, bad, inside, place, "unsymmetric", what)
+
+
+def _fail(name: str, bad: np.ndarray, inside: np.ndarray, place: str, what: str, remedy: str) -> None:
+    first = tuple(int(i) for i in np.argwhere(bad)[0])
+    raise ValueError(
+        f"{name}: {int(bad.sum())} of {int(inside.sum())} tensors are {what} (the first at {place} {first}); "
+        f"expected symmetric positive definite tensors. {remedy}"
+    )

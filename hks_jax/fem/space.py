@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.surface_mesh import Triangulation
+from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
 
 

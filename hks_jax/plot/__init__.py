@@ -17,3 +17,6 @@ from hks_jax.plot.sensitivity import sensitivity as sensitivity
 from hks_jax.plot.surfaces import surface as surface
 from hks_jax.plot.tracing import evenly_spaced_lines as evenly_spaced_lines
 from hks_jax.plot.tracing import trace as trace
+from hks_jax.plot.volumes import middle_node as middle_node
+from hks_jax.plot.volumes import orthogonal_slices as orthogonal_slices
+from hks_jax.plot.volumes import volume_panels as volume_panels

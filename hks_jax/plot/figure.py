@@ -82,8 +82,12 @@ def frame(ax: Axes, grid: Grid) -> None:
 def colour_bar(ax: Axes, mappable: ScalarMappable, label: str = "", **kwargs: Any) -> Colorbar:
     """Add a colour bar to the right of `ax`, exactly as tall as its box."""
     # An inset moves with its parent's box: the bar stays as tall as an image of equal aspect.
-    bar_axes = ax.inset_axes((1.03, 0.0, 0.045, 1.0))
-    bar = ax.get_figure().colorbar(mappable, cax=bar_axes, **kwargs)  # type: ignore[union-attr]
+    return colour_bar_in(ax.inset_axes((1.03, 0.0, 0.045, 1.0)), mappable, label, **kwargs)
+
+
+def colour_bar_in(bar_axes: Axes, mappable: ScalarMappable, label: str = "", **kwargs: Any) -> Colorbar:
+    """Draw a colour bar in axes of its own, with few ticks and powers of ten."""
+    bar = bar_axes.get_figure().colorbar(mappable, cax=bar_axes, **kwargs)  # type: ignore[union-attr]
     formatter = ScalarFormatter(useOffset=False, useMathText=True)
     formatter.set_powerlimits((-3, 4))
     if "format" not in kwargs and "ticks" not in kwargs:
@@ -91,7 +95,7 @@ def colour_bar(ax: Axes, mappable: ScalarMappable, label: str = "", **kwargs: An
         bar.formatter = formatter
         bar.update_ticks()
     bar_axes.tick_params(labelsize=SMALL)
-    bar_axes.yaxis.get_offset_text().set_fontsize(SMALL)
+    (bar_axes.yaxis if bar.orientation == "vertical" else bar_axes.xaxis).get_offset_text().set_fontsize(SMALL)
     bar.outline.set_linewidth(0.6)
     if label:
         bar.set_label(label, fontsize=SMALL)

@@ -52,8 +52,8 @@ def scalar_image(
         ValueError: a 3D grid, or values that are not of its shape or have nothing finite inside its mask.
     """
     require_plane("grid", grid)
-    array = _masked("values", values, grid)
-    low, high = _colour_range(array.compressed(), quantiles, least_range)
+    array = masked("values", values, grid)
+    low, high = colour_range(array.compressed(), quantiles, least_range)
     low, high = low if vmin is None else vmin, high if vmax is None else vmax
     image = ax.imshow(
         array.T,
@@ -66,8 +66,7 @@ def scalar_image(
     )
     frame(ax, grid)
     if colorbar:
-        beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-        colour_bar(ax, image, label, extend=beyond[bool(array.min() < low), bool(array.max() > high)])
+        colour_bar(ax, image, label, extend=beyond(array, low, high))
     return image
 
 
@@ -104,19 +103,10 @@ def hks_panels(
         ValueError: shapes that do not agree; no time at all.
     """
     require_plane("grid", grid)
-    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    if np.shape(values) != (t.size, *grid.shape) or t.ndim != 1 or t.size == 0:
-        raise ValueError(
-            f"values: got shape {np.shape(values)} and times of shape {t.shape}; expected "
-            f"(n_times, *grid.shape) = {(t.size, *grid.shape)} and at least one time"
-        )
-    if titles is None:
-        titles = [f"$t$ = {number_text(s)}{' ' * bool(unit)}{unit}" for s in t]
-    elif len(titles) != t.size:
-        raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
-    images = [_masked("values", v, grid) for v in np.asarray(values)]
+    t, titles = panel_titles(values, times, grid, titles, unit)
+    images = [masked("values", v, grid) for v in np.asarray(values)]
     everything = np.concatenate([image.compressed() for image in images])
-    vmin, vmax = _colour_range(everything, quantiles) if shared_range else (None, None)
+    vmin, vmax = colour_range(everything, quantiles) if shared_range else (None, None)
 
     rows, columns = _layout(t.size)
     fig = _panel_figure(grid, rows, columns, bool(suptitle))
@@ -135,7 +125,31 @@ def hks_panels(
     return fig
 
 
-def _masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
+def panel_titles(
+    values: Any, times: Any, grid: Grid, titles: Sequence[str] | None, unit: str
+) -> tuple[Float[np.ndarray, " n_times"], Sequence[str]]:
+    """Return the times and a title for each; raise ValueError if they, the values and the grid do not agree."""
+    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    if np.shape(values) != (t.size, *grid.shape) or t.ndim != 1 or t.size == 0:
+        raise ValueError(
+            f"values: got shape {np.shape(values)} and times of shape {t.shape}; expected "
+            f"(n_times, *grid.shape) = {(t.size, *grid.shape)} and at least one time"
+        )
+    if titles is None:
+        titles = [f"$t$ = {number_text(s)}{' ' * bool(unit)}{unit}" for s in t]
+    elif len(titles) != t.size:
+        raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
+    return t, titles
+
+
+def beyond(values: np.ma.MaskedArray, low: float, high: float) -> str:
+    """Return at which ends of a colour bar values lie beyond it, in matplotlib's words."""
+    ends = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+    return ends[bool(values.min() < low), bool(values.max() > high)]
+
+
+def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
+    """Return values on the grid, masked where they are not finite or outside its mask; raise if that is everywhere."""
     if isinstance(values, np.ma.MaskedArray):
         return values
     array = np.asarray(values, dtype=np.float64)
@@ -147,7 +161,8 @@ def _masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
     return masked
 
 
-def _colour_range(values: np.ndarray, quantiles: tuple[float, float], least_range: float = 1e-6) -> tuple[float, float]:
+def colour_range(values: np.ndarray, quantiles: tuple[float, float], least_range: float = 1e-6) -> tuple[float, float]:
+    """Return the values of the first and the last colour; see `scalar_image`."""
     low, high = (float(q) for q in np.quantile(values, quantiles))
     lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
     return low - max(lacking, 0) / 2, high + max(lacking, 0) / 2

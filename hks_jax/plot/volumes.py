@@ -1,0 +1,210 @@
+"""Scalars on volumes: three orthogonal slices through a node, and panels of them over time."""
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from hks_jax.domain.grid import Grid
+from hks_jax.plot.figure import SMALL, colour_bar_in, new_figure, save_figure
+from hks_jax.plot.images import beyond, colour_range, masked, panel_titles, scalar_image
+
+AXES = "xyz"
+NORMALS = (2, 1, 0)
+"""The axes that the three slices are orthogonal to, from the first slice to the last: planes xy, xz, yz."""
+_COLUMN, _COLUMNS = 2.3, 6
+"""The width of a column of slices, in inches, and how many are side by side."""
+
+
+def middle_node(inside: Bool[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
+    """Return the node inside that is nearest to the middle of the nodes inside.
+
+    Raises:
+        ValueError: no node inside.
+    """
+    nodes = np.argwhere(inside)
+    if not len(nodes):
+        raise ValueError("inside: no node is; expected at least one")
+    extent = np.maximum(np.ptp(nodes, axis=0), 1)
+    distance = np.sum(((nodes - nodes.mean(axis=0)) / extent) ** 2, axis=1)
+    return tuple(nodes[np.argmin(distance)].tolist())
+
+
+def orthogonal_slices(
+    axes: Sequence[Axes],
+    values: Float[ArrayLike, "nx ny nz"],
+    grid: Grid,
+    *,
+    node: Sequence[int] | None = None,
+    cross: bool = True,
+    cmap: str | Colormap = "viridis",
+    vmin: float | None = None,
+    vmax: float | None = None,
+    quantiles: tuple[float, float] = (0.0, 1.0),
+    **kwargs: Any,
+) -> AxesImage:
+    """Draw the slices xy, xz and yz of a volume through a node, in the same colours, and return the last image.
+
+    Args:
+        axes: three axes, for the planes xy, xz and yz in this order.
+        values: (*shape,), NaN where there is nothing to draw.
+        grid: the 3D grid of the values; its spacing makes the aspect.
+        node: indices (i, j, k) of the node; None: `middle_node` of what is finite.
+        cross: whether thin lines show where the other two slices are.
+        cmap: colour map.
+        vmin: value of the first colour; None: from `quantiles`.
+        vmax: value of the last colour; None: from `quantiles`.
+        quantiles: the quantiles of the whole volume that take the first and the last colour where vmin and vmax do
+            not say.
+        **kwargs: passed to `Axes.imshow`.
+
+    Raises:
+        ValueError: not three axes, a grid that is not 3D, values that are not of its shape or nowhere finite, a node
+            out of range or where there is no value.
+    """
+    if len(axes) != 3:
+        raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
+    array = _volume(values, grid)
+    chosen = _checked_node(node, array, grid)
+    low, high = colour_range(array.compressed(), quantiles)
+    low, high = low if vmin is None else vmin, high if vmax is None else vmax
+    for ax, normal in zip(axes, NORMALS, strict=True):
+        first, second = keep = [a for a in range(3) if a != normal]
+        shape, spacing, origin = (np.take(of, keep).tolist() for of in (grid.shape, grid.spacing, grid.origin))
+        slab = np.take(array, chosen[normal], axis=normal)
+        image = scalar_image(
+            ax, slab, Grid(shape, spacing, origin), cmap=cmap, vmin=low, vmax=high, colorbar=False, **kwargs
+        )
+        if cross:
+            style: dict[str, Any] = {"color": "0.5", "linewidth": 0.6, "linestyle": (0, (4, 3))}
+            ax.axvline(grid.axes[first][chosen[first]], **style)
+            ax.axhline(grid.axes[second][chosen[second]], **style)
+    return image
+
+
+def volume_panels(
+    values: Float[ArrayLike, "n_times nx ny nz"],
+    times: Sequence[float] | Float[ArrayLike, " n_times"],
+    grid: Grid,
+    *,
+    node: Sequence[int] | None = None,
+    titles: Sequence[str] | None = None,
+    unit: str = "",
+    length_unit: str = "",
+    limits: Sequence[tuple[float, float]] | None = None,
+    path: str | os.PathLike[str] | None = None,
+    cmap: str | Colormap = "viridis",
+    quantiles: tuple[float, float] = (0.0, 1.0),
+    label: str = "",
+    suptitle: str = "",
+) -> Figure:
+    """Return a figure with one column per time: three orthogonal slices of the HKS, and their colour bar.
+
+    Args:
+        values: (n_times, *shape), as `hks_jax.hks` returns them.
+        times: (n_times,).
+        grid: the 3D grid of the values.
+        node: indices (i, j, k) of the node that the slices run through; None: `middle_node` of what is finite.
+        titles: one per time; None: “t = …”.
+        unit: the unit of t, written after it.
+        length_unit: the unit of the coordinates.
+        limits: the values of the first and the last colour, one pair per time; None: from `quantiles`.
+        path: where to save the figure; None: nowhere.
+        cmap: colour map.
+        quantiles: as for `orthogonal_slices`.
+        label: the colour bars' label.
+        suptitle: the figure's title.
+
+    Raises:
+        ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
+    """
+    _require_volume(grid)
+    t, titles = panel_titles(values, times, grid, titles, unit)
+    volumes = [_volume(v, grid) for v in np.asarray(values)]
+    if limits is None:
+        limits = [colour_range(volume.compressed(), quantiles) for volume in volumes]
+    elif len(limits) != t.size:
+        raise ValueError(f"limits: got {len(limits)}; expected {t.size}, one pair per time")
+    chosen = _checked_node(node, volumes[0], grid)
+
+    rows = math.ceil(t.size / _COLUMNS)
+    columns = math.ceil(t.size / rows)
+    heights = _heights(grid)
+    fig = new_figure(
+        columns * (_COLUMN + 0.2) + 0.6, rows * (sum(heights) + 1.35 + 0.15 * bool(label)) + 0.3 * bool(suptitle)
+    )
+    blocks = np.atleast_1d(np.asarray(fig.subfigures(rows, 1), dtype=object))
+    for row, block in enumerate(blocks):
+        panels = block.subplots(4, columns, squeeze=False, height_ratios=[*heights, 0.09])
+        for column in range(columns):
+            index = row * columns + column
+            if index >= t.size:
+                for ax in panels[:, column]:
+                    ax.remove()
+                continue
+            low, high = limits[index]
+            image = orthogonal_slices(
+                panels[:3, column], volumes[index], grid, node=chosen, cmap=cmap, vmin=low, vmax=high
+            )
+            panels[0, column].set_title(titles[index], fontsize="medium")
+            _label_slices(panels[:3, column], grid, chosen, length_unit, leftmost=column == 0)
+            extend = beyond(volumes[index], low, high)
+            colour_bar_in(panels[3, column], image, label, orientation="horizontal", extend=extend)
+    if suptitle:
+        fig.suptitle(suptitle)
+    if path is not None:
+        save_figure(fig, path)
+    return fig
+
+
+def _label_slices(axes: Sequence[Axes], grid: Grid, node: tuple[int, ...], unit: str, leftmost: bool) -> None:
+    suffix = f" ({unit})" if unit else ""
+    for ax, normal in zip(axes, NORMALS, strict=True):
+        first, second = (a for a in range(3) if a != normal)
+        ax.set_xlabel(AXES[first] + suffix, fontsize=SMALL, labelpad=1)
+        ax.tick_params(labelleft=leftmost)
+        if leftmost:
+            place = f"{AXES[normal]} = {grid.axes[normal][node[normal]]:.4g}{' ' * bool(unit)}{unit}"
+            ax.set_ylabel(f"{place}\n{AXES[second]}{suffix}", fontsize=SMALL)
+
+
+def _heights(grid: Grid) -> list[float]:
+    """Return the slices' heights in inches, when the widest of them is as wide as a column."""
+    planes = [[a for a in range(3) if a != normal] for normal in NORMALS]
+    sizes = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
+    scale = _COLUMN / max(sizes[0], sizes[1])
+    return [min(max(scale * sizes[second], 0.25), 3 * _COLUMN) for _, second in planes]
+
+
+def _volume(values: Any, grid: Grid) -> np.ma.MaskedArray:
+    _require_volume(grid)
+    return masked("values", values, grid)
+
+
+def _require_volume(grid: Grid) -> None:
+    if grid.dimension != 3:
+        raise ValueError(
+            f"grid: got shape {grid.shape}; expected a grid of three dimensions. Use hks_panels in the plane"
+        )
+
+
+def _checked_node(node: Sequence[int] | None, array: np.ma.MaskedArray, grid: Grid) -> tuple[int, int, int]:
+    inside = ~np.ma.getmaskarray(array)
+    if node is None:
+        return middle_node(inside)
+    chosen = tuple(int(i) for i in node)
+    if len(chosen) != 3 or not all(0 <= i < n for i, n in zip(chosen, grid.shape, strict=True)):
+        raise ValueError(f"node: got {tuple(node)}; expected three indices within the grid's shape {grid.shape}")
+    if not inside[chosen]:
+        raise ValueError(
+            f"node: {chosen} has no value; the one nearest to the middle that has is {middle_node(inside)}"
+        )
+    return chosen
