@@ -15,6 +15,8 @@ from hks_jax.accuracy import AccuracyWarning as AccuracyWarning
 from hks_jax.curvature import gaussian_curvature as gaussian_curvature
 from hks_jax.curvature import hks_expansion as hks_expansion
 from hks_jax.curvature import laplace_beltrami as laplace_beltrami
+from hks_jax.domain.degenerate import DegeneratePoints as DegeneratePoints
+from hks_jax.domain.degenerate import degenerate_points as degenerate_points
 from hks_jax.domain.grid import Grid as Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField

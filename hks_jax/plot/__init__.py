@@ -4,7 +4,10 @@ Every function draws on the axes that it is given, so that pictures compose: int
 the HKS, ellipses beside a surface. No function touches pyplot, a backend or rcParams.
 """
 
+from hks_jax.plot.convolution import lic_texture as lic_texture
+from hks_jax.plot.convolution import line_integral_convolution as line_integral_convolution
 from hks_jax.plot.curves import hks_curves as hks_curves
+from hks_jax.plot.degenerate import degenerate_points as degenerate_points
 from hks_jax.plot.ellipses import ellipses as ellipses
 from hks_jax.plot.figure import new_figure as new_figure
 from hks_jax.plot.figure import number_text as number_text
