@@ -32,6 +32,7 @@ from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import reflect as reflect
 from hks_jax.fem.pencil import MirrorPencil as MirrorPencil
 from hks_jax.fem.pencil import Pencil as Pencil
+from hks_jax.signatures.boundary import boundary_influence as boundary_influence
 from hks_jax.signatures.custom import spectral_signature as spectral_signature
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance
 from hks_jax.signatures.distances import diffusion_distance as diffusion_distance
@@ -46,6 +47,7 @@ from hks_jax.signatures.times import default_times as default_times
 from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
 from hks_jax.signatures.wave import wks as wks
+from hks_jax.signatures.weyl import weyl_count as weyl_count
 
 __version__ = "0.1.0"
 

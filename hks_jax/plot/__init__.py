@@ -17,6 +17,7 @@ from hks_jax.plot.images import hks_panels as hks_panels
 from hks_jax.plot.images import scalar_image as scalar_image
 from hks_jax.plot.lines import integral_lines as integral_lines
 from hks_jax.plot.sensitivity import sensitivity as sensitivity
+from hks_jax.plot.spectrum import spectrum as spectrum
 from hks_jax.plot.surfaces import surface as surface
 from hks_jax.plot.tracing import evenly_spaced_lines as evenly_spaced_lines
 from hks_jax.plot.tracing import trace as trace
