@@ -38,10 +38,13 @@ from hks_jax.signatures.distances import biharmonic_distance as biharmonic_dista
 from hks_jax.signatures.distances import diffusion_distance as diffusion_distance
 from hks_jax.signatures.distances import global_point_signature as global_point_signature
 from hks_jax.signatures.distances import shape_dna as shape_dna
+from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.heat import heat_kernel as heat_kernel
 from hks_jax.signatures.heat import heat_trace as heat_trace
 from hks_jax.signatures.heat import hks as hks
 from hks_jax.signatures.heat import scale_invariant_hks as scale_invariant_hks
+from hks_jax.signatures.scale_space import gaussian_scale_space as gaussian_scale_space
+from hks_jax.signatures.scale_space import tensor_invariants as tensor_invariants
 from hks_jax.signatures.times import default_energies as default_energies
 from hks_jax.signatures.times import default_times as default_times
 from hks_jax.signatures.truncation import Truncation as Truncation
