@@ -8,9 +8,9 @@ from typing import NoReturn
 import numpy as np
 
 from hks_jax import __version__
-from hks_jax.cli import demo, fit, hks, paper
+from hks_jax.cli import curvature, demo, fit, hks, paper, plot, spectrum
 
-SUBCOMMANDS = (hks, fit, demo, paper)
+SUBCOMMANDS = (hks, spectrum, curvature, fit, plot, demo, paper)
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
