@@ -1,5 +1,9 @@
 """More pictures: degenerate points, line integral convolution, spectra, rows over t, the boundary's influence."""
 
+import importlib.util
+import inspect
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -116,3 +120,137 @@ def test_shading_keeps_the_mean_colour_and_the_grain_its_size_on_paper():
         plot.line_integral_convolution(ax, field, contrast=2)
     with pytest.raises(ValueError, match="which: got 'medium'"):
         plot.line_integral_convolution(ax, field, "medium")
+
+
+# --- spectra, curves, rows, influence -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def square():
+    grid = hj.Grid.from_bounds(0, 1, (12, 12))
+    field = hj.TensorField(grid, np.broadcast_to(np.eye(2), (12, 12, 2, 2)))
+    return field, hj.eigenpairs(field, 30, solver="dense", multiplet="drop")
+
+
+def test_spectrum_is_the_counting_function(square):
+    field, pairs = square
+    values = np.asarray(pairs.eigenvalues)[np.asarray(pairs.kept)]
+    ax = axes()
+    count, law, area = plot.spectrum(ax, pairs, field, unit="1/s")
+    x, y = count.get_data()
+    np.testing.assert_array_equal(x[1::2], values)
+    np.testing.assert_array_equal(y[1::2], np.arange(1, values.size + 1))
+    np.testing.assert_array_equal(y[::2], np.arange(values.size))
+    t = np.asarray(law.get_xdata())
+    np.testing.assert_allclose(law.get_ydata(), (t + 4 * np.sqrt(t)) / (4 * np.pi), rtol=1e-9)
+    np.testing.assert_allclose(area.get_ydata(), t / (4 * np.pi), rtol=1e-9)
+    assert ax.get_xlabel().endswith(" in 1/s")
+    assert len(plot.spectrum(axes(), pairs)) == 2
+    count, law, area = plot.spectrum(axes(), pairs, field, remainder=True)
+    assert np.abs(count.get_ydata()).max() < 3
+    assert np.abs(law.get_ydata()).max() == 0
+    assert np.max(area.get_ydata()) <= 0
+
+
+def test_unresolved_times_are_shaded():
+    grid, times = hj.Grid((3, 3)), np.geomspace(0.01, 1, 9)
+    values = (1 / times)[:, None, None] * np.ones((9, 3, 3))
+    ax = axes()
+    plot.hks_curves(ax, values, times, grid, [[1, 1]], limit=0.1, unit="s")
+    (span,) = ax.patches
+    assert span.get_x() < 0.01
+    assert span.get_x() + span.get_width() == pytest.approx(0.1)
+    assert ax.get_xlabel() == "$t$ in s"
+    assert ax.get_legend().get_texts()[-1].get_text() == "unresolved $t$"
+    resolved = axes()
+    plot.hks_curves(resolved, values, times, grid, [[1, 1]], limit=0.001)
+    assert not resolved.patches
+
+
+def test_rows_over_time():
+    grid = hj.Grid((6, 4), mask=np.indices((6, 4))[0] < 5)
+    rng = np.random.default_rng(0)
+    rows = {"HKS": rng.random((3, 6, 4)), "trace": 5 + rng.random((3, 6, 4))}
+    fig = plot.time_rows(rows, [0.1, 1, 10], grid, unit="s", shared="row", cmap={"HKS": "viridis", "trace": "cividis"})
+    assert len(fig.axes) == 6
+    assert [ax.get_title() for ax in fig.axes[:3]] == ["$t$ = 0.1 s", "$t$ = 1 s", "$t$ = 10 s"]
+    assert [fig.axes[i].get_ylabel() for i in (0, 3)] == list(rows)
+    for i, values in enumerate(rows.values()):
+        inside = values[:, :5]
+        assert all(ax.images[0].get_clim() == (inside.min(), inside.max()) for ax in fig.axes[3 * i : 3 * i + 3])
+        assert fig.axes[3 * i].images[0].get_cmap().name == ("viridis", "cividis")[i]
+    own = plot.time_rows(rows, [0.1, 1, 10], grid)
+    assert own.axes[1].images[0].get_clim() == (rows["HKS"][1, :5].min(), rows["HKS"][1, :5].max())
+    with pytest.raises(ValueError, match=r"rows: got 'HKS' of shape \(3, 6, 4\); expected .* \(2, 6, 4\)"):
+        plot.time_rows(rows, [0.1, 1], grid)
+    with pytest.raises(ValueError, match="shared: got 'all'"):
+        plot.time_rows(rows, [0.1, 1, 10], grid, shared="all")
+    with pytest.raises(ValueError, match="rows, times: got 0 rows"):
+        plot.time_rows({}, [0.1], grid)
+
+
+def test_influence_lines_are_where_the_influence_is():
+    grid = hj.Grid.from_bounds(0, 1, (21, 21))
+    x = grid.nodes[..., 0]
+    ax = axes()
+    image = plot.influence_map(ax, x, grid, levels=(0.1, 0.5))
+    assert image.get_clim() == (0, 1)
+    (lines,) = [c for c in ax.collections if hasattr(c, "levels")]
+    for level, path in zip(lines.levels, lines.get_paths(), strict=True):
+        np.testing.assert_allclose(path.vertices[:, 0], level, atol=1e-9)
+    plot.influence_map(ax, 0 * x, grid)  # no line, no warning
+
+
+# --- at any size --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [20, 300])
+def test_glyphs_are_as_many_as_fit_whatever_the_grid(n):
+    """Sizes are in coordinates: what does not overlap in one figure does not in any other."""
+    x = np.linspace(-1, 1, n)
+    a, b = np.meshgrid(x, x, indexing="ij")
+    tensors = 2 * np.eye(2) + np.stack([np.stack([a, b], -1), np.stack([b, -a], -1)], -1)
+    field = hj.TensorField(hj.Grid.from_bounds(-1, 1, (n, n)), tensors)
+    ax = axes()
+    drawn = plot.ellipses(ax, field)
+    assert 20**2 <= len(drawn.get_offsets()) <= 26**2
+    bars = plot.sensitivity(ax, field.grid, tensors)
+    assert 2 * 20**2 <= len(bars.get_segments()) <= 2 * 26**2
+    (mark,) = plot.degenerate_points(ax, field).get_paths()
+    width = np.ptp(mark.vertices[:, 0])
+    assert 0.03 < width < 0.06
+    texture = plot.line_integral_convolution(ax, field)
+    assert 100 <= texture.get_array().shape[0] <= 400
+    separation = 2 / 25
+    lines = plot.integral_lines(ax, field).get_segments()
+    assert sum(len(line) for line in lines) > 0
+    assert len(lines) < 4 / separation * 4
+
+
+# --- the gallery --------------------------------------------------------------------------------------------
+
+COMPUTATIONS = {"evenly_spaced_lines", "lic_texture", "number_text", "save_figure", "trace"}
+
+
+@pytest.fixture(scope="module")
+def gallery():
+    path = Path(__file__).parents[1] / "docs" / "gallery.py"
+    spec = importlib.util.spec_from_file_location("gallery", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_picture_is_in_the_gallery(gallery):
+    text = (gallery.HERE / "gallery.md").read_text(encoding="utf-8")
+    assert text == gallery.page(), "run: python docs/gallery.py"
+    public = {name for name, value in vars(plot).items() if inspect.isfunction(value)}
+    assert public > COMPUTATIONS
+    missing = [name for name in sorted(public - COMPUTATIONS) if f"plot.{name}(" not in text]
+    assert missing == []
+
+
+def test_the_gallerys_pictures_are_there_and_small(gallery):
+    pictures = sorted(gallery.PICTURES.iterdir())
+    assert [p.stem for p in pictures] == sorted(draw.__name__ for draw in gallery.ENTRIES.values())
+    assert sum(p.stat().st_size for p in pictures) < 1.5e6
