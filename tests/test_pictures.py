@@ -147,7 +147,7 @@ def test_spectrum_is_the_counting_function(square):
     assert ax.get_xlabel().endswith(" in 1/s")
     assert len(plot.spectrum(axes(), pairs)) == 2
     count, law, area = plot.spectrum(axes(), pairs, field, remainder=True)
-    assert np.abs(count.get_ydata()).max() < 3
+    assert np.abs(count.get_ydata()).max() < 5
     assert np.abs(law.get_ydata()).max() == 0
     assert np.max(area.get_ydata()) <= 0
 
@@ -205,26 +205,26 @@ def test_influence_lines_are_where_the_influence_is():
 
 
 @pytest.mark.parametrize("n", [20, 300])
-def test_glyphs_are_as_many_as_fit_whatever_the_grid(n):
-    """Sizes are in coordinates: what does not overlap in one figure does not in any other."""
+@pytest.mark.parametrize(("inches", "most"), [(1.0, 10), (3.0, 26), (14.0, 26)])
+def test_glyphs_are_as_many_as_fit_whatever_the_grid(n, inches, most):
+    """Sizes are in coordinates, so that nothing overlaps in any figure; in a small one there are fewer."""
     x = np.linspace(-1, 1, n)
     a, b = np.meshgrid(x, x, indexing="ij")
     tensors = 2 * np.eye(2) + np.stack([np.stack([a, b], -1), np.stack([b, -a], -1)], -1)
     field = hj.TensorField(hj.Grid.from_bounds(-1, 1, (n, n)), tensors)
-    ax = axes()
+    ax = plot.new_figure(inches, inches).subplots()
     drawn = plot.ellipses(ax, field)
-    assert 20**2 <= len(drawn.get_offsets()) <= 26**2
+    assert (0.6 * most) ** 2 <= len(drawn.get_offsets()) <= most**2
     bars = plot.sensitivity(ax, field.grid, tensors)
-    assert 2 * 20**2 <= len(bars.get_segments()) <= 2 * 26**2
+    assert 2 * (0.6 * most) ** 2 <= len(bars.get_segments()) <= 2 * most**2
     (mark,) = plot.degenerate_points(ax, field).get_paths()
     width = np.ptp(mark.vertices[:, 0])
-    assert 0.03 < width < 0.06
-    texture = plot.line_integral_convolution(ax, field)
-    assert 100 <= texture.get_array().shape[0] <= 400
-    separation = 2 / 25
-    lines = plot.integral_lines(ax, field).get_segments()
-    assert sum(len(line) for line in lines) > 0
-    assert len(lines) < 4 / separation * 4
+    assert 0.06 < width < 0.1
+    if inches < 14:  # a quarter of a million steps more would show nothing new
+        texture = plot.line_integral_convolution(ax, field)
+        assert texture.get_array().shape[0] == pytest.approx(max(100, 85 * inches), rel=0.05)
+        lines = plot.integral_lines(ax, field, which="minor").get_segments()
+        assert 0.2 * most < len(lines) < 4 * most
 
 
 # --- the gallery --------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from hks_jax.domain.components import active_elements
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import frame, require_plane
+from hks_jax.plot.figure import frame, require_plane, side_in_inches
 from hks_jax.plot.images import scalar_image
 from hks_jax.plot.tracing import LEAST_COSINE, DirectionField, Which
 
@@ -115,10 +115,7 @@ def line_integral_convolution(
     if not 0 < contrast <= 1:
         raise ValueError(f"contrast: got {contrast}; expected a number in (0, 1]")
     if pixels is None:
-        figure = ax.get_figure(root=True)
-        assert figure is not None
-        inches = max(ax.get_position().size * figure.get_size_inches())
-        pixels = int(np.clip(PIXELS_PER_INCH * inches, 100, 1200))
+        pixels = int(np.clip(PIXELS_PER_INCH * side_in_inches(ax), 100, 1200))
     texture = lic_texture(field, which, pixels=pixels, length=length, seed=seed)
     if values is not None:
         scalar_image(ax, values, field.grid, **{"interpolation": "bilinear", **kwargs})

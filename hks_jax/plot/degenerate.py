@@ -8,15 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.transforms import ScaledTranslation
 from scipy.spatial import cKDTree
 
 from hks_jax.domain.degenerate import degenerate_points as find_degenerate_points
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import SMALL, cell_extent, frame
-
-LABELS = 21
-"""Points (1/72 inch) below the axes that tick labels and an axis label take."""
+from hks_jax.plot.figure import cell_extent, frame, legend_below
 
 
 def degenerate_points(
@@ -76,7 +72,7 @@ def degenerate_points(
 
 
 def _add_legend(ax: Axes, indices: np.ndarray, colours: dict[float, Any]) -> None:
-    """Say below the axes, where it hides nothing, which mark is which index."""
+    """Say which mark is which index."""
     handles = [
         Line2D(
             [],
@@ -89,22 +85,7 @@ def _add_legend(ax: Axes, indices: np.ndarray, colours: dict[float, Any]) -> Non
         )
         for index, colour in colours.items()
     ]
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    below = ax.transAxes + ScaledTranslation(0, -LABELS / 72, figure.dpi_scale_trans)
-    ax.legend(
-        handles=handles,
-        title="index (how many)",
-        title_fontsize=SMALL,
-        fontsize=SMALL,
-        ncols=min(len(handles), 4),
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0.0),
-        bbox_transform=below,
-        frameon=False,
-        handletextpad=0.1,
-        columnspacing=1.2,
-    )
+    legend_below(ax, handles, "index (how many)")
 
 
 def _outline(index: float) -> np.ndarray:
