@@ -48,6 +48,11 @@ def brain_like(shape: tuple[int, int] = (60, 70)) -> hj.TensorField:
     return hj.TensorField.from_diffusion(hj.Grid(shape, spacing, mask=mask), tensors, metric="inverse")
 
 
+def signature_at_dot(field: hj.TensorField) -> jax.Array:
+    """Return the HKS at one node and time."""
+    return hj.hks(hj.eigenpairs(field, 80, multiplet="drop"), [0.03])[0, 12, 12]
+
+
 def panels() -> Figure:
     """The signature over t, each image with its own colours or, with `shared_range`, all with the same."""
     field = brain_like()
@@ -166,12 +171,8 @@ def rows() -> Figure:
 def derivative() -> Figure:
     """Which tensor, changed in which direction, drives the signature at the black dot."""
     field = hj.examples.figure4_fields(24)["waves"]
-
-    def signature(tensors):
-        pairs = hj.eigenpairs(hj.TensorField(field.grid, tensors), 80, multiplet="drop")
-        return hj.hks(pairs, [0.03])[0, 12, 12]
-
-    gradient = jax.grad(signature)(field.tensors)
+    derivative_of = jax.grad(lambda tensors: signature_at_dot(hj.TensorField(field.grid, tensors)))
+    gradient = derivative_of(field.tensors)
     figure = plot.new_figure(4.0, 3.8)
     ax = figure.subplots()
     plot.sensitivity(ax, field.grid, gradient, every=1)
@@ -219,7 +220,8 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
 
 def page() -> str:
     """Return the text of docs/gallery.md."""
-    parts = [HEAD, f"```python\n{inspect.getsource(brain_like)}```\n"]
+    helpers = "\n\n".join(inspect.getsource(helper) for helper in (brain_like, signature_at_dot))
+    parts = [HEAD, f"```python\n{helpers}```\n"]
     for title, draw in ENTRIES.items():
         body = textwrap.dedent(inspect.getsource(draw).split('"""', 2)[2]).strip("\n")
         body = body.replace("return figure", 'plot.save_figure(figure, "picture.png")').replace(

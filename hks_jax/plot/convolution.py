@@ -114,8 +114,9 @@ def line_integral_convolution(
     require_plane("field", field.grid)
     if not 0 < contrast <= 1:
         raise ValueError(f"contrast: got {contrast}; expected a number in (0, 1]")
+    x0, x1, y0, y1 = field.grid.extent
     if pixels is None:
-        pixels = int(np.clip(PIXELS_PER_INCH * side_in_inches(ax), 100, 1200))
+        pixels = int(np.clip(PIXELS_PER_INCH * side_in_inches(ax, (x1 - x0, y1 - y0)), 100, 1200))
     texture = lic_texture(field, which, pixels=pixels, length=length, seed=seed)
     if values is not None:
         scalar_image(ax, values, field.grid, **{"interpolation": "bilinear", **kwargs})
@@ -129,7 +130,6 @@ def line_integral_convolution(
         shade[..., :3] = (0.5 + shift / 2)[..., None]
         shade[..., 3] = 1
     shade[np.isnan(shift)] = 0
-    x0, x1, y0, y1 = field.grid.extent
     image = ax.imshow(shade, origin="lower", extent=(x0, x1, y0, y1), interpolation="nearest")
     frame(ax, field.grid)
     return image

@@ -116,7 +116,8 @@ def node_steps(
 ) -> tuple[int, ...]:
     """Return the step along each axis: as given, or for some 10 nodes an inch of the longer side, 24 at most."""
     if every is None:
-        cell = max(n * h for n, h in zip(shape, spacing, strict=True)) / min(24, max(4, 10.5 * side_in_inches(ax)))
+        width, height = (n * h for n, h in zip(shape, spacing, strict=True))
+        cell = max(width, height) / min(24, max(4, 10.5 * side_in_inches(ax, (width, height))))
         return tuple(max(1, round(cell / h)) for h in spacing)
     steps = np.broadcast_to(np.asarray(every), (len(shape),))
     if not np.issubdtype(steps.dtype, np.integer) or steps.min() < 1:

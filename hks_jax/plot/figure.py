@@ -84,11 +84,22 @@ def frame(ax: Axes, grid: Grid) -> None:
     ax.tick_params(labelsize=SMALL)
 
 
-def side_in_inches(ax: Axes) -> float:
-    """Return the longer side of the axes in inches, as far as it is known before the figure is drawn."""
+def side_in_inches(ax: Axes, extent: tuple[float, float]) -> float:
+    """Return how long the longer side of something will be, in equal aspect on the axes as they are before layout.
+
+    Args:
+        ax: the axes.
+        extent: width and height of what is drawn, in coordinates.
+    """
+    scale = min(room / size for room, size in zip(_inches(ax), extent, strict=True))
+    return scale * max(extent)
+
+
+def _inches(ax: Axes) -> tuple[float, float]:
     figure = ax.get_figure(root=True)
     assert figure is not None
-    return float(max(ax.get_position().size * figure.get_size_inches()))
+    width, height = ax.get_position().size * figure.get_size_inches()
+    return float(width), float(height)
 
 
 def legend_below(ax: Axes, handles: Sequence[Artist], title: str = "") -> None:
@@ -100,7 +111,7 @@ def legend_below(ax: Axes, handles: Sequence[Artist], title: str = "") -> None:
         title=title,
         title_fontsize=SMALL,
         fontsize=SMALL,
-        ncols=min(len(handles), 4),
+        ncols=min(len(handles), 4, max(1, int(1.5 * _inches(ax)[0]))),
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + ScaledTranslation(0, -LABELS / 72, figure.dpi_scale_trans),

@@ -43,8 +43,9 @@ def integral_lines(
     if seeds is None:
         if not density > 0:
             raise ValueError(f"density: got {density}; expected a positive number")
-        gaps = min(25.0, max(4.0, 11 * side_in_inches(ax)))
-        side = max(float(a[-1] - a[0]) for a in field.grid.axes)
+        x0, x1, y0, y1 = field.grid.extent
+        side = max(x1 - x0, y1 - y0)
+        gaps = min(25.0, max(4.0, 11 * side_in_inches(ax, (x1 - x0, y1 - y0))))
         lines = evenly_spaced_lines(field, which, separation=side / (gaps * density), step=step, max_length=max_length)
     else:
         lines = [line for line in trace(field, seeds, which, step=step, max_length=max_length) if len(line) > 1]
