@@ -1,8 +1,10 @@
 """Weyl's law, and the boundary's influence, against what is known in closed form."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from fields import flat
+from fields import flat, random_spd
 
 import hks_jax as hj
 from hks_jax.fem.boundary import normalise_boundary
@@ -114,6 +116,26 @@ def test_all_of_a_masks_rim_is_pinned_and_nothing_else():
     free[1:6, 1:8] = True
     free[:3, 5:] = free[3:6, 3:6] = False
     np.testing.assert_array_equal(pin_rim(hj.assemble(field)).space.free, free)
+
+
+def test_influence_is_differentiable(rng):
+    mask = np.ones((6, 5), bool)
+    mask[:2, :2] = False
+    grid = hj.Grid((6, 5), 0.2, mask=mask)
+    tensors = random_spd(rng, (6, 5), 0.4)
+    direction = random_spd(rng, (6, 5)) - np.eye(2)
+    weights = np.where(mask, rng.standard_normal((6, 5)), 0)
+
+    @jax.jit
+    @jax.value_and_grad
+    def mean(t):
+        influence = hj.boundary_influence(hj.TensorField(grid, t), [0.2], 6, solver="dense")
+        return jnp.sum(jnp.where(mask, influence[0], 0) * weights)
+
+    gradient = mean(tensors)[1]
+    ends = [float(mean(tensors + h * direction)[0]) for h in (1e-4, -1e-4, 2e-4, -2e-4)]
+    difference = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / 12e-4
+    assert float(jnp.sum(gradient * direction)) == pytest.approx(difference, rel=1e-6)
 
 
 def test_influence_errors():
