@@ -16,6 +16,8 @@ from hks_jax.curvature import gaussian_curvature as gaussian_curvature
 from hks_jax.curvature import hks_expansion as hks_expansion
 from hks_jax.curvature import laplace_beltrami as laplace_beltrami
 from hks_jax.curvature import scalar_curvature as scalar_curvature
+from hks_jax.domain.degenerate import DegeneratePoints as DegeneratePoints
+from hks_jax.domain.degenerate import degenerate_points as degenerate_points
 from hks_jax.domain.grid import Grid as Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
@@ -32,20 +34,25 @@ from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import reflect as reflect
 from hks_jax.fem.pencil import MirrorPencil as MirrorPencil
 from hks_jax.fem.pencil import Pencil as Pencil
+from hks_jax.signatures.boundary import boundary_influence as boundary_influence
 from hks_jax.signatures.custom import spectral_signature as spectral_signature
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance
 from hks_jax.signatures.distances import diffusion_distance as diffusion_distance
 from hks_jax.signatures.distances import global_point_signature as global_point_signature
 from hks_jax.signatures.distances import shape_dna as shape_dna
+from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.heat import heat_kernel as heat_kernel
 from hks_jax.signatures.heat import heat_trace as heat_trace
 from hks_jax.signatures.heat import hks as hks
 from hks_jax.signatures.heat import scale_invariant_hks as scale_invariant_hks
+from hks_jax.signatures.scale_space import gaussian_scale_space as gaussian_scale_space
+from hks_jax.signatures.scale_space import tensor_invariants as tensor_invariants
 from hks_jax.signatures.times import default_energies as default_energies
 from hks_jax.signatures.times import default_times as default_times
 from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
 from hks_jax.signatures.wave import wks as wks
+from hks_jax.signatures.weyl import weyl_count as weyl_count
 
 __version__ = "0.1.0"
 

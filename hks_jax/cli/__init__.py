@@ -8,9 +8,9 @@ from typing import NoReturn
 import numpy as np
 
 from hks_jax import __version__
-from hks_jax.cli import convert, demo, fit, hks, info, paper
+from hks_jax.cli import convert, curvature, demo, fit, hks, info, paper, plot, spectrum
 
-SUBCOMMANDS = (hks, fit, info, convert, demo, paper)
+SUBCOMMANDS = (hks, spectrum, curvature, fit, plot, info, convert, demo, paper)
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 

@@ -2,18 +2,15 @@
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import parse_boundary, parse_times, parse_voxel
+from hks_jax.cli.arguments import parse_times, parse_voxel
+from hks_jax.cli.inputs import add_eigenpair_arguments, add_tensor_arguments, read_volume, require_metric
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import add_arguments as add_reading_arguments
-from hks_jax.cli.reading import image_suffix, read
-from hks_jax.eigen.solve import SOLVERS
+from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume
-from hks_jax.io.repair import require_valid
 
 DESCRIPTION = """\
 Compute the heat kernel signature of a field of diffusion tensors. FILE holds tensors: NIfTI, NRRD, VTK image data, npz
@@ -43,33 +40,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add_reading_arguments(parser)
-    add("-o", "--output", metavar="OUT", type=Path, required=True, help="folder for the results")
-    add(
-        "--metric",
-        choices=("tensor", "inverse", "adjugate"),
-        help="the metric of diffusion tensors D: inverse is D⁻¹ (t is time), tensor is D itself, adjugate is |D|D⁻¹; "
-        "must be chosen but for NumPy's files, which hold the metric itself unless you choose",
-    )
+    add_tensor_arguments(parser)
+    add_eigenpair_arguments(parser)
     add(
         "--through",
         type=parse_voxel,
         metavar="I,J,K",
         help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
-    )
-    add(
-        "--components",
-        choices=("raise", "largest", "all"),
-        default="raise",
-        help="where the mask falls apart: stop (default), keep the largest piece, or keep all",
-    )
-    add(
-        "--boundary",
-        type=parse_boundary,
-        default="neumann",
-        metavar="B",
-        help="neumann (default), dirichlet, periodic or mirror; one for all axes, or one per axis as in "
-        "neumann,periodic; low:high for the two sides, as in neumann:dirichlet,neumann",
     )
     add(
         "--times",
@@ -78,30 +55,18 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="positive numbers, or auto, or auto:N for N times that suit the eigenvalues (default auto:6)",
     )
     add(
-        "-k",
-        type=int,
-        help="number of eigenpairs (default 200, for a volume 100, or a quarter of the unknowns if that is less)",
-    )
-    add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
-    add(
         "--normalisation",
         choices=("raw", "heat-trace", "volume", "flat"),
         default="raw",
         help="of the signature (default raw)",
     )
-    add("--dtype", choices=("float32", "float64"), default="float64", help="precision (default float64)")
     return parser
 
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     times = parse_times(args.times)
-    image = image_suffix(args.file)
-    if args.metric is None and image:
-        raise ValueError(
-            "--metric: choose one; diffusion tensors D become a metric as inverse (D⁻¹, Brownian motion with "
-            "diffusivity D), tensor (D itself) or adjugate (|D|D⁻¹)"
-        )
+    require_metric(args)
     from hks_jax.cli.job import Settings, compute
     from hks_jax.cli.outputs import check_folder, write_outputs
     from hks_jax.cli.picture import draw, draw_volume
@@ -110,14 +75,9 @@ def run(args: argparse.Namespace) -> None:
     progress = Progress(args.quiet)
     with progress.catching_warnings():
         with progress.stage("reading", str(args.file)):
-            volume = read(args, progress)
-            if 1 in volume.shape:
-                raise ValueError(
-                    f"--slice: the volume is one voxel thick; pass --slice {'xyz'[volume.shape.index(1)]}=0"
-                )
+            volume = read_volume(args, progress)
             if args.through is not None:
                 _check_voxel(args.through, volume)
-            require_valid(volume.with_mask(volume.grid(args.components).mask), "--repair")
         settings = Settings(
             metric=args.metric or "tensor",
             k=args.k,
@@ -134,7 +94,7 @@ def run(args: argparse.Namespace) -> None:
             result,
             progress,
             draw=lambda path: draw(result, path) if volume.dimension == 2 else draw_volume(result, path, args.through),
-            image=image,
+            image=image_suffix(args.file),
             command=sys.argv,
         )
     if not args.quiet:

@@ -4,13 +4,16 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hks_jax.cli.arguments import DEFAULT_TIMES, Times
 from hks_jax.cli.progress import Progress
+from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import MetricChoice, TensorField
 from hks_jax.eigen.block_lanczos import BlockLanczos
+from hks_jax.eigen.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.shift_invert import ShiftInvert
 from hks_jax.eigen.solve import choose_solver, eigenpairs
@@ -71,32 +74,52 @@ def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Res
         ValueError: tensors, mask or settings that cannot be computed with.
         ComputationError: eigenpairs that did not converge.
     """
-    use_dtype(settings.dtype)
-    tensors = volume.tensors.astype(settings.dtype)
+    field, pairs = compute_pairs(volume, settings, progress)
+    with progress.stage("signature"):
+        times = settings.times.explicit or tuple(default_times(pairs, settings.times.automatic).tolist())
+        values = np.asarray(hks(pairs, times, settings.normalisation))
+    mask = field.grid.mask
+    return Result(
+        volume.with_mask(mask),
+        np.asarray(times),
+        values,
+        np.asarray(pairs.eigenvalues),
+        _report(volume, mask, settings, pairs, times),
+    )
+
+
+def field_of(volume: TensorVolume, grid: Grid, metric: MetricChoice, dtype: str) -> TensorField:
+    """Return the metric of a volume or slice on its grid, in the precision asked for.
+
+    Raises:
+        ValueError: tensors that make no metric.
+    """
+    use_dtype(dtype)
+    return TensorField.from_diffusion(grid, volume.tensors.astype(dtype), metric, name="tensors")
+
+
+def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) -> tuple[TensorField, Eigenpairs]:
+    """Compute the eigenpairs of a volume or slice, and return them with its metric.
+
+    Raises:
+        ValueError: tensors, mask or settings that cannot be computed with.
+        ComputationError: eigenpairs that did not converge.
+    """
     grid = volume.grid(settings.components)
     with progress.stage("assembly", f"{int(grid.inside.sum())} of {grid.size} nodes"):
         for message in unreached_sides(grid.inside, settings.boundary):
             progress.warn(message)
-        field = TensorField.from_diffusion(grid, tensors, settings.metric, name="tensors")
+        field = field_of(volume, grid, settings.metric, settings.dtype)
         pencil = assemble(field, settings.boundary)
     unknowns = sum(part.space.n_dof for part in pencil.parts)
     k = min(DEFAULT_K[volume.dimension], max(1, unknowns // 4)) if settings.k is None else settings.k
     solver = _reporting(settings.solver, pencil, k, progress.update)
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
         pairs = eigenpairs(pencil, k, solver=solver)
-        eigenvalues = np.asarray(pairs.eigenvalues)
+        jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])
-    with progress.stage("signature"):
-        times = settings.times.explicit or tuple(default_times(pairs, settings.times.automatic).tolist())
-        values = np.asarray(hks(pairs, times, settings.normalisation))
-    return Result(
-        volume.with_mask(grid.mask),
-        np.asarray(times),
-        values,
-        eigenvalues,
-        _report(volume, grid.mask, settings, pairs, times),
-    )
+    return field, pairs
 
 
 def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
@@ -115,40 +138,20 @@ def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
 def _reporting(solver: str, pencil: Pencil | MirrorPencil, k: int, callback: Callable[[str], None]) -> Eigensolver:
     """Return the solver, with progress if it has any to show."""
     chosen = choose_solver(solver, pencil.parts[0], k)
-    return type(chosen)(progress=callback) if isinstance(chosen, ShiftInvert | BlockLanczos) else chosen
+    if isinstance(chosen, ShiftInvert | BlockLanczos | ChebyshevFilter):
+        return type(chosen)(progress=callback)
+    return chosen
 
 
 def _report(
     volume: TensorVolume, mask: np.ndarray | None, settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]
 ) -> dict[str, Any]:
     estimate = truncation(pairs, jnp.asarray(times))
-    values = np.asarray(pairs.eigenvalues)
     chosen = replace(settings, times=Times(times, settings.times.automatic), k=pairs.k)
     return {
-        "input": {
-            "source": volume.source,
-            "sha256": volume.digest,
-            "shape": volume.shape,
-            "spacing": volume.spacing,
-            "order": volume.order,
-            "frame": volume.frame,
-            "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),
-            "notes": list(volume.notes),
-            "repair": dict(volume.repair) or None,
-        },
+        "input": describe_input(volume, mask),
         "settings": {**asdict(chosen), "times": "automatic" if settings.times.automatic else "explicit"},
-        "eigenpairs": {
-            "k": pairs.k,
-            "unknowns": sum(part.space.n_dof for part in pairs.pencil.parts),
-            "solver": pairs.solver_name,
-            "zero": pairs.n_null,
-            "first_positive": float(values[min(pairs.n_null, pairs.k - 1)]),
-            "last": float(values[-1]),
-            "next": float(pairs.next_eigenvalue),
-            "worst_residual": float(np.max(np.asarray(pairs.residuals))),
-            "converged": int(np.sum(np.asarray(pairs.converged))),
-            "cut_multiplet": int(pairs.cut_multiplet),
-        },
+        "eigenpairs": describe_pairs(pairs),
         "times": [
             {"t": float(t), "truncation": float(tail), "resolution_bias": float(bias), "coarse_fraction": float(coarse)}
             for t, tail, bias, coarse in zip(
@@ -159,4 +162,36 @@ def _report(
                 strict=True,
             )
         ],
+    }
+
+
+def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, Any]:
+    """Return what a report says of the tensors."""
+    return {
+        "source": volume.source,
+        "sha256": volume.digest,
+        "shape": volume.shape,
+        "spacing": volume.spacing,
+        "order": volume.order,
+        "frame": volume.frame,
+        "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),
+        "notes": list(volume.notes),
+        "repair": dict(volume.repair) or None,
+    }
+
+
+def describe_pairs(pairs: Eigenpairs) -> dict[str, Any]:
+    """Return what a report says of eigenpairs."""
+    values = np.asarray(pairs.eigenvalues)
+    return {
+        "k": pairs.k,
+        "unknowns": sum(part.space.n_dof for part in pairs.pencil.parts),
+        "solver": pairs.solver_name,
+        "zero": pairs.n_null,
+        "first_positive": float(values[min(pairs.n_null, pairs.k - 1)]),
+        "last": float(values[-1]),
+        "next": float(pairs.next_eigenvalue),
+        "worst_residual": float(np.max(np.asarray(pairs.residuals))),
+        "converged": int(np.sum(np.asarray(pairs.converged))),
+        "cut_multiplet": int(pairs.cut_multiplet),
     }

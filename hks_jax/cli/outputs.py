@@ -59,6 +59,17 @@ def write_report(path: Path, report: dict[str, Any], progress: Progress, command
     path.write_text(json.dumps(plain(whole), indent=2, ensure_ascii=False) + "\n")
 
 
+def show_files(files: list[Path], quiet: bool, as_json: bool) -> None:
+    """Print the files' names, or the report among them as JSON together with the names."""
+    if as_json:
+        (report,) = (file for file in files if file.name == "report.json")
+        print(
+            json.dumps({**json.loads(report.read_text()), "files": [str(file) for file in files]}, ensure_ascii=False)
+        )
+    elif not quiet:
+        print("\n".join(map(str, files)))
+
+
 def versions() -> dict[str, str]:
     """Return the versions of what took part, and the device."""
     import jax

@@ -78,7 +78,7 @@ def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Penc
     tensors = field.domain_tensors
     tensors = jnp.where(space.domain[..., None, None], tensors, jnp.eye(space.dimension, dtype=tensors.dtype))
     stiffness, consistent, lumped, width = _grid_integrals(
-        tensors, space.elements, _free_couplings(space), space.periodic, space.grid.spacing
+        tensors, space.elements, free_couplings(space), space.periodic, space.grid.spacing
     )
     return _pencil(
         StencilOperator(coefficients=stiffness, space=space),
@@ -152,7 +152,7 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
 
 
 @lru_cache(maxsize=16)
-def _free_couplings(space: GridSpace) -> np.ndarray:
+def free_couplings(space: GridSpace) -> np.ndarray:
     """Tell for which offsets and nodes both ends are free, bool (3^d, *shape)."""
     free, d = space.free, space.dimension
     for axis, wraps in enumerate(space.periodic):

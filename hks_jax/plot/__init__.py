@@ -4,7 +4,10 @@ Every function draws on the axes that it is given, so that pictures compose: int
 the HKS, ellipses beside a surface. No function touches pyplot, a backend or rcParams.
 """
 
+from hks_jax.plot.convolution import lic_texture as lic_texture
+from hks_jax.plot.convolution import line_integral_convolution as line_integral_convolution
 from hks_jax.plot.curves import hks_curves as hks_curves
+from hks_jax.plot.degenerate import degenerate_points as degenerate_points
 from hks_jax.plot.ellipses import ellipses as ellipses
 from hks_jax.plot.figure import new_figure as new_figure
 from hks_jax.plot.figure import number_text as number_text
@@ -13,7 +16,10 @@ from hks_jax.plot.fit import fit_panels as fit_panels
 from hks_jax.plot.images import hks_panels as hks_panels
 from hks_jax.plot.images import scalar_image as scalar_image
 from hks_jax.plot.lines import integral_lines as integral_lines
+from hks_jax.plot.rows import influence_map as influence_map
+from hks_jax.plot.rows import time_rows as time_rows
 from hks_jax.plot.sensitivity import sensitivity as sensitivity
+from hks_jax.plot.spectrum import spectrum as spectrum
 from hks_jax.plot.surfaces import surface as surface
 from hks_jax.plot.tracing import evenly_spaced_lines as evenly_spaced_lines
 from hks_jax.plot.tracing import trace as trace

@@ -8,6 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 from matplotlib import colormaps
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -24,7 +25,9 @@ def hks_curves(
     points: Sequence[Sequence[float]],
     *,
     expansion: Float[ArrayLike, "n_times *shape"] | None = None,
+    limit: float | None = None,
     labels: Sequence[str] | None = None,
+    unit: str = "",
     scaled: bool = False,
     cmap: str = "viridis",
     **kwargs: Any,
@@ -38,7 +41,10 @@ def hks_curves(
         grid: the grid of the values, 2D or 3D.
         points: coordinates, one row of d numbers per curve.
         expansion: (n_times, *shape), as `hks_jax.hks_expansion` returns it.
+        limit: the least time that the eigenpairs resolve, `hks_jax.truncation(pairs, times).smallest_time`; times below
+            it are shaded.
         labels: one per point; None: its coordinates.
+        unit: the unit of t.
         scaled: draw (4πt)^(d/2)·HKS, which is 1 for flat space without boundary, on a linear scale.
         cmap: colour map; the curves take evenly spaced colours.
         **kwargs: passed to `Axes.plot` for the HKS.
@@ -73,12 +79,15 @@ def hks_curves(
         ax.set_ylim(drawn.min() - margin, drawn.max() + margin)
     else:
         _logarithmic(ax, "y", drawn)
-    ax.set_xlabel("$t$")
+    ax.set_xlabel(f"$t${' in ' * bool(unit)}{unit}")
     power = {2: r"4\pi t\,", 3: r"(4\pi t)^{3/2}\,"}[grid.dimension] if scaled else ""
     ax.set_ylabel(rf"${power}\mathrm{{HKS}}(t)$")
-    handles = list(lines)
+    handles: list[Artist] = list(lines)
     if series is not None:
         handles.append(Line2D([], [], color="0.3", linestyle="--", linewidth=1.0, label="expansion"))
+    if limit is not None and limit > ax.get_xlim()[0]:
+        end = min(limit, ax.get_xlim()[1])
+        handles.append(ax.axvspan(ax.get_xlim()[0], end, color="0.88", linewidth=0, zorder=0, label="unresolved $t$"))
     ax.legend(handles=handles, fontsize="small", frameon=False)
     ax.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
     return lines

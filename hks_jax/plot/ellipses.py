@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import colour_bar, frame, require_plane
+from hks_jax.plot.figure import colour_bar, frame, require_plane, side_in_inches
 
 
 def ellipses(
@@ -29,7 +29,8 @@ def ellipses(
     Args:
         ax: the axes to draw on.
         field: the field; nodes outside its mask are left out.
-        every: draw every such node (one number or one per axis); None: about 24 along the longer side.
+        every: draw every such node (one number or one per axis); None: about 24 along the longer side,
+            or fewer where the axes are small.
         kind: ``"metric"``: the unit circle of the metric, {v : vᵀTv = const}, half axes ∝ 1/√λ; ``"tensor"``:
             the image of a circle under T^(1/2), half axes ∝ √λ, as is usual for diffusion tensors. (λ: the
             eigenvalues of T.)
@@ -53,7 +54,7 @@ def ellipses(
         raise ValueError(f'sizes: got {sizes!r}; expected "common" or "fit"')
     if not 0 < fill <= 1:
         raise ValueError(f"fill: got {fill}; expected a number in (0, 1]; ellipses overlap beyond 1")
-    steps = node_steps(grid.shape, grid.spacing, every)
+    steps = node_steps(grid.shape, grid.spacing, every, ax)
     pick = tuple(centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
     inside = grid.inside[pick]
     if not inside.any():
@@ -111,11 +112,12 @@ def centred(n: int, step: int) -> slice:
 
 
 def node_steps(
-    shape: tuple[int, ...], spacing: tuple[float, ...], every: int | Sequence[int] | None
+    shape: tuple[int, ...], spacing: tuple[float, ...], every: int | Sequence[int] | None, ax: Axes
 ) -> tuple[int, ...]:
-    """Return the step along each axis: as given, or such that about 24 nodes are drawn along the longer side."""
+    """Return the step along each axis: as given, or for some 10 nodes an inch of the longer side, 24 at most."""
     if every is None:
-        cell = max(n * h for n, h in zip(shape, spacing, strict=True)) / 24
+        width, height = (n * h for n, h in zip(shape, spacing, strict=True))
+        cell = max(width, height) / min(24, max(4, 10.5 * side_in_inches(ax, (width, height))))
         return tuple(max(1, round(cell / h)) for h in spacing)
     steps = np.broadcast_to(np.asarray(every), (len(shape),))
     if not np.issubdtype(steps.dtype, np.integer) or steps.min() < 1:

@@ -2,18 +2,23 @@
 
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.transforms import ScaledTranslation
 
 from hks_jax.domain.grid import Grid
 
 SMALL = "small"
+LABELS = 21
+"""Points (1/72 inch) below the axes that tick labels and an axis label take."""
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -77,6 +82,42 @@ def frame(ax: Axes, grid: Grid) -> None:
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
     ax.tick_params(labelsize=SMALL)
+
+
+def side_in_inches(ax: Axes, extent: tuple[float, float]) -> float:
+    """Return how long the longer side of something will be, in equal aspect on the axes as they are before layout.
+
+    Args:
+        ax: the axes.
+        extent: width and height of what is drawn, in coordinates.
+    """
+    scale = min(room / size for room, size in zip(_inches(ax), extent, strict=True))
+    return scale * max(extent)
+
+
+def _inches(ax: Axes) -> tuple[float, float]:
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    width, height = ax.get_position().size * figure.get_size_inches()
+    return float(width), float(height)
+
+
+def legend_below(ax: Axes, handles: Sequence[Artist], title: str = "") -> None:
+    """Add a legend below the axes, where it hides nothing."""
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    ax.legend(
+        handles=handles,
+        title=title,
+        title_fontsize=SMALL,
+        fontsize=SMALL,
+        ncols=min(len(handles), 4, max(1, int(1.5 * _inches(ax)[0]))),
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        bbox_transform=ax.transAxes + ScaledTranslation(0, -LABELS / 72, figure.dpi_scale_trans),
+        frameon=False,
+        columnspacing=1.2,
+    )
 
 
 def colour_bar(ax: Axes, mappable: ScalarMappable, label: str = "", **kwargs: Any) -> Colorbar:

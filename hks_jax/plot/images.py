@@ -80,6 +80,8 @@ def hks_panels(
     shared_range: bool = False,
     path: str | os.PathLike[str] | None = None,
     cmap: str | Colormap = "viridis",
+    vmin: float | None = None,
+    vmax: float | None = None,
     quantiles: tuple[float, float] = (0.0, 1.0),
     label: str = "",
     suptitle: str = "",
@@ -95,6 +97,8 @@ def hks_panels(
         shared_range: whether all images use the colours of one range.
         path: where to save the figure; None: nowhere.
         cmap: colour map.
+        vmin: value of the first colour of all images; None: see `shared_range`.
+        vmax: value of the last colour of all images; likewise.
         quantiles: as for `scalar_image`.
         label: the colour bars' label.
         suptitle: the figure's title.
@@ -106,7 +110,9 @@ def hks_panels(
     t, titles = panel_titles(values, times, grid, titles, unit)
     images = [masked("values", v, grid) for v in np.asarray(values)]
     everything = np.concatenate([image.compressed() for image in images])
-    vmin, vmax = colour_range(everything, quantiles) if shared_range else (None, None)
+    if shared_range:
+        low, high = colour_range(everything, quantiles)
+        vmin, vmax = low if vmin is None else vmin, high if vmax is None else vmax
 
     rows, columns = _layout(t.size)
     fig = _panel_figure(grid, rows, columns, bool(suptitle))

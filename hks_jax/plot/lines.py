@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import frame, require_plane
+from hks_jax.plot.figure import frame, require_plane, side_in_inches
 from hks_jax.plot.tracing import Which, evenly_spaced_lines, trace
 
 
@@ -30,7 +30,8 @@ def integral_lines(
         field: a 2D field.
         which: ``"major"``, the eigenvector of the larger eigenvalue of T, or ``"minor"``.
         seeds: (n, 2) points that the lines go through; None: evenly spaced lines.
-        density: with evenly spaced lines, how dense: 1 leaves a 25th of the longer side between neighbours.
+        density: with evenly spaced lines, how dense: 1 leaves a 25th of the longer side between neighbours,
+            or more where the axes are small.
         step: arc length of an integration step; None: half the smaller grid spacing.
         max_length: longest arc length of a line; None: eight times the longer side.
         **kwargs: passed to `matplotlib.collections.LineCollection` (``colors``, ``linewidths``, ``alpha``).
@@ -42,8 +43,10 @@ def integral_lines(
     if seeds is None:
         if not density > 0:
             raise ValueError(f"density: got {density}; expected a positive number")
-        side = max(float(a[-1] - a[0]) for a in field.grid.axes)
-        lines = evenly_spaced_lines(field, which, separation=side / (25 * density), step=step, max_length=max_length)
+        x0, x1, y0, y1 = field.grid.extent
+        side = max(x1 - x0, y1 - y0)
+        gaps = min(25.0, max(4.0, 11 * side_in_inches(ax, (x1 - x0, y1 - y0))))
+        lines = evenly_spaced_lines(field, which, separation=side / (gaps * density), step=step, max_length=max_length)
     else:
         lines = [line for line in trace(field, seeds, which, step=step, max_length=max_length) if len(line) > 1]
     collection = LineCollection(lines, **{"colors": "black", "linewidths": 0.7, "capstyle": "round", **kwargs})

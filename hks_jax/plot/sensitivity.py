@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.ellipses import centred, node_steps
-from hks_jax.plot.figure import SMALL, frame, require_plane
+from hks_jax.plot.figure import frame, legend_below, require_plane
 
 
 def sensitivity(
@@ -49,7 +49,7 @@ def sensitivity(
     array = np.asarray(gradient, dtype=np.float64)
     if array.shape != (*grid.shape, 2, 2):
         raise ValueError(f"gradient: got shape {array.shape}; expected {(*grid.shape, 2, 2)}, as jax.grad returns it")
-    steps = node_steps(grid.shape, grid.spacing, every)
+    steps = node_steps(grid.shape, grid.spacing, every, ax)
     pick = tuple(centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
     inside = grid.inside[pick]
     matrices, centres = array[pick][inside], grid.nodes[pick][inside]
@@ -68,5 +68,5 @@ def sensitivity(
     ax.add_collection(collection, autolim=False)
     if legend:
         handles = [Line2D([], [], color=c, label=text) for c, text in zip(colors, ("grows", "falls"), strict=True)]
-        ax.legend(handles=handles, fontsize=SMALL, loc="upper right", framealpha=0.9, handlelength=1.2)
+        legend_below(ax, handles)
     return collection

@@ -1,19 +1,19 @@
-"""How the kernel Φ C Φᵀ of a spectral function, C (k, k), is read: its diagonal, its columns, its distances."""
+"""How the kernel Φ C Φᵀ of a spectral function, C (k, k), is read: diagonal, columns, distances, flows."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hks_jax.domain.static_array import StaticArray
 from hks_jax.fem.space import FunctionSpace
 
 
-class Contraction(ABC):
-    """A reading of Φ C Φᵀ: static and hashable."""
+class Contraction(eqx.Module):
+    """A reading of Φ C Φᵀ; what it depends on linearly is its leaves."""
 
     @abstractmethod
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m *s n"]:
@@ -24,7 +24,6 @@ class Contraction(ABC):
         """Return the reading for one symmetric C."""
 
 
-@dataclass(frozen=True)
 class Diagonal(Contraction):
     """(Φ C Φᵀ)(x, x)."""
 
@@ -37,10 +36,9 @@ class Diagonal(Contraction):
         return jnp.sum(vectors * _matmul(matrix, vectors), axis=0)
 
 
-@dataclass(frozen=True)
 class _FromSources(Contraction):
-    space: FunctionSpace
-    sources: StaticArray
+    space: FunctionSpace = eqx.field(static=True)
+    sources: StaticArray = eqx.field(static=True)
 
     def at_sources(self, vectors: Float[Array, "k n"]) -> Float[Array, "k s"]:
         """Return the functions' values at the source nodes (flat node indices): 0 at Dirichlet nodes."""
@@ -77,6 +75,34 @@ class SquaredDistances(_FromSources):
     def _map(self, vectors: Float[Array, "k n"], reading: Callable[[Array], Array]) -> Array:
         nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], -1)
         return jax.lax.map(lambda source: reading(nodal - source[:, None]), self.at_sources(vectors).T)
+
+
+class Applied(Contraction):
+    """Φ C Φᵀ w for functionals w.
+
+    Attributes:
+        functionals: (s, n).
+        part: (k,) the part of a mirrored problem that a function is of; the functionals act on those of part 0.
+    """
+
+    functionals: Float[Array, "s n"]
+    part: Int[Array, " k"]
+
+    def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
+        """Return Σᵢ cᵢ (φᵢ·w) φᵢ(x)."""
+        return _matmul(weights[:, None, :] * self._coefficients(vectors), vectors)
+
+    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "s n"]:
+        """Return Σᵢⱼ Cᵢⱼ (φᵢ·w) φⱼ(x)."""
+        return _matmul(_matmul(self._coefficients(vectors), matrix), vectors)
+
+    def along(self, tangent: "Contraction") -> "Applied":
+        """Return the reading's derivative along a tangent of itself: it is linear in the functionals."""
+        assert isinstance(tangent, Applied)
+        return Applied(tangent.functionals, self.part)
+
+    def _coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
+        return jnp.where(self.part == 0, _matmul(self.functionals, vectors.T), 0)
 
 
 def _matmul(a: Array, b: Array) -> Array:

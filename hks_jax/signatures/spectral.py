@@ -13,7 +13,7 @@ from hks_jax.domain.static_array import StaticArray
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.pencil import MirrorPencil, Pencil
-from hks_jax.signatures.contractions import Columns, Contraction, Diagonal, SquaredDistances
+from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Derivative, Filter
 
 
@@ -39,12 +39,25 @@ def spectral_squared_distances(
     return squared.reshape(*squared.shape[:-1], *pairs.space.node_shape)
 
 
+def spectral_flow(
+    pairs: Eigenpairs, filters: Filter, functions: Float[Array, "s *shape"]
+) -> Float[Array, "m s *shape"]:
+    """Return Σᵢ f(λᵢ) φᵢ(x) ∫φᵢu for each of m filters and s functions u; NaN outside the mask.
+
+    Under "mirror" the functions are continued evenly, as the metric is.
+    """
+    # Inner products over the reflected domain: twice those over the domain for each mirror, and 0 with odd functions.
+    part = pairs.pencil.parts[0]
+    functionals = len(pairs.pencil.parts) * part.mass.apply(pairs.space.restrict(functions))
+    return pairs.space.extend(_kernel(Applied(functionals, pairs.part), filters, pairs))
+
+
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
     """Return Σᵢ f(λᵢ) for each of m filters. Its derivative is f'(λᵢ) dλᵢ: no eigenvector enters."""
     return jnp.sum(_all_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+@jax.custom_jvp
 def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
     """Read the kernels Φ f(Λ) Φᵀ of m filters."""
     # Where JAX differentiates this body and not the rule (the outer of two derivatives), it must not.
@@ -66,10 +79,12 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
 # xᵢ the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept count as pairs
 # with f = 0. Under "mirror" pairs of different parts do not mix.
 @partial(_kernel.defjvp, symbolic_zeros=True)
-def _kernel_jvp(contraction: Contraction, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    (filters, pairs), (d_filters, d_pairs) = primals, tangents
+def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
     value = _kernel(contraction, filters, pairs)
     tangent = jnp.zeros_like(value)
+    if isinstance(contraction, Applied) and not _is_constant(d_contraction.functionals):
+        tangent += _kernel(contraction.along(d_contraction), filters, pairs)
     if not _is_constant(d_filters):
         tangent += _kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs)
     if not _is_constant(d_pairs.pencil):
@@ -85,7 +100,7 @@ def _kernel_jvp(contraction: Contraction, primals: tuple, tangents: tuple) -> tu
     return value, tangent
 
 
-@partial(jax.jit, static_argnums=0)
+@jax.jit
 def _tangent(
     contraction: Contraction,
     filters: Filter,

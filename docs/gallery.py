@@ -1,0 +1,251 @@
+"""Make docs/gallery.md and its pictures: ``python docs/gallery.py``, or with names of pictures only those."""
+
+import inspect
+import sys
+import textwrap
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import hks_jax as hj
+from hks_jax import plot
+from hks_jax.domain.phantom import phantom
+
+HERE = Path(__file__).parent
+PICTURES = HERE / "images" / "gallery"
+DPI = 72
+
+HEAD = """\
+# Gallery
+
+Every picture of `hks_jax.plot`, and the code that made it. Most functions draw on axes that they are given, so that
+pictures compose; `hks_panels`, `time_rows` and `fit_panels` make a figure. `python docs/gallery.py` makes this page.
+
+All code below begins with
+
+```python
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hks_jax as hj
+from hks_jax import plot
+from hks_jax.domain.phantom import phantom
+
+jax.config.update("jax_enable_x64", True)
+```
+"""
+
+
+def brain_like(shape: tuple[int, int] = (60, 70)) -> hj.TensorField:
+    """Return the metric D⁻¹ of an analytic brain phantom."""
+    tensors, mask, spacing = phantom(shape)
+    return hj.TensorField.from_diffusion(hj.Grid(shape, spacing, mask=mask), tensors, metric="inverse")
+
+
+def signature_at_dot(field: hj.TensorField) -> jax.Array:
+    """Return the HKS at one node and time."""
+    return hj.hks(hj.eigenpairs(field, 80, multiplet="drop"), [0.03])[0, 12, 12]
+
+
+def panels() -> Figure:
+    """The signature over t, each image with its own colours or, with `shared_range`, all with the same."""
+    field = brain_like()
+    times = np.array([0.4, 1.5, 6.0]) * 1e5
+    values = hj.hks(hj.eigenpairs(field, 300), times)
+    # The natural boundary raises the signature fourfold: leave the highest values to the colour bar's arrows.
+    return plot.hks_panels(values, times, field.grid, unit="s", quantiles=(0.01, 0.9), label="HKS in 1/s")
+
+
+def glyphs() -> Figure:
+    """Unit circles of the metric, coloured by anisotropy or by orientation; as many as fit."""
+    field = brain_like()
+    figure = plot.new_figure(8.4, 4.2)
+    left, right = figure.subplots(1, 2)
+    plot.ellipses(left, field, sizes="fit")
+    plot.ellipses(right, field, sizes="fit", color="orientation")
+    return figure
+
+
+def lines() -> Figure:
+    """Integral lines of the eigenvectors, evenly spaced, over an image of the signature."""
+    field = hj.examples.figure4_fields(41)["waves"]
+    (values,) = hj.hks(hj.eigenpairs(field, 200, "mirror", multiplet="drop"), [0.02], "flat")
+    figure = plot.new_figure(4.6, 3.8)
+    ax = figure.subplots()
+    plot.scalar_image(ax, values, field.grid, label=r"$4\pi t\,$HKS, $t$ = 0.02", interpolation="bilinear")
+    plot.integral_lines(ax, field, "major", colors="white", density=0.8)
+    plot.integral_lines(ax, field, "minor", colors="tab:orange", density=0.8, linewidths=0.5)
+    return figure
+
+
+def convolution() -> Figure:
+    """Line integral convolution: every direction at once, alone or as shading of a scalar."""
+    field = hj.examples.figure4_fields(41)["cells"]
+    (values,) = hj.hks(hj.eigenpairs(field, 200, "mirror", multiplet="drop"), [0.02], "flat")
+    figure = plot.new_figure(7.6, 3.6)
+    left, right = figure.subplots(1, 2)
+    plot.line_integral_convolution(left, field, pixels=220)
+    plot.line_integral_convolution(right, field, values=values, pixels=220, label=r"$4\pi t\,$HKS, $t$ = 0.02")
+    return figure
+
+
+def degenerate() -> Figure:
+    """Degenerate points, where the eigenvalues are equal, with the index that the eigenvectors have around them."""
+    grid = hj.Grid.from_bounds(-1, 1, (61, 61))
+    z = grid.nodes[..., 0] + 1j * grid.nodes[..., 1]
+    v = (z - 0.5) * (z + 0.4 - 0.3j) * np.conj(z + 0.1 + 0.5j) ** 2 * np.conj(z - 0.2 - 0.6j)
+    v = v / (1 + np.abs(v))  # T = 2·I + [[Re v, Im v], [Im v, −Re v]]
+    tensors = np.stack([np.stack([2 + v.real, v.imag], -1), np.stack([v.imag, 2 - v.real], -1)], -1)
+    field = hj.TensorField(grid, tensors)
+    print(hj.degenerate_points(field))
+    figure = plot.new_figure(4.0, 4.2)
+    ax = figure.subplots()
+    plot.integral_lines(ax, field, colors="0.5")
+    plot.degenerate_points(ax, field)
+    return figure
+
+
+def curves() -> Figure:
+    """HKS(t) at points, with the expansion in curvature dashed, and the times that the eigenpairs do not resolve."""
+    field = hj.examples.sphere_field(41, 1.5)
+    pairs = hj.eigenpairs(field, 150, multiplet="drop")
+    times = jnp.geomspace(0.005, 3, 60)
+    figure = plot.new_figure(7.6, 3.4)
+    limit = float(hj.truncation(pairs, times).smallest_time)
+    for ax, scaled in zip(figure.subplots(1, 2), (False, True), strict=True):
+        plot.hks_curves(
+            ax,
+            hj.hks(pairs, times),
+            times,
+            field.grid,
+            [[0, 0], [0.75, 0.75]],
+            expansion=hj.hks_expansion(field, times),
+            limit=limit,
+            scaled=scaled,
+        )
+    return figure
+
+
+def weyl() -> Figure:
+    """How many eigenvalues there are up to λ, and Weyl's law, which they fall behind where the grid is too coarse."""
+    field = hj.examples.figure4_fields(41)["cells"]
+    pairs = hj.eigenpairs(field, 250)
+    figure = plot.new_figure(7.6, 3.2)
+    counts, remainder = figure.subplots(1, 2)
+    plot.spectrum(counts, pairs, field)
+    plot.spectrum(remainder, pairs, field, remainder=True)
+    return figure
+
+
+def influence() -> Figure:
+    """How far the boundary reaches: which part of the signature it decides, with lines at 1 % and 10 %."""
+    field = brain_like()
+    times = np.array([0.4, 1.5, 6.0]) * 1e5
+    values = hj.boundary_influence(field, times, 300)
+    figure = plot.new_figure(8.4, 3.2)
+    for ax, t, image in zip(figure.subplots(1, 3), times, values, strict=True):
+        plot.influence_map(ax, image, field.grid)
+        ax.set_title(f"$t$ = {plot.number_text(t)} s", fontsize="medium")
+    return figure
+
+
+def rows() -> Figure:
+    """The signature over t beside the trace and the anisotropy, smoothed by Gaussians or by heat flow in the metric."""
+    field = hj.examples.figure3_fields(41)["T³"]
+    pairs = hj.eigenpairs(field, 200, "mirror", multiplet="drop")
+    times = np.array([1.0, 4.0, 16.0])
+    scalars = hj.tensor_invariants(field)
+    values = {"HKS": hj.hks(pairs, times, "flat")}
+    for name in ("trace", "anisotropy"):
+        values[f"{name}\nGaussian"] = hj.gaussian_scale_space(field, times, scalars[name])
+        values[f"{name}\nheat flow"] = hj.heat_flow(pairs, times, scalars[name])
+    return plot.time_rows(values, times, field.grid)
+
+
+def derivative() -> Figure:
+    """Which tensor, changed in which direction, drives the signature at the black dot."""
+    field = hj.examples.figure4_fields(24)["waves"]
+    derivative_of = jax.grad(lambda tensors: signature_at_dot(hj.TensorField(field.grid, tensors)))
+    gradient = derivative_of(field.tensors)
+    figure = plot.new_figure(4.0, 3.8)
+    ax = figure.subplots()
+    plot.sensitivity(ax, field.grid, gradient, every=1)
+    ax.plot(*field.grid.nodes[12, 12], "ko", markersize=4)
+    return figure
+
+
+def fit() -> Figure:
+    """A metric found from its signature: target, fit and difference over t, the metric, and the way there."""
+    grid = hj.Grid(shape=(20, 20), spacing=1 / 19)
+    x, y = grid.nodes[..., 0], grid.nodes[..., 1]
+    hidden = hj.TensorField(grid, jnp.exp(0.4 * jnp.sin(3 * x) * jnp.cos(2 * y))[..., None, None] * jnp.eye(2))
+    times = jnp.geomspace(0.01, 0.1, 4)
+    target = hj.hks(hj.eigenpairs(hidden, k=64), times)
+    start = hj.TensorField(grid, jnp.broadcast_to(jnp.eye(2), (20, 20, 2, 2)))
+    return plot.fit_panels(hj.fit_metric(target, times, start, "conformal"), target, times, max_times=2)
+
+
+def torus() -> Figure:
+    """A surface, coloured by its signature."""
+    mesh = hj.examples.bumpy_torus_mesh(90)
+    (values,) = hj.hks(hj.eigenpairs(mesh, 60, multiplet="drop"), [1.0])
+    figure = plot.new_figure(5.0, 3.4)
+    ax = figure.add_subplot(projection="3d")
+    mappable = plot.surface(ax, mesh, values)
+    figure.colorbar(mappable, ax=ax, label="HKS at $t$ = 1", shrink=0.7)
+    return figure
+
+
+ENTRIES: dict[str, Callable[[], Figure]] = {
+    "Signatures over t": panels,
+    "Tensor ellipses": glyphs,
+    "Integral lines": lines,
+    "Line integral convolution": convolution,
+    "Degenerate points": degenerate,
+    "Curves at points": curves,
+    "Spectra and Weyl's law": weyl,
+    "The boundary's influence": influence,
+    "Beside Gaussian smoothing and heat flow": rows,
+    "Sensitivity": derivative,
+    "Fits": fit,
+    "Surfaces": torus,
+}
+
+
+def page() -> str:
+    """Return the text of docs/gallery.md."""
+    helpers = "\n\n".join(inspect.getsource(helper) for helper in (brain_like, signature_at_dot))
+    parts = [HEAD, f"```python\n{helpers}```\n"]
+    for title, draw in ENTRIES.items():
+        body = textwrap.dedent(inspect.getsource(draw).split('"""', 2)[2]).strip("\n")
+        body = body.replace("return figure", 'plot.save_figure(figure, "picture.png")').replace(
+            "return plot", "figure = plot"
+        )
+        image = f"![{title}](images/gallery/{draw.__name__}.png)"
+        parts += [f"## {title}", f"{draw.__doc__}", image, f"```python\n{body}\n```\n"]
+    return "\n\n".join(part.rstrip() for part in parts) + "\n"
+
+
+def main(names: list[str]) -> None:
+    """Draw the pictures, all or those named, and write the page."""
+    jax.config.update("jax_enable_x64", True)
+    for draw in ENTRIES.values():
+        if names and draw.__name__ not in names:
+            continue
+        with warnings.catch_warnings():
+            # Symmetric fields have multiple eigenvalues, and some is always cut: no picture shows it. The curves show
+            # what happens at times that the pairs do not resolve.
+            warnings.filterwarnings("ignore", ".*(multiple eigenvalue|too small for k)", hj.AccuracyWarning)
+            path = plot.save_figure(draw(), PICTURES / f"{draw.__name__}.png", dpi=DPI)
+        print(path, path.stat().st_size // 1024, "KiB", flush=True)
+    (HERE / "gallery.md").write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,79 @@
+"""What the commands that compute with tensors have in common: their arguments, and the volume these describe."""
+
+import argparse
+from pathlib import Path
+
+from hks_jax.cli.arguments import parse_boundary
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import add_arguments as add_reading_arguments
+from hks_jax.cli.reading import image_suffix, read
+from hks_jax.eigen.solve import SOLVERS
+from hks_jax.io import TensorVolume
+from hks_jax.io.repair import require_valid
+
+
+def add_tensor_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that say which tensors are read, and where the results go."""
+    add_reading_arguments(parser)
+    add = parser.add_argument
+    add("-o", "--output", metavar="OUT", type=Path, required=True, help="folder for the results")
+    add(
+        "--metric",
+        choices=("tensor", "inverse", "adjugate"),
+        help="the metric of diffusion tensors D: inverse is D⁻¹ (t is time), tensor is D itself, adjugate is |D|D⁻¹; "
+        "must be chosen but for NumPy's files, which hold the metric itself unless you choose",
+    )
+    add(
+        "--components",
+        choices=("raise", "largest", "all"),
+        default="raise",
+        help="where the mask falls apart: stop (default), keep the largest piece, or keep all",
+    )
+    add("--dtype", choices=("float32", "float64"), default="float64", help="precision (default float64)")
+
+
+def add_eigenpair_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that say which eigenpairs are computed."""
+    add = parser.add_argument
+    add(
+        "--boundary",
+        type=parse_boundary,
+        default="neumann",
+        metavar="B",
+        help="neumann (default), dirichlet, periodic or mirror; one for all axes, or one per axis as in "
+        "neumann,periodic; low:high for the two sides, as in neumann:dirichlet,neumann",
+    )
+    add(
+        "-k",
+        type=int,
+        help="number of eigenpairs (default 200, for a volume 100, or a quarter of the unknowns if that is less)",
+    )
+    add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that asks for a machine-readable summary."""
+    parser.add_argument("--json", action="store_true", help="print a summary as JSON, not the names of the files")
+
+
+def require_metric(args: argparse.Namespace) -> None:
+    """Raise ValueError where diffusion tensors are not yet a metric."""
+    if args.metric is None and image_suffix(args.file):
+        raise ValueError(
+            "--metric: choose one; diffusion tensors D become a metric as inverse (D⁻¹, Brownian motion with "
+            "diffusivity D), tensor (D itself) or adjugate (|D|D⁻¹)"
+        )
+
+
+def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
+    """Read the file, cut the slice, settle the mask, and refuse tensors that make no metric.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: what cannot be read as tensors, or a slice or a mask that does not fit them.
+    """
+    volume = read(args, progress)
+    if 1 in volume.shape:
+        raise ValueError(f"--slice: the volume is one voxel thick; pass --slice {'xyz'[volume.shape.index(1)]}=0")
+    require_valid(volume.with_mask(volume.grid(args.components).mask), "--repair")
+    return volume

@@ -1,0 +1,124 @@
+"""``hks-jax spectrum FILE -o OUT``: the eigenvalues of a tensor field in a file, against Weyl's law."""
+
+import argparse
+import csv
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hks_jax.cli.inputs import (
+    add_eigenpair_arguments,
+    add_json_argument,
+    add_tensor_arguments,
+    read_volume,
+    require_metric,
+)
+from hks_jax.cli.progress import Progress
+from hks_jax.io import atomic_folder
+
+if TYPE_CHECKING:
+    from hks_jax.domain.tensor_field import TensorField
+    from hks_jax.eigen.eigenpairs import Eigenpairs
+
+DESCRIPTION = """\
+Compute the lowest eigenvalues of the Laplace-Beltrami operator of a field of diffusion tensors. FILE is read as by
+'hks-jax hks'.
+
+Writes to the folder OUT: spectrum.csv and spectrum.npz (eigenvalues, their residuals, and how many there are up to each
+by Weyl's law), spectrum.png and report.json.
+"""
+
+EPILOG = """\
+examples:
+  hks-jax spectrum tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 300
+  hks-jax spectrum field.npz -o out -k 50 -q --json | jq .eigenvalues
+"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand's parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "spectrum",
+        help="compute eigenvalues, and compare them with Weyl's law",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_tensor_arguments(parser)
+    add_eigenpair_arguments(parser)
+    add_json_argument(parser)
+    return parser
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the subcommand."""
+    require_metric(args)
+    from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
+    from hks_jax.cli.outputs import check_folder, show_files, write_report
+    from hks_jax.plot import save_figure
+    from hks_jax.signatures.weyl import weyl_count
+
+    check_folder(args.output)
+    progress = Progress(args.quiet)
+    with progress.catching_warnings():
+        with progress.stage("reading", str(args.file)):
+            volume = read_volume(args, progress)
+        settings = Settings(
+            metric=args.metric or "tensor",
+            k=args.k,
+            boundary=args.boundary,
+            components=args.components,
+            solver=args.solver,
+            dtype=args.dtype,
+        )
+        field, pairs = compute_pairs(volume, settings, progress)
+        columns = {
+            "eigenvalue": np.asarray(pairs.eigenvalues),
+            "residual": np.asarray(pairs.residuals),
+            "weyl_count": weyl_count(pairs, pairs.eigenvalues, field),
+        }
+        chosen = asdict(settings)
+        for name in ("times", "normalisation"):
+            del chosen[name]
+        report = {
+            "input": describe_input(volume, field.grid.mask),
+            "settings": {**chosen, "k": pairs.k},
+            "eigenpairs": describe_pairs(pairs),
+            "volume": float(pairs.pencil.volume),
+            "eigenvalues": columns["eigenvalue"].tolist(),
+        }
+        with progress.stage("writing", str(args.output)), atomic_folder(args.output) as folder:
+            np.savez_compressed(
+                folder / "spectrum.npz",
+                eigenvalues=columns["eigenvalue"],
+                residuals=columns["residual"],
+                weyl_counts=columns["weyl_count"],
+            )
+            write_csv(folder / "spectrum.csv", columns)
+            save_figure(draw(pairs, field), folder / "spectrum.png")
+            write_report(folder / "report.json", report, progress, sys.argv)
+            names = sorted(file.name for file in folder.iterdir())
+    show_files([args.output / name for name in names], args.quiet, args.json)
+
+
+def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
+    """Write numbered rows with every digit."""
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["index", *columns])
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        writer.writerows([i, *row] for i, row in enumerate(rows))
+
+
+def draw(pairs: "Eigenpairs", field: "TensorField") -> Any:
+    """Return the picture: the eigenvalues' count beside Weyl's law, and what is left when that is taken off."""
+    from hks_jax.plot import new_figure, spectrum
+
+    figure = new_figure(9.0, 3.8)
+    counts, remainder = figure.subplots(1, 2)
+    spectrum(counts, pairs, field)
+    spectrum(remainder, pairs, field, remainder=True)
+    return figure

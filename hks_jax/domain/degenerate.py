@@ -1,0 +1,145 @@
+"""Degenerate points of a tensor field in two dimensions: where its eigenvalues are equal."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from hks_jax.domain.components import active_elements
+from hks_jax.domain.tensor_field import TensorField
+
+
+class DegeneratePoints(NamedTuple):
+    """Degenerate points of a field.
+
+    Attributes:
+        positions: (n, 2) coordinates.
+        indices: (n,) multiples of ½: how often the eigenvectors turn while one goes once around the point.
+    """
+
+    positions: Float[np.ndarray, "n 2"]
+    indices: Float[np.ndarray, " n"]
+
+
+def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
+    """Find the points of a 2D field where the eigenvalues are equal, with their index.
+
+    The vector (T₁₁ − T₂₂, 2T₁₂) vanishes there, and it turns twice as fast as the eigenvectors. Interpolated
+    bilinearly from the nodes, it has at most one zero in a cell that it winds around: index ±½, a wedge or a
+    trisector. A point of higher index shows as several of these, or as zeros at nodes and on edges, side by side: what
+    is near is one point, whose index is the sum (Tricoche, Scheuermann and Hagen 2001).
+
+    Only what has an index is found: points of index 0, a pair of opposite index closer than `merge`, and points on the
+    rim of the domain, around which one cannot go, are not. Of a curve or a patch of equal eigenvalues that does not
+    reach the rim the middle is returned, if its index is not 0.
+
+    Args:
+        field: a 2D field. Cells with a node outside the mask are no part of the domain.
+        merge: zeros in cells that are at most so many cells apart, along either axis, count as one point; at least 1
+            (zeros on an edge belong to two cells).
+
+    Returns:
+        The points, by first and then by second coordinate.
+
+    Raises:
+        ValueError: a 3D field; merge less than 1.
+    """
+    grid = field.grid
+    if grid.dimension != 2:
+        raise ValueError(
+            f"field: got a grid of shape {grid.shape}; expected 2 dimensions. In 3D eigenvalues meet on curves; "
+            "take a slice"
+        )
+    if merge < 1:
+        raise ValueError(f"merge: got {merge}; expected at least 1 cell")
+    nodal = np.asarray(field.domain_tensors)
+    tensors = nodal.astype(np.float64)
+    v = np.stack([tensors[..., 0, 0] - tensors[..., 1, 1], 2 * tensors[..., 0, 1]], axis=-1)
+    active = active_elements(grid.inside, (False, False))
+    # What rounding makes of a zero.
+    tiny = 16 * np.finfo(nodal.dtype).eps * np.trace(tensors, axis1=-2, axis2=-1)
+    winding, crossed, on_rim = _windings(v, tiny, active)
+    cells = np.argwhere(active & ((winding != 0) | crossed))
+    if len(cells) == 0:
+        return DegeneratePoints(np.zeros((0, 2)), np.zeros(0))
+
+    near = cKDTree(cells).query_pairs(merge, p=np.inf, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
+    count, cluster = connected_components(graph, directed=False)
+    turns = winding[tuple(cells.T)]
+    # A zero on an edge or a node is seen by several cells, and how they share its turns is arbitrary; their sum is not.
+    index = np.bincount(cluster, turns, count) / 2
+    settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
+    shared = crossed[tuple(cells.T)]
+    exact = np.bincount(cluster, shared, count)[cluster] > 0
+    weights = np.where(exact, shared, np.sign(turns) == np.sign(index[cluster])).astype(float)
+    zeros = cells + _zeros_in_cells(v, cells)
+    middle = np.stack([np.bincount(cluster, weights * z, count) for z in zeros.T], axis=-1)
+    found = settled & (index != 0)
+    middle = middle[found] / np.bincount(cluster, weights, count)[found, None]
+    order = np.lexsort((middle[:, 1], middle[:, 0]))
+    return DegeneratePoints((grid.origin + middle * grid.spacing)[order], index[found][order])
+
+
+def _windings(
+    v: Float[np.ndarray, "nx ny 2"], tiny: Float[np.ndarray, "nx ny"], active: Bool[np.ndarray, "mx my"]
+) -> tuple[Int[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
+    """Return how often v turns around each cell, which cells have a zero on their edges, and which one on the rim."""
+    angle = np.arctan2(v[..., 1], v[..., 0])
+    zero = np.hypot(v[..., 0], v[..., 1]) <= tiny
+    number = np.zeros(active.shape)
+    crossed, on_rim = np.zeros(active.shape, dtype=bool), np.zeros(active.shape, dtype=bool)
+    for axis in (0, 1):
+        first, second = _ends(v, axis)
+        a, b = _ends(angle, axis)
+        turn = np.mod(b - a + np.pi, 2 * np.pi) - np.pi
+        # Interpolated linearly along the edge, v passes the origin at this distance, if it does between the ends.
+        apart = np.linalg.norm(second - first, axis=-1)
+        cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+        opposite = np.sum(first * second, axis=-1) < 0
+        limit = np.maximum(*_ends(tiny, axis))
+        through = opposite & (np.abs(cross) <= limit * apart)
+        through |= np.logical_or(*_ends(zero, axis))
+        padded = np.pad(active, [(1, 1) if other != axis else (0, 0) for other in (0, 1)])
+        low, high = _ends(padded, 1 - axis)
+        rim = through & ~(low & high)
+        sign = 1 if axis == 0 else -1
+        (one, two), (rim_one, rim_two), (by_one, by_two) = (_ends(e, 1 - axis) for e in (turn, rim, through))
+        number += sign * (one - two)
+        crossed |= by_one | by_two
+        on_rim |= rim_one | rim_two
+    return np.rint(number / (2 * np.pi)).astype(int), crossed, on_rim
+
+
+def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values at the low and at the high ends of the edges (or sides of the cells) along an axis."""
+    n = values.shape[axis]
+    return values.take(range(n - 1), axis), values.take(range(1, n), axis)
+
+
+def _zeros_in_cells(v: Float[np.ndarray, "nx ny 2"], cells: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Return the zero of the bilinear interpolant in each cell, in units of its sides; the middle where there is none.
+
+    a₀ + a₁x + a₂y + a₃xy = 0 in both components: without x a quadratic equation in y.
+    """
+    i, j = cells.T
+    p00, p10, p01, p11 = v[i, j], v[i + 1, j], v[i, j + 1], v[i + 1, j + 1]
+    c0, c1, c2, c3 = p00, p10 - p00, p01 - p00, p11 - p10 - p01 + p00
+
+    def cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+
+    A, B, C = cross(c2, c3), cross(c0, c3) + cross(c2, c1), cross(c0, c1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = -(B + np.where(B < 0, -1, 1) * np.sqrt(B**2 - 4 * A * C)) / 2
+        y = np.stack([q / A, C / q], axis=1)
+        slope, value = c1[:, None] + c3[:, None] * y[..., None], c0[:, None] + c2[:, None] * y[..., None]
+        x = -np.sum(slope * value, axis=-1) / np.sum(slope**2, axis=-1)
+    roots = np.stack([x, y], axis=-1)
+    beyond = np.nan_to_num(np.max(np.abs(roots - 0.5), axis=-1), nan=np.inf, posinf=np.inf)
+    best = np.take_along_axis(roots, np.argmin(beyond, axis=1)[:, None, None], axis=1)[:, 0]
+    inside = beyond.min(axis=1)[:, None] <= 0.5 + 1e-6
+    return np.where(inside, best, 0.5)
