@@ -24,7 +24,8 @@ HEAD = """\
 # Gallery
 
 Every picture of `hks_jax.plot`, and the code that made it. Most functions draw on axes that they are given, so that
-pictures compose; `hks_panels`, `time_rows` and `fit_panels` make a figure. `python docs/gallery.py` makes this page.
+pictures compose; `hks_panels`, `volume_panels`, `time_rows` and `fit_panels` make a figure. `python docs/gallery.py`
+makes this page.
 
 All code below begins with
 
@@ -191,6 +192,16 @@ def fit() -> Figure:
     return plot.fit_panels(hj.fit_metric(target, times, start, "conformal"), target, times, max_times=2)
 
 
+def volume() -> Figure:
+    """A volume over t, as three orthogonal slices; `orthogonal_slices` draws them on axes of yours."""
+    grid = hj.Grid.from_bounds(-1.0, 1.0, shape=(17, 17, 17))
+    bump = 1 + 8 * np.exp(-8 * np.sum((grid.nodes - [0.3, -0.2, 0.1]) ** 2, axis=-1))
+    field = hj.TensorField(grid, bump[..., None, None] * np.eye(3))
+    times = [0.05, 0.2, 0.8]
+    values = hj.hks(hj.eigenpairs(field, 200, solver="dense", multiplet="drop"), times)
+    return plot.volume_panels(values, times, grid, quantiles=(0.01, 0.99))
+
+
 def torus() -> Figure:
     """A surface, coloured by its signature."""
     mesh = hj.examples.bumpy_torus_mesh(90)
@@ -212,6 +223,7 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
     "Spectra and Weyl's law": weyl,
     "The boundary's influence": influence,
     "Beside Gaussian smoothing and heat flow": rows,
+    "Volumes": volume,
     "Sensitivity": derivative,
     "Fits": fit,
     "Surfaces": torus,
