@@ -32,12 +32,12 @@ def timed_from_cold(function: Callable[..., Any], *args: Any, repeats: int) -> t
     return times[0], min(times[1:]), result
 
 
-def field(n: int) -> hj.TensorField:
-    """Anisotropic tensors of eigenvalues 1 … 4 and random directions, n² nodes on the unit square."""
-    rng = np.random.default_rng(n)
-    frames = np.linalg.qr(rng.standard_normal((n, n, 2, 2)))[0]
-    values = rng.uniform(1, 4, (n, n, 2))
-    return hj.TensorField(hj.Grid((n, n), 1 / (n - 1)), np.einsum("...ia,...a,...ja->...ij", frames, values, frames))
+def field(n: int, d: int = 2) -> hj.TensorField:
+    """Anisotropic tensors of eigenvalues 1 … 4 and random directions, n^d nodes on the unit square or cube."""
+    rng, shape = np.random.default_rng(n), (n,) * d
+    frames = np.linalg.qr(rng.standard_normal((*shape, d, d)))[0]
+    values = rng.uniform(1, 4, (*shape, d))
+    return hj.TensorField(hj.Grid(shape, 1 / (n - 1)), np.einsum("...ia,...a,...ja->...ij", frames, values, frames))
 
 
 def write(output: Path, rows: Any, **more: Any) -> None:

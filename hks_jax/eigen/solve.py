@@ -28,8 +28,8 @@ SOLVERS: dict[str, Callable[[], Eigensolver]] = {
     solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos, ChebyshevFilter)
 }
 
-_LARGE = 4_000_000
-"""Unknowns times pairs from which on block Lanczos wins even if it has to be compiled first."""
+_LARGE, _LARGE_IN_3D = 4_000_000, 1_000_000
+"""Unknowns times pairs from which on JAX's solvers win even if they have to be compiled first."""
 
 
 def eigenpairs(
@@ -107,14 +107,16 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
         n = pencil.space.n_dof
         if n <= 1500 or 4 * k > n:
             return Dense()
+        if not isinstance(pencil.stiffness, StencilOperator):
+            return ShiftInvert()
+        # In 3D factorisations fill in.
+        if pencil.space.dimension == 3:
+            large = n * k >= _LARGE_IN_3D and k <= ChebyshevFilter().max_pairs(n)
+            return ChebyshevFilter() if large else ShiftInvert()
         # Block Lanczos is faster from about 60² nodes on, but takes some ten seconds to compile. In float32 matrices
         # it has float32 factors, where the host's solver has float64.
-        grid, precise = isinstance(pencil.stiffness, StencilOperator), pencil.stiffness.dtype == np.float64
-        return (
-            BlockLanczos()
-            if grid and precise and n * k >= _LARGE and k <= BlockLanczos().max_pairs(n)
-            else ShiftInvert()
-        )
+        large = n * k >= _LARGE and k <= BlockLanczos().max_pairs(n)
+        return BlockLanczos() if large and pencil.stiffness.dtype == np.float64 else ShiftInvert()
     if solver not in SOLVERS:
         raise ValueError(
             f'solver: got {solver!r}; expected "auto", {", ".join(f"{name!r}" for name in SOLVERS)} or a solver object'
