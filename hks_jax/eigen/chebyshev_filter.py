@@ -48,8 +48,8 @@ class ChebyshevFilter(Eigensolver):
         single_precision: whether filters run in float32.
         derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
             below what the eigenvectors' dtype allows.
-        mesh: devices to share the work among, a `jax.sharding.Mesh` with one axis (docs/devices.md): each filters some of
-            the vectors, and holds all of them on a part of the grid. None: one device.
+        mesh: devices to share the work among, a `jax.sharding.Mesh` with one axis: each filters some of the vectors,
+            and holds all of them on a part of the grid (docs/devices.md). None: one device.
         progress: called with short texts after each round; None is silent.
     """
 

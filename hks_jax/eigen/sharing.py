@@ -69,4 +69,3 @@ def total(slabs: Slabs | None, tree: Any) -> Any:
 def first_of(slabs: Slabs | None, x: Array) -> Array:
     """Return what the first device has: devices of different kinds need not round alike."""
     return x if slabs is None else slabs.total(jnp.where(jax.lax.axis_index(slabs.name) == 0, x, 0))
-

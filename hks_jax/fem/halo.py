@@ -122,7 +122,7 @@ class Slabs:
         up = [(i, i + 1) for i in range(last)]
         down = [(i + 1, i) for i in range(last)]
         top = jax.lax.slice_in_dim(x, -1, None, axis=0)
-        place = self.thickness + 1
+        place: int | Array = self.thickness + 1
         if self.periodic[0]:
             up, down = [*up, (last, 0)], [*down, (0, last)]
             if planes + 1 < self.thickness:
