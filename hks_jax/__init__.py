@@ -50,7 +50,8 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    # Several devices, fits and the outside world (files, pictures) are imported when first asked for: slow to import, often not needed.
+    # Several devices, fits and the outside world (files, pictures) are imported when first asked for: slow to import,
+    # often not needed.
     if name in ("devices", "inverse", "io", "plot"):
         return importlib.import_module(f"hks_jax.{name}")
     if name in ("fit_metric", "identifiability"):
