@@ -24,7 +24,8 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
         mesh: devices along one axis.
 
     Returns:
-        What ``jax.lax.map(function, batch)`` would: arrays (n, …). They lie where they were computed.
+        What ``jax.lax.map(function, batch)`` would: arrays (n, …). They stay where they were computed if n is a
+        multiple of the number of devices; otherwise every device has them whole.
 
     Raises:
         ValueError: arrays of different lengths, or none; a mesh with several axes.

@@ -80,7 +80,7 @@ class Slabs:
         return jax.jit(self._padded, static_argnums=1, out_shardings=NamedSharding(self.mesh, self.spec(axis)))(x, axis)
 
     def join(self, x: Array, axis: int = 0) -> Array:
-        """Cut the padding off again."""
+        """Cut the padding off again. If there was any, every device has the result whole."""
         return jax.lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
 
     @partial(jax.jit, static_argnums=0)
