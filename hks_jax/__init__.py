@@ -58,8 +58,9 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    # Fits and the outside world (files, pictures) are imported when first asked for: slow to import, often not needed.
-    if name in ("inverse", "io", "plot"):
+    # Several devices, fits and the outside world (files, pictures) are imported when first asked for: slow to import,
+    # often not needed.
+    if name in ("devices", "inverse", "io", "plot"):
         return importlib.import_module(f"hks_jax.{name}")
     if name in ("fit_metric", "identifiability"):
         return getattr(importlib.import_module("hks_jax.inverse"), name)

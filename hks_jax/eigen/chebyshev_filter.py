@@ -8,6 +8,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from hks_jax.eigen import filter_complement
@@ -15,7 +16,9 @@ from hks_jax.eigen.chebyshev import upper_end
 from hks_jax.eigen.coarsening import Level, coarsen, finest_level
 from hks_jax.eigen.filtering import Plan, from_coarse, from_random, improve, unconverged
 from hks_jax.eigen.quality import indistinct
+from hks_jax.eigen.sharing import replicate
 from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.fem.halo import checked_mesh
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
@@ -45,6 +48,8 @@ class ChebyshevFilter(Eigensolver):
         single_precision: whether filters run in float32.
         derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
             below what the eigenvectors' dtype allows.
+        mesh: devices to share the work among, a `jax.sharding.Mesh` with one axis: each filters some of the vectors,
+            and holds all of them on a part of the grid (docs/devices.md). None: one device.
         progress: called with short texts after each round; None is silent.
     """
 
@@ -55,6 +60,7 @@ class ChebyshevFilter(Eigensolver):
     max_rounds: int = eqx.field(default=60, static=True)
     single_precision: bool = eqx.field(default=True, static=True)
     derivative_tolerance: float = eqx.field(default=1e-10, static=True)
+    mesh: Mesh | None = eqx.field(default=None, static=True)
     progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
@@ -65,6 +71,8 @@ class ChebyshevFilter(Eigensolver):
             raise ValueError(f"spare: got {self.spare}; expected a positive part of k")
         if not 0 < self.derivative_tolerance < 1:
             raise ValueError(f"derivative_tolerance: got {self.derivative_tolerance}; expected between 0 and 1")
+        if self.mesh is not None:
+            checked_mesh(self.mesh)
 
     def lowest(self, pencil: Pencil, k: int) -> RawPairs:
         """Return the k lowest eigenpairs; the bound is NaN: there is no certificate."""
@@ -103,8 +111,10 @@ class ChebyshevFilter(Eigensolver):
 
     def plan(self, k: int, space: GridSpace) -> Plan:
         """Return the sizes of the computation."""
-        size = math.ceil((k + max(8, self.spare * k)) / self.block) * self.block
-        return Plan(k, size, self.block, space.n_null, self.tolerance, self.single_precision)
+        mesh = None if self.mesh is None else checked_mesh(self.mesh)
+        together = self.block if mesh is None else self.block * mesh.size
+        size = math.ceil((k + max(8, self.spare * k)) / together) * together
+        return Plan(k, size, self.block, space.n_null, self.tolerance, self.single_precision, mesh)
 
 
 def _lowest(
@@ -117,7 +127,7 @@ def _lowest(
     state = None
     for number in reversed(range(len(levels))):
         level = levels[number]
-        high = upper_end(level, space.periodic)
+        level, high = replicate(plan.mesh, (level, upper_end(level, space.periodic)))
         if state is None:
             rounds, state = _FIRST_ROUNDS, from_random(level, space.periodic, plan, high, pencil.volume)
         else:
@@ -132,14 +142,16 @@ def _lowest(
     if report:
         while (left := int(unconverged(plan, rounding, state))) and state.rounds < max_rounds:
             report(f"round {int(state.rounds) + 1}, {plan.wanted - left} of {plan.wanted} pairs")
-            state = improve(levels[0], space.periodic, plan, high, rounding, state)
+            state = improve(level, space.periodic, plan, high, rounding, state)
     else:
         state = jax.lax.while_loop(
             lambda state: (unconverged(plan, rounding, state) > 0) & (state.rounds < max_rounds),
-            lambda state: improve(levels[0], space.periodic, plan, high, rounding, state),
+            lambda state: improve(level, space.periodic, plan, high, rounding, state),
             state,
         )
-    found = state.vectors[: plan.wanted].reshape(plan.wanted, *levels[0].shape)
+    slabs, found = plan.slabs(level.shape, space.periodic), state.vectors[: plan.wanted]
+    found = found.reshape(plan.wanted, *(level.shape if slabs is None else slabs.padded_shape))
+    found = found if slabs is None else slabs.join(found, axis=1)
     return state.values[: plan.wanted], space.restrict(found)
 
 

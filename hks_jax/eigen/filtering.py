@@ -5,12 +5,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.eigen.chebyshev import Band, correction, degree_for, weyl
 from hks_jax.eigen.coarsening import Level, interpolate
-from hks_jax.eigen.subspace import block_of, measure, rayleigh_ritz
+from hks_jax.eigen.sharing import EVERYWHERE, own_blocks, shared, to_own_rows, to_slabs
+from hks_jax.eigen.subspace import block_of, local_level, measure, rayleigh_ritz
 from hks_jax.fem.columns import stencil_product, to_rows
+from hks_jax.fem.halo import Slabs
 
 _GAIN = 40.0
 """How far one round damps what is not wanted: much more, and the lumped mass in the filter is what limits it."""
@@ -31,6 +34,7 @@ class Plan(NamedTuple):
         n_null: zero eigenvalues.
         tolerance: relative residual that counts as converged.
         single_precision: whether filters run in float32.
+        mesh: the devices that vectors are shared among; None for one.
     """
 
     wanted: int
@@ -39,6 +43,11 @@ class Plan(NamedTuple):
     n_null: int
     tolerance: float
     single_precision: bool
+    mesh: Mesh | None
+
+    def slabs(self, shape: tuple[int, ...], periodic: tuple[bool, ...]) -> Slabs | None:
+        """Return how a grid of this shape is cut between rounds."""
+        return None if self.mesh is None else Slabs(self.mesh, shape, periodic)
 
 
 class State(NamedTuple):
@@ -46,7 +55,7 @@ class State(NamedTuple):
 
     Attributes:
         values: (m,) Ritz values θ, ascending.
-        vectors: (m, nodes) M-orthonormal Ritz vectors.
+        vectors: (m, nodes) M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab.
         defects: (m,) ‖Kx − θMx‖/‖Mx‖.
         lumped_values: (m,) xᵀKx / xᵀDx with the lumped mass D.
         rounds: rounds so far on this grid.
@@ -75,17 +84,23 @@ def from_random(
 ) -> State:
     """Return the state after filtering random functions."""
     low = jnp.minimum(1.3 * weyl(plan.size, volume, len(level.shape)).astype(high.dtype), high / 3)
-    band = Band(low, high)
-    degree = jnp.ceil(degree_for(band, jnp.zeros_like(low), _SPREAD)).astype(int)
+    slabs = plan.slabs(level.shape, periodic)
 
-    def damped(key: Array) -> Float[Array, "b nodes"]:
-        x = jnp.where(level.free[..., None], jax.random.normal(key, (*level.shape, plan.block), high.dtype), 0)
-        residual = stencil_product(level.stiffness, x, periodic) - low * level.lumped[..., None] * x
-        return to_rows(x + correction(level, periodic, band, residual, jnp.full(plan.block, low), degree))
+    def run(level: Level, low: Float[Array, ""], high: Float[Array, ""]) -> State:
+        band = Band(low, high)
+        degree = jnp.ceil(degree_for(band, jnp.zeros_like(low), _SPREAD)).astype(int)
 
-    keys = jax.random.split(jax.random.key(0), plan.size // plan.block)
-    vectors = jax.lax.map(damped, keys).reshape(plan.size, -1)
-    return _ritz(level, periodic, plan, vectors, jnp.zeros((), int))
+        def damped(key: Array) -> Float[Array, "b nodes"]:
+            x = jnp.where(level.free[..., None], jax.random.normal(key, (*level.shape, plan.block), high.dtype), 0)
+            residual = stencil_product(level.stiffness, x, periodic) - low * level.lumped[..., None] * x
+            return to_rows(x + correction(level, periodic, band, residual, jnp.full(plan.block, low), degree))
+
+        numbers = own_blocks(slabs, plan.size // plan.block)
+        keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
+        rows = jax.lax.map(damped, keys).reshape(-1, level.lumped.size)
+        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, rows), jnp.zeros((), int))
+
+    return shared(slabs, run, EVERYWHERE, _layout(slabs))(level, low, high)
 
 
 @partial(jax.jit, static_argnames=("periodic", "plan", "coarse_shape"))
@@ -93,12 +108,19 @@ def from_coarse(
     level: Level, periodic: tuple[bool, ...], plan: Plan, coarse_shape: tuple[int, ...], coarse: State
 ) -> State:
     """Return the state that interpolation from the next coarser grid gives."""
+    slabs, coarse_slabs = plan.slabs(level.shape, periodic), plan.slabs(coarse_shape, periodic)
 
-    def of_block(number: Array) -> Float[Array, "b nodes"]:
-        return to_rows(interpolate(block_of(coarse.vectors, number, plan.block, coarse_shape), level, periodic))
+    def run(level: Level, coarse: Float[Array, "m coarse_nodes"]) -> State:
+        rows = to_own_rows(coarse_slabs, plan.block, coarse)
 
-    vectors = jax.lax.map(of_block, jnp.arange(plan.size // plan.block)).reshape(plan.size, -1)
-    return _ritz(level, periodic, plan, vectors, jnp.zeros((), int))
+        def of_block(number: Array) -> Float[Array, "b nodes"]:
+            return to_rows(interpolate(block_of(rows, number, plan.block, coarse_shape), level, periodic))
+
+        fine = jax.lax.map(of_block, jnp.arange(rows.shape[0] // plan.block)).reshape(rows.shape[0], -1)
+        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, fine), jnp.zeros((), int))
+
+    layout = _layout(slabs)
+    return shared(slabs, run, (EVERYWHERE, layout.vectors), layout)(level, coarse.vectors)
 
 
 @partial(jax.jit, static_argnames=("periodic", "plan"), donate_argnames="state")
@@ -111,6 +133,21 @@ def improve(
     state: State,
 ) -> State:
     """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz."""
+    slabs = plan.slabs(level.shape, periodic)
+    layout = _layout(slabs)
+    run = partial(_improve, periodic, plan, slabs)
+    return shared(slabs, run, (EVERYWHERE, EVERYWHERE, EVERYWHERE, layout), layout)(level, high, rounding, state)
+
+
+def _improve(
+    periodic: tuple[bool, ...],
+    plan: Plan,
+    slabs: Slabs | None,
+    level: Level,
+    high: Float[Array, ""],
+    rounding: Float[Array, ""] | None,
+    state: State,
+) -> State:
     spare = jnp.arange(plan.size) >= plan.wanted
     # β of the modes: what the lumped mass makes of their eigenvalues.
     ratio = jnp.where(state.values > 0, state.lumped_values / jnp.where(state.values > 0, state.values, 1), 1)
@@ -129,8 +166,11 @@ def improve(
     degrees = jnp.max(jnp.where(left, degrees, 0).reshape(-1, plan.block), axis=1).astype(int)
     dtype = jnp.float32 if plan.single_precision else state.values.dtype
 
-    def filtered(number: Array, vectors: Float[Array, "m nodes"]) -> Float[Array, "m nodes"]:
-        x = block_of(vectors, number, plan.block, level.shape)
+    numbers = own_blocks(slabs, plan.size // plan.block)
+
+    def filtered(own: Array, vectors: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
+        number = numbers[own]
+        x = block_of(vectors, own, plan.block, level.shape)
         theta, zeta, scale = (
             jax.lax.dynamic_slice_in_dim(v, number * plan.block, plan.block)
             for v in (state.values, filtered_values, factor)
@@ -142,18 +182,27 @@ def improve(
         residual = stencil_product(level.stiffness, x, periodic) - moved
         z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number], sharp)
         x = x + jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
-        return jax.lax.dynamic_update_slice_in_dim(vectors, to_rows(x), number * plan.block, axis=0)
+        return jax.lax.dynamic_update_slice_in_dim(vectors, to_rows(x), own * plan.block, axis=0)
 
-    def step(number: Array, vectors: Float[Array, "m nodes"]) -> Float[Array, "m nodes"]:
-        return jax.lax.cond(degrees[number] > 0, filtered, lambda _, unchanged: unchanged, number, vectors)
+    def step(own: Array, vectors: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
+        return jax.lax.cond(degrees[numbers[own]] > 0, filtered, lambda _, unchanged: unchanged, own, vectors)
 
-    vectors = jax.lax.fori_loop(0, plan.size // plan.block, step, state.vectors)
+    rows = to_own_rows(slabs, plan.block, state.vectors)
+    vectors = to_slabs(slabs, plan.block, jax.lax.fori_loop(0, numbers.size, step, rows))
     return _ritz(level, periodic, plan, vectors, state.rounds + 1)
 
 
 def _ritz(
     level: Level, periodic: tuple[bool, ...], plan: Plan, vectors: Float[Array, "m nodes"], rounds: Int[Array, ""]
 ) -> State:
-    values, vectors = rayleigh_ritz(level, periodic, plan.block, vectors)
-    measured = measure(level, periodic, plan.block, values, vectors)
+    slabs = plan.slabs(level.shape, periodic)
+    level = local_level(level, slabs)
+    values, vectors = rayleigh_ritz(level, periodic, plan.block, vectors, slabs)
+    measured = measure(level, periodic, plan.block, values, vectors, slabs)
     return State(values, vectors, measured.defects, measured.lumped_values, rounds)
+
+
+def _layout(slabs: Slabs | None) -> State:
+    """Return how a state is laid out: the vectors in slabs, the rest on every device."""
+    vectors = EVERYWHERE if slabs is None else PartitionSpec(None, slabs.name)
+    return State(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]

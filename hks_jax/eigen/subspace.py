@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 from hks_jax.eigen.coarsening import Level
 from hks_jax.eigen.products import combine, inner_products
-from hks_jax.fem.columns import stencil_product, to_columns, to_rows
+from hks_jax.eigen.sharing import first_of, total
+from hks_jax.fem.columns import product_with_rim, stencil_product, to_columns, to_rows
+from hks_jax.fem.halo import Slabs
 
 _CHUNK = 1 << 14
 """Nodes rotated at once."""
@@ -27,23 +29,35 @@ def block_of(x: Float[Array, "m nodes"], number: Array, block: int, shape: tuple
     return to_columns(jax.lax.dynamic_slice_in_dim(x, number * block, block), shape)
 
 
-@partial(jax.jit, static_argnames=("periodic", "block"), donate_argnames="x")
+def local_level(level: Level, slabs: Slabs | None) -> Level:
+    """Return the level on this device's slab."""
+    if slabs is None:
+        return level
+    d = len(slabs.shape)
+    return Level(*(slabs.own(a, a.ndim - d) for a in level))
+
+
+@partial(jax.jit, static_argnames=("periodic", "block", "slabs"), donate_argnames="x")
 def rayleigh_ritz(
-    level: Level, periodic: tuple[bool, ...], block: int, x: Float[Array, "m nodes"]
+    level: Level, periodic: tuple[bool, ...], block: int, x: Float[Array, "m nodes"], slabs: Slabs | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, "m nodes"]]:
-    """Return the Ritz values, ascending, and the M-orthonormal Ritz vectors in place of the rows."""
+    """Return the Ritz values, ascending, and the M-orthonormal Ritz vectors in place of the rows.
+
+    With ``slabs``, level and rows are those of this device's slab.
+    """
     m, nodes = x.shape
 
     def products(number: Array) -> tuple[Array, Array]:
         columns = block_of(x, number, block, level.shape)
-        image, moved = (stencil_product(matrix, columns, periodic) for matrix in (level.stiffness, level.mass))
+        image, moved = _images(level, periodic, slabs, columns)
         return inner_products(x, to_rows(image)), inner_products(x, to_rows(moved))
 
-    stiffness, mass = (p.reshape(m, m) for p in jax.lax.map(products, jnp.arange(m // block)))
+    stiffness, mass = (p.reshape(m, m) for p in total(slabs, jax.lax.map(products, jnp.arange(m // block))))
     factor = jnp.linalg.cholesky((mass + mass.T) / 2)
     half = jax.scipy.linalg.solve_triangular(factor, (stiffness + stiffness.T) / 2, lower=True)
     values, mix = jnp.linalg.eigh(jax.scipy.linalg.solve_triangular(factor, half.T, lower=True))
     mix = jax.scipy.linalg.solve_triangular(factor, mix, lower=True, trans=1).T
+    values, mix = first_of(slabs, values), first_of(slabs, mix)
 
     def rotate(number: Array, x: Array) -> Array:
         rotated = combine(mix, jax.lax.dynamic_slice_in_dim(x, number * _CHUNK, _CHUNK, axis=1))
@@ -57,19 +71,36 @@ def rayleigh_ritz(
     return values, x
 
 
-@partial(jax.jit, static_argnames=("periodic", "block"))
+@partial(jax.jit, static_argnames=("periodic", "block", "slabs"))
 def measure(
-    level: Level, periodic: tuple[bool, ...], block: int, values: Float[Array, " m"], x: Float[Array, "m nodes"]
+    level: Level,
+    periodic: tuple[bool, ...],
+    block: int,
+    values: Float[Array, " m"],
+    x: Float[Array, "m nodes"],
+    slabs: Slabs | None = None,
 ) -> Measured:
     """Return how good the pairs are."""
 
-    def of_block(number: Array) -> tuple[Array, Array]:
+    def of_block(number: Array) -> tuple[Array, ...]:
         columns = block_of(x, number, block, level.shape)
         theta = jax.lax.dynamic_slice_in_dim(values, number * block, block)
-        image, moved = (stencil_product(matrix, columns, periodic) for matrix in (level.stiffness, level.mass))
-        axes = tuple(range(columns.ndim - 1))
-        defect = jnp.sqrt(jnp.sum((image - theta * moved) ** 2, axes) / jnp.sum(moved**2, axes))
-        lumped = jnp.sum(columns * image, axes) / jnp.sum(level.lumped[..., None] * columns**2, axes)
-        return defect, lumped
+        image, moved = _images(level, periodic, slabs, columns)
+        products = (image - theta * moved) ** 2, moved**2, columns * image, level.lumped[..., None] * columns**2
+        return tuple(jnp.sum(p, tuple(range(columns.ndim - 1))) for p in products)
 
-    return Measured(*(v.ravel() for v in jax.lax.map(of_block, jnp.arange(values.size // block))))
+    sums = total(slabs, jax.lax.map(of_block, jnp.arange(values.size // block)))
+    defect, moved, energy, lumped = (s.ravel() for s in sums)
+    return Measured(jnp.sqrt(defect / moved), energy / lumped)
+
+
+def _images(
+    level: Level, periodic: tuple[bool, ...], slabs: Slabs | None, columns: Float[Array, "*shape b"]
+) -> tuple[Float[Array, "*shape b"], Float[Array, "*shape b"]]:
+    """Return the columns' products with K and M."""
+    if slabs is None:
+        return stencil_product(level.stiffness, columns, periodic), stencil_product(level.mass, columns, periodic)
+    rimmed = slabs.with_halo(columns)
+    diagonal = level.mass.shape[0] == 1
+    moved = level.mass[0][..., None] * columns if diagonal else product_with_rim(level.mass, rimmed)
+    return product_with_rim(level.stiffness, rimmed), moved

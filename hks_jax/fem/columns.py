@@ -19,10 +19,22 @@ def stencil_product(
     """
     if coefficients.shape[0] == 1:
         return coefficients[0][..., None] * x
-    shape = x.shape[:-1]
-    for axis, wraps in enumerate(periodic):
+    return product_with_rim(coefficients, with_rim(x, periodic))
+
+
+def with_rim(x: Float[Array, "*shape b"], periodic: tuple[bool, ...], first: int = 0) -> Float[Array, "*rimmed b"]:
+    """Return x with a node more at either end of each axis from the ``first`` on: the opposite one's, or zero."""
+    for axis, wraps in enumerate(periodic[first:], start=first):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
         x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
+    return x
+
+
+def product_with_rim(
+    coefficients: Float[Array, "offsets *shape"], x: Float[Array, "*rimmed b"]
+) -> Float[Array, "*shape b"]:
+    """Return the product with columns whose neighbours beyond all sides are there."""
+    shape = coefficients.shape[1:]
     y = jnp.zeros((), x.dtype)
     for c, start in zip(coefficients, product((0, 1, 2), repeat=len(shape)), strict=True):
         stop = [s + n for s, n in zip(start, shape, strict=True)]

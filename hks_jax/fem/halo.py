@@ -1,0 +1,154 @@
+"""Grids cut into slabs, one for each device: stencil products that exchange one plane of nodes with each neighbour."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+from hks_jax.fem.columns import product_with_rim, with_rim
+from hks_jax.traced import is_traced
+
+
+def checked_mesh(mesh: Any) -> Mesh:
+    """Return a mesh of devices with one axis, of which XLA chooses the layout of arrays where we do not."""
+    if not isinstance(mesh, Mesh) or len(mesh.axis_names) != 1:
+        got = f"the axes {mesh.axis_names}" if isinstance(mesh, Mesh) else type(mesh).__name__
+        raise ValueError(
+            f'mesh: got {got}; expected a jax.sharding.Mesh with one axis, such as jax.make_mesh((8,), ("devices",))'
+        )
+    return Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,))
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Slabs:
+    """A grid cut across its first axis into slabs of equal thickness, one for each device. Static and hashable.
+
+    Where the axis does not divide evenly, the last slabs are padded: with zeros, which couple to nothing.
+
+    Attributes:
+        mesh: devices along one axis, in the order of the slabs.
+        shape: nodes along each axis of the grid.
+        periodic: whether each axis is.
+
+    Raises:
+        ValueError: a mesh with several axes.
+    """
+
+    mesh: Mesh
+    shape: tuple[int, ...]
+    periodic: tuple[bool, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mesh", checked_mesh(self.mesh))
+
+    @property
+    def name(self) -> str:
+        """The name of the mesh's axis."""
+        return self.mesh.axis_names[0]
+
+    @property
+    def thickness(self) -> int:
+        """Nodes of a slab along the first axis."""
+        return -(-self.shape[0] // self.mesh.size)
+
+    @property
+    def local_shape(self) -> tuple[int, ...]:
+        """The shape of one slab."""
+        return (self.thickness, *self.shape[1:])
+
+    @property
+    def padded_shape(self) -> tuple[int, ...]:
+        """The shape of all slabs together."""
+        return (self.thickness * self.mesh.size, *self.shape[1:])
+
+    def spec(self, axis: int) -> PartitionSpec:
+        """Return the partition of arrays whose ``axis`` is the grid's first."""
+        return PartitionSpec(*[None] * axis, self.name)
+
+    def split(self, x: Any, axis: int = 0) -> Array:
+        """Pad an array whose ``axis`` is the grid's first, and lay each slab on its device.
+
+        Of several processes, each gives the whole array.
+        """
+        if is_traced(x):
+            return jax.lax.with_sharding_constraint(self._padded(x, axis), NamedSharding(self.mesh, self.spec(axis)))
+        return jax.jit(self._padded, static_argnums=1, out_shardings=NamedSharding(self.mesh, self.spec(axis)))(x, axis)
+
+    def join(self, x: Array, axis: int = 0) -> Array:
+        """Cut the padding off again. If there was any, every device has the result whole."""
+        return jax.lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
+
+    @partial(jax.jit, static_argnums=0)
+    def product(
+        self, coefficients: Float[Array, "offsets *padded"], x: Float[Array, "*padded b"]
+    ) -> Float[Array, "*padded b"]:
+        """Return the product of a stencil with columns, both from `split` (axes 1 and 0); see `stencil_product`.
+
+        Linear in both, differentiable, transposable. Each device sends two planes of the columns, and receives two.
+        """
+        self.check("coefficients", coefficients, 1)
+        self.check("x", x, 0)
+        share = jax.shard_map(
+            self.local_product, mesh=self.mesh, in_specs=(self.spec(1), self.spec(0)), out_specs=self.spec(0)
+        )
+        return share(coefficients, x)
+
+    def check(self, name: str, x: Array, axis: int) -> None:
+        """Raise unless the array is one that `split` returned."""
+        got = x.shape[axis : axis + len(self.shape)]
+        if got != self.padded_shape:
+            raise ValueError(
+                f"{name}: got shape {x.shape}; expected {self.padded_shape} at axis {axis}, as Slabs.split makes it"
+            )
+
+    # What follows is for the inside of shard_map, on one device's share.
+
+    def local_product(
+        self, coefficients: Float[Array, "offsets *slab"], x: Float[Array, "*slab b"]
+    ) -> Float[Array, "*slab b"]:
+        """Return the product on this device's slab."""
+        if coefficients.shape[0] == 1:
+            return coefficients[0][..., None] * x
+        return product_with_rim(coefficients, self.with_halo(x))
+
+    def with_halo(self, x: Float[Array, "*slab b"]) -> Float[Array, "*rimmed b"]:
+        """Return the slab with the neighbours' adjacent planes, and its rim along the other axes."""
+        last, planes = divmod(self.shape[0] - 1, self.thickness)
+        up = [(i, i + 1) for i in range(last)]
+        down = [(i + 1, i) for i in range(last)]
+        top = jax.lax.slice_in_dim(x, -1, None, axis=0)
+        place: int | Array = self.thickness + 1
+        if self.periodic[0]:
+            up, down = [*up, (last, 0)], [*down, (0, last)]
+            if planes + 1 < self.thickness:
+                # The last node, and what follows it, are amid the padding of the last slab that has any nodes.
+                is_last = jax.lax.axis_index(self.name) == last
+                top = jnp.where(is_last, jax.lax.slice_in_dim(x, planes, planes + 1, axis=0), top)
+                place = jnp.where(is_last, planes + 2, place)
+        below = jax.lax.ppermute(top, self.name, up)
+        above = jax.lax.ppermute(jax.lax.slice_in_dim(x, 0, 1, axis=0), self.name, down)
+        x = jnp.pad(x, [(1, 1)] + [(0, 0)] * (x.ndim - 1))
+        x = jax.lax.dynamic_update_slice_in_dim(x, below, 0, axis=0)
+        x = jax.lax.dynamic_update_slice_in_dim(x, above, place, axis=0)
+        return with_rim(x, self.periodic, first=1)
+
+    def own(self, x: Array, axis: int = 0) -> Array:
+        """Return this device's slab of an array that every device has whole."""
+        start = jax.lax.axis_index(self.name) * self.thickness
+        return jax.lax.dynamic_slice_in_dim(self._padded(x, axis), start, self.thickness, axis=axis)
+
+    def total(self, x: Any) -> Any:
+        """Return the sum over all devices."""
+        return jax.lax.psum(x, self.name)
+
+    def _padded(self, x: Any, axis: int) -> Array:
+        x = jnp.asarray(x)
+        if x.shape[axis : axis + len(self.shape)] != self.shape:
+            raise ValueError(f"x: got shape {x.shape}; expected the grid's {self.shape} from axis {axis} on")
+        missing = self.padded_shape[0] - self.shape[0]
+        return jnp.pad(x, [(0, missing if a == axis else 0) for a in range(x.ndim)]) if missing else x

@@ -1,0 +1,166 @@
+"""What tests/test_devices.py runs in processes of its own, where the number of devices can be chosen.
+
+    python work_on_devices.py devices                      on the (virtual) devices of this process
+    python work_on_devices.py process INDEX PORT           as one of two processes that talk over loopback
+    python work_on_devices.py all-process INDEX PORT       likewise, with eigenpairs
+
+Prints, as JSON, how far each result is from that of one device.
+"""
+
+import json
+import sys
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from fields import random_spd
+
+import hks_jax as hj
+from hks_jax.devices import Slabs, heat_columns, map_fields
+from hks_jax.fem.columns import stencil_product
+
+warnings.simplefilter("error")
+jax.config.update("jax_enable_x64", True)
+MODE = sys.argv[1]
+RNG = np.random.default_rng(5)
+
+
+def difference(a, b):
+    """The largest, relative to the largest value, on what this process holds of the first."""
+    b = np.asarray(b)
+    shards = [(s.data, b[s.index]) for s in a.addressable_shards]
+    assert all(x.shape == y.shape for x, y in shards)
+    return max(float(np.abs(np.asarray(x) - y).max()) for x, y in shards) / float(np.abs(b).max())
+
+
+def halo(mesh, shape, periodic, gradient):
+    """The product, and its derivatives, with 8 slabs and without."""
+    slabs = Slabs(mesh, shape, periodic)
+    c, x, w = (RNG.standard_normal(s) for s in ((3 ** len(shape), *shape), (*shape, 3), (*shape, 3)))
+    image = slabs.product(slabs.split(c, 1), slabs.split(x))
+    assert image.sharding.is_equivalent_to(slabs.split(x).sharding, x.ndim)
+    errors = {"product": difference(slabs.join(image), stencil_product(c, jnp.asarray(x), periodic))}
+    if gradient:
+
+        def cut(c, x):
+            return jnp.sum(jnp.sin(slabs.join(slabs.product(slabs.split(c, 1), slabs.split(x)))) * w)
+
+        def whole(c, x):
+            return jnp.sum(jnp.sin(stencil_product(c, x, periodic)) * w)
+
+        got, expected = (jax.jit(jax.grad(f, (0, 1)))(jnp.asarray(c), jnp.asarray(x)) for f in (cut, whole))
+        errors |= {f"d{n}": difference(a, b) for n, a, b in zip("cx", got, expected, strict=True)}
+    return errors
+
+
+def heat(mesh):
+    """Columns of exp(−tD⁻¹K) against SciPy's exponential; the transpose, which D makes symmetric; all on slabs."""
+    shape, boundary, times = (9, 6), ("periodic", ("dirichlet", "neumann")), np.array([0.0, 0.3, 2.0])
+    field = hj.TensorField(hj.Grid(shape, 0.5), random_spd(RNG, shape))
+    pencil = hj.assemble(field, boundary, mass="lumped")
+    space = pencil.space
+    slabs = Slabs(mesh, shape, space.periodic)
+    x = np.where(space.free[..., None], RNG.standard_normal((*shape, 2)), 0)
+    entries = space.extend(pencil.mass.entries, outside=0.0)
+    arrays = slabs.split(pencil.stiffness.coefficients, 1), slabs.split(entries), slabs.split(x)
+    assert all(len(a.sharding.device_set) == mesh.size for a in arrays)
+    got = slabs.join(heat_columns(slabs, *arrays, times, tolerance=1e-13), 1)
+    matrix = np.asarray(pencil.stiffness.to_dense()) / np.asarray(pencil.mass.entries)[:, None]
+    flat = space.restrict(jnp.moveaxis(x, -1, 0)).T
+    expected = np.stack([scipy.linalg.expm(-t * matrix) @ flat for t in times])
+    errors = {"against expm": difference(space.restrict(jnp.moveaxis(got, -1, 1)), expected.swapaxes(1, 2))}
+
+    def paired(stiffness, columns):
+        y = heat_columns(slabs, stiffness, arrays[1], columns, times, degree=60)
+        return jnp.sum(y[1] * columns * arrays[1][..., None])
+
+    d_columns = jax.jit(jax.grad(paired, 1))(arrays[0], arrays[2])
+    y = heat_columns(slabs, *arrays, times, degree=60)[1]
+    return errors | {"derivative": difference(d_columns, 2 * y * arrays[1][..., None])}
+
+
+def batch(mesh):
+    """The signatures of ten slices, shared out, and one by one."""
+    grid = hj.Grid((5, 6), 0.3)
+    tensors = random_spd(RNG, (10, 5, 6))[..., :2, :2]
+    scales = RNG.uniform(1, 2, 10)
+
+    def signature(entry):
+        T, scale = entry
+        return hj.hks(hj.eigenpairs(hj.TensorField(grid, scale * T), 12, solver="dense"), jnp.array([0.5, 1.0]))
+
+    got = map_fields(signature, (tensors, scales), mesh)
+    expected = jax.lax.map(signature, (jnp.asarray(tensors), jnp.asarray(scales)))
+    return difference(got, expected)
+
+
+def eigenpairs(mesh, shape, k, block):
+    """The same eigenvalues and spectral projections as on one device, and as from a dense solver."""
+    x = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij"))
+    T = np.exp(0.3 * np.sin(3 * x[0] + 2 * x[1]))[..., None, None] * np.diag([1.0, 1.7])
+    pencil = hj.assemble(hj.TensorField(hj.Grid(shape, 1 / (shape[0] - 1)), T))
+    one, several = hj.ChebyshevFilter(block=block), hj.ChebyshevFilter(block=block, mesh=mesh)
+    assert one.plan(k + 1, pencil.space).size == several.plan(k + 1, pencil.space).size
+    values, vectors, _ = one.lowest(pencil, k + 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hj.AccuracyWarning)  # k may cut a pair of eigenvalues
+        together = hj.eigenpairs(pencil, k, solver=several)
+    dense = scipy.linalg.eigh(pencil.stiffness.to_dense(), pencil.mass.to_dense(), eigvals_only=True)
+    times = np.array([0.15, 0.3])
+    signature = np.exp(-times[:, None] * np.asarray(values)[:k]) @ np.asarray(vectors)[:k] ** 2
+    return {
+        "converged": bool(np.all(together.converged)),
+        "eigenvalues": difference(together.eigenvalues, values[:k]),
+        "against dense": difference(together.eigenvalues, dense[:k]),
+        "signature": difference(hj.hks(together, times), signature.reshape(2, *shape)),
+    }
+
+
+def refusals(mesh):
+    """What wrong calls say."""
+    grid_mesh = jax.sharding.Mesh(mesh.devices.reshape(2, -1), ("a", "b"))
+    slabs = Slabs(mesh, (9, 4), (False, False))
+    calls = [
+        lambda: Slabs(grid_mesh, (9, 4), (False, False)),
+        lambda: hj.ChebyshevFilter(mesh=grid_mesh),
+        lambda: map_fields(jnp.sin, {"a": np.zeros((3, 2)), "b": np.zeros(4)}, mesh),
+        lambda: slabs.product(np.zeros((9, 9, 4)), np.zeros((9, 4, 1))),
+        lambda: slabs.split(np.zeros((8, 4, 1))),
+    ]
+    messages = []
+    for call in calls:
+        try:
+            call()
+        except ValueError as error:
+            messages.append(str(error))
+    return messages
+
+
+def main():
+    if MODE != "devices":
+        index, port = map(int, sys.argv[2:])
+        jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=2, process_id=index)
+    # As most users make one; its axes are of JAX's default type.
+    mesh = jax.make_mesh((jax.device_count(),), ("devices",))
+    found = {"devices": mesh.size, "processes": jax.process_count()}
+    if MODE == "devices":
+        found["refusals"] = refusals(mesh)
+        found["halo"] = [
+            halo(mesh, (16, 5), (False, True), gradient=False),
+            halo(mesh, (9, 5), (True, False), gradient=True),
+            halo(mesh, (9, 3, 4), (False, True, False), gradient=False),
+        ]
+        found["heat"] = heat(mesh)
+        found["batch"] = batch(mesh)
+        found["eigenpairs"] = eigenpairs(mesh, (19, 17), 7, 2)
+    else:
+        found["halo"] = [halo(mesh, (9, 4), (True, False), gradient=False)]
+        if MODE == "all-process":
+            found["eigenpairs"] = eigenpairs(mesh, (19, 17), 7, 4)
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
