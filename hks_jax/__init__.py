@@ -44,6 +44,9 @@ from hks_jax.signatures.times import default_times as default_times
 from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
 from hks_jax.signatures.wave import wks as wks
+from hks_jax.spectrum_free.colours import Colouring as Colouring
+from hks_jax.spectrum_free.hks import colouring as colouring
+from hks_jax.spectrum_free.hks import hks_spectrum_free as hks_spectrum_free
 
 __version__ = "0.1.0"
 
