@@ -53,7 +53,8 @@ class Colouring:
         counts = [int(axis.max()) + 1 for axis in axes]
         number = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), counts)
         result = np.full(space.node_shape, -1, np.int32)
-        result[space.free] = np.unique(number[space.free], return_inverse=True)[1]
+        found = np.unique(number[space.free])
+        result[space.free] = np.searchsorted(found, number[space.free])
         return StaticArray(result)
 
     def n_vectors(self, space: GridSpace) -> int:
@@ -186,11 +187,10 @@ def choose(
     for time in times:
         allowed = tolerance * kernel_scale(time, limits, d) * float(limits.least_mass) / 2
         while True:
-            apart = [
+            trial = tuple(
                 _least_spacing(n, time * float(kappa), allowed, lumped)
                 for n, kappa in zip(space.node_shape, limits.reach, strict=True)
-            ]
-            trial = tuple(int(s) for s in apart)
+            )
             if error_bound(trial, degree, time, limits, space) <= tolerance or all(
                 s >= n for s, n in zip(trial, space.node_shape, strict=True)
             ):
@@ -199,7 +199,8 @@ def choose(
         spacing = np.maximum(spacing, trial)
     chosen = tuple(int(min(s, n)) for s, n in zip(spacing, space.node_shape, strict=True))
     errors = tuple(
-        error_bound(chosen, degree, float(time), limits, space) + more for time, more in zip(times, of_mass, strict=True)
+        error_bound(chosen, degree, float(time), limits, space) + more
+        for time, more in zip(times, of_mass, strict=True)
     )
     return Colouring(
         chosen,

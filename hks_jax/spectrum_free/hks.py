@@ -52,8 +52,8 @@ def hks_spectrum_free(
         mass: likewise. ``"lumped"`` is 20 to 100 times as fast with colouring.
         method: ``"colouring"``: Chebyshev polynomials on sums of point sources that are far enough apart, 2D and 3D,
             all times from the same vectors. ``"selected-inversion"`` (2D): rational approximation and block-wise
-            inversion, to about 1e-10 at any time, one time after another. ``"auto"``: whichever takes fewer operations. Or
-            a `Colouring` that `colouring` made beforehand, which is what colouring needs under `jax.jit`.
+            inversion, to about 1e-10 at any time, one time after another. ``"auto"``: whichever takes less work. Or a
+            `Colouring` that `colouring` made beforehand, which is what colouring needs under `jax.jit`.
         tolerance: bounds the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the largest
             value that a node can have. Selected inversion does not use it.
 
@@ -135,9 +135,7 @@ def choose_method(
     assert isinstance(space, GridSpace)
     if isinstance(method, Colouring):
         if len(method.spacing) != space.dimension:
-            raise ValueError(
-                f"method: got a Colouring for {len(method.spacing)} axes; the grid has {space.dimension}"
-            )
+            raise ValueError(f"method: got a Colouring for {len(method.spacing)} axes; the grid has {space.dimension}")
         return method
     if method not in ("auto", "colouring", "selected-inversion"):
         raise ValueError(
@@ -149,10 +147,8 @@ def choose_method(
     if method == "selected-inversion" or (method == "auto" and traced and space.dimension == 2):
         return None
     settings = plan(pencil, times, tolerance)
-    if method == "auto" and space.dimension == 2:
-        inverting = times.size * pole_pairs(times.dtype) * inversion_flops(space) / _FASTER
-        if inverting < colouring_flops(settings, pencil):
-            return None
+    if method == "auto" and space.dimension == 2 and work(None, pencil, times) < work(settings, pencil, times):
+        return None
     require_fewer_vectors(settings, pencil)
     return settings
 
@@ -195,20 +191,24 @@ def plan(
 
 def _widest(limits: Sequence[Bounds], slack: float) -> Bounds:
     """Return bounds that hold for all parts."""
+    stacked = Bounds(*(jnp.stack(values) for values in zip(*limits, strict=True)))
     return Bounds(
-        slack * max(float(one.top) for one in limits),
-        min(float(one.low) for one in limits),
-        slack * np.max([np.asarray(one.reach) for one in limits], axis=0),
-        min(float(one.least_mass) for one in limits),
-        max(float(one.greatest_mass) for one in limits),
+        slack * jnp.max(stacked.top),
+        jnp.min(stacked.low),
+        slack * jnp.max(stacked.reach, axis=0),
+        jnp.min(stacked.least_mass),
+        jnp.max(stacked.greatest_mass),
     )
 
 
-def colouring_flops(settings: Colouring, pencil: Pencil | MirrorPencil) -> float:
-    """Estimate the floating-point operations of a colouring."""
+def work(settings: Colouring | None, pencil: Pencil | MirrorPencil, times: Float[Array, " m"]) -> float:
+    """Estimate what a method takes, in floating-point operations of stencils."""
     space = pencil.space
     assert isinstance(space, GridSpace)
-    products = (settings.degree + 1) * (1 if settings.mass_degree == 1 else settings.mass_degree)
+    if settings is None:
+        inversions = len(pencil.parts) * times.size * pole_pairs(times.dtype)
+        return inversions * inversion_flops(space) / _FASTER
+    products = (settings.degree + 1) * settings.mass_degree
     return 2.0 * len(pencil.parts) * settings.n_vectors(space) * products * 3**space.dimension * space.free.size
 
 
@@ -236,8 +236,9 @@ def _diagonal(
     else:
         values = _by_colours(settings, part, times)
         if checked:
+            # A factor, so that the derivatives are NaN too.
             fits = _fits(settings, *jax.lax.stop_gradient((part, times)))
-            values = jnp.where(fits, values, jnp.nan)
+            values = values * jnp.where(fits, 1, jnp.nan)
     return jnp.where(space.domain, jnp.where(space.free, values, 0), jnp.nan)
 
 

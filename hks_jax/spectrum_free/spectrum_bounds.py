@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.fem.operators import DiagonalOperator
 from hks_jax.fem.pencil import Pencil
-from hks_jax.spectrum_free.heat_operator import HeatOperator, heat_operator
+from hks_jax.spectrum_free.heat_operator import heat_operator
 
 _STEPS, _MASS_STEPS = 50, 200
 _FAILURE = 1e-6
@@ -64,17 +64,13 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     inverse = operator.inverse_row_sums
     d, free = pencil.space.dimension, pencil.space.free
     sums = jnp.where(free, 1 / jnp.where(free, inverse, 1), 0)
-    top = _largest(
-        operator.apply_stiffness, operator.solve_mass, sums[..., None], pencil.space.n_dof, _STEPS
-    )
+    top = _largest(operator.apply_stiffness, operator.solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
     sizes = jnp.abs(operator.stiffness) * inverse
     if operator.lumped:
         top = jnp.minimum(top, jnp.max(jnp.sum(sizes, axis=0)))
     offsets = np.array(list(product((-1, 0, 1), repeat=d)))
     reach = jnp.stack([jnp.max(jnp.sum(sizes[np.flatnonzero(offsets[:, a])], axis=0)) for a in range(d)])
-    return Bounds(
-        top, low, reach, jnp.min(jnp.where(free, sums, jnp.inf)), jnp.max(sums)
-    )
+    return Bounds(top, low, reach, jnp.min(jnp.where(free, sums, jnp.inf)), jnp.max(sums))
 
 
 def _largest(
