@@ -77,6 +77,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         default="raw",
         help="of the signature (default raw)",
     )
+    add(
+        "--method",
+        choices=("spectral", "spectrum-free", "auto"),
+        default="spectral",
+        help="sum over eigenpairs (default), do without them, or choose by t, k and the spacing: auto reports which "
+        "times came from where and how the two agree",
+    )
     add("--dtype", choices=("float32", "float64"), default="float64", help="precision (default float64)")
     return parser
 
@@ -106,6 +113,7 @@ def run(args: argparse.Namespace) -> None:
             components=args.components,
             solver=args.solver,
             normalisation=args.normalisation,
+            method=args.method,
             dtype=args.dtype,
         )
         result = compute(volume, settings, progress)

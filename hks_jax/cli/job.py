@@ -19,9 +19,10 @@ from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.heat import Normalisation, hks
+from hks_jax.signatures.heat import Normalisation
 from hks_jax.signatures.times import default_times
 from hks_jax.signatures.truncation import truncation
+from hks_jax.spectrum_free.auto import HKSMethod, hks, hks_auto
 
 DEFAULT_K = 200
 
@@ -41,6 +42,7 @@ class Settings:
     components: Literal["raise", "largest", "all"] = "raise"
     solver: str = "auto"
     normalisation: Normalisation = "raw"
+    method: HKSMethod = "spectral"
     dtype: Literal["float32", "float64"] = "float64"
 
 
@@ -88,14 +90,31 @@ def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Res
         raise ComputationError(pairs.messages()[0])
     with progress.stage("signature"):
         times = settings.times.explicit or tuple(default_times(pairs, settings.times.automatic).tolist())
-        values = np.asarray(hks(pairs, times, settings.normalisation))
+        values, origin = _signature(pairs, times, settings)
     return Result(
         volume.with_mask(grid.mask),
         np.asarray(times),
         values,
         eigenvalues,
-        _report(volume, grid.mask, settings, pairs, times),
+        _report(volume, grid.mask, settings, pairs, times) | origin,
     )
+
+
+def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the signature and, where methods were chosen from, what the report says of the choice."""
+    if settings.method != "auto":
+        return np.asarray(hks(pairs, times, settings.normalisation, settings.method)), {}
+    found = hks_auto(pairs, times, settings.normalisation)
+    agreement = None
+    if np.isfinite(float(found.overlap_time)):
+        agreement = {"t": float(found.overlap_time), "difference": float(found.overlap_difference)}
+    of_pairs = np.asarray(found.spectral)
+    origin = {
+        "eigenpairs": [t for t, yes in zip(times, of_pairs, strict=True) if yes],
+        found.method: [t for t, yes in zip(times, of_pairs, strict=True) if not yes],
+        "agreement": agreement,
+    }
+    return np.asarray(found.values), {"method": {name: value for name, value in origin.items() if name != "none"}}
 
 
 def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:

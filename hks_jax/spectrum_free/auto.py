@@ -169,7 +169,8 @@ def hks_auto(
         if float(difference) > 10 * tolerance:
             warnings.warn(
                 f"at t = {float(overlap):.4g} the signatures with and without eigenpairs differ by "
-                f"{float(difference):.1e}, more than ten times the tolerance {tolerance:.1e}. Check the pairs' residuals",
+                f"{float(difference):.1e}, more than ten times the tolerance {tolerance:.1e}. Check the pairs' "
+                "residuals",
                 AccuracyWarning,
                 stacklevel=2,
             )

@@ -51,7 +51,7 @@ class Colouring:
             for n, s, wraps in zip(space.node_shape, self.spacing, space.periodic, strict=True)
         ]
         counts = [int(axis.max()) + 1 for axis in axes]
-        number = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), counts)
+        number = np.asarray(np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), counts))
         result = np.full(space.node_shape, -1, np.int32)
         found = np.unique(number[space.free])
         result[space.free] = np.searchsorted(found, number[space.free])
