@@ -182,7 +182,8 @@ def choose(
         allowed = tolerance * kernel_scale(time, limits, d) * float(limits.least_mass) / 2
         sizes = coefficient_sizes(time * float(limits.top) / 2)
         tails = np.append(np.cumsum(sizes[::-1])[::-1], 0)
-        here = int(np.argmax(tails <= 0.1 * allowed * float(limits.low))) - 1
+        # It counts once at every source that the expansion reaches: the node itself and its neighbours of one colour.
+        here = int(np.argmax(tails <= 0.1 / 3**d * allowed * float(limits.low))) - 1
         degree = max(degree, here)
     for time in times:
         allowed = tolerance * kernel_scale(time, limits, d) * float(limits.least_mass) / 2
