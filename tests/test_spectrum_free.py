@@ -164,7 +164,7 @@ def test_traced_values_need_settings_and_settings_must_fit():
         moved = hj.TensorField(field.grid, scale * field.tensors)
         return jnp.sum(hj.hks_spectrum_free(moved, times, mass="lumped", **more))
 
-    with pytest.raises(ValueError, match="hks_jax.colouring"):
+    with pytest.raises(ValueError, match=r"hks_jax\.colouring"):
         jax.jit(lambda s: loss(s, method="colouring"))(1.0)
     # Traced, selected inversion needs no settings.
     settings = hj.colouring(field, times, mass="lumped", tolerance=1e-9)

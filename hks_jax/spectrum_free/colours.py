@@ -199,6 +199,12 @@ def choose(
             allowed /= 2
         spacing = np.maximum(spacing, trial)
     chosen = tuple(int(min(s, n)) for s, n in zip(spacing, space.node_shape, strict=True))
+    if lumped:
+        # Or else no wider than the expansion reaches: then nothing comes from other sources.
+        shortest = max(_least_degree(float(time), limits, space, tolerance) for time in times)
+        apart = tuple(min(shortest + 1, n) for n in space.node_shape)
+        if math.prod(apart) <= math.prod(chosen):
+            chosen, degree = apart, shortest
     errors = tuple(
         error_bound(chosen, degree, float(time), limits, space) + more
         for time, more in zip(times, of_mass, strict=True)
@@ -213,6 +219,13 @@ def choose(
         tuple(float(kappa) * float(times.max()) for kappa in limits.reach),
         errors,
     )
+
+
+def _least_degree(time: float, limits: Bounds, space: GridSpace, tolerance: float) -> int:
+    allowed = tolerance * kernel_scale(time, limits, space.dimension) * float(limits.least_mass)
+    sizes = coefficient_sizes(time * float(limits.top) / 2)
+    tails = np.append(np.cumsum(sizes[::-1])[::-1], 0)
+    return max(int(np.argmax(tails <= allowed)) - 1, 1)
 
 
 def _least_spacing(n: int, reach_time: float, allowed: float, lumped: bool) -> int:
