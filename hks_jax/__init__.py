@@ -43,7 +43,6 @@ from hks_jax.signatures.distances import shape_dna as shape_dna
 from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.heat import heat_kernel as heat_kernel
 from hks_jax.signatures.heat import heat_trace as heat_trace
-from hks_jax.signatures.heat import hks as hks
 from hks_jax.signatures.heat import scale_invariant_hks as scale_invariant_hks
 from hks_jax.signatures.scale_space import gaussian_scale_space as gaussian_scale_space
 from hks_jax.signatures.scale_space import tensor_invariants as tensor_invariants
@@ -53,6 +52,12 @@ from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
 from hks_jax.signatures.wave import wks as wks
 from hks_jax.signatures.weyl import weyl_count as weyl_count
+from hks_jax.spectrum_free.auto import AutomaticHKS as AutomaticHKS
+from hks_jax.spectrum_free.auto import hks as hks
+from hks_jax.spectrum_free.auto import hks_auto as hks_auto
+from hks_jax.spectrum_free.colours import Colouring as Colouring
+from hks_jax.spectrum_free.hks import colouring as colouring
+from hks_jax.spectrum_free.hks import hks_spectrum_free as hks_spectrum_free
 
 __version__ = "0.1.0"
 

@@ -103,6 +103,7 @@ def test_report_says_what_was_done(npz, tmp_path):
         "components": "raise",
         "solver": "auto",
         "normalisation": "raw",
+        "method": "spectral",
         "dtype": "float64",
     }
     assert report["input"]["shape"] == list(SHAPE)
@@ -115,6 +116,20 @@ def test_report_says_what_was_done(npz, tmp_path):
     assert any("too small for k" in warning for warning in report["warnings"])
     assert {"python", "jax", "numpy", "scipy", "hks-jax", "device"} <= set(report["versions"])
     assert {"reading", "assembly", "eigenpairs", "signature"} <= set(report["seconds"])
+
+
+def test_method_auto_reports_which_times_came_from_where(npz, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["-k", "25", "--times", "0.1", "4", "--method", "auto"]
+    assert main(["hks", str(npz), "-o", str(out), "-q", *arguments]) == 0
+    method = json.loads((out / "report.json").read_text())["method"]
+    assert method["eigenpairs"] == [4]
+    assert method["selected-inversion"] == [0.1]
+    assert method["agreement"]["t"] == 4
+    assert method["agreement"]["difference"] < 1e-4
+    field = hj.TensorField(hj.Grid(SHAPE, (0.5, 0.25), (1.0, 2.0), disc()), metric())
+    with np.load(out / "hks.npz") as read:
+        np.testing.assert_allclose(read["hks"][:1], hj.hks_spectrum_free(field, [0.1]), rtol=1e-3)
 
 
 def test_nifti_slice_end_to_end_keeps_the_affine(nifti, tmp_path):

@@ -60,6 +60,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         default="raw",
         help="of the signature (default raw)",
     )
+    add(
+        "--method",
+        choices=("spectral", "spectrum-free", "auto"),
+        default="spectral",
+        help="sum over eigenpairs (default), do without them, or choose by t, k and the spacing: auto reports which "
+        "times came from where and how the two agree",
+    )
     return parser
 
 
@@ -86,6 +93,7 @@ def run(args: argparse.Namespace) -> None:
             components=args.components,
             solver=args.solver,
             normalisation=args.normalisation,
+            method=args.method,
             dtype=args.dtype,
         )
         result = compute(volume, settings, progress)

@@ -22,9 +22,10 @@ from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.heat import Normalisation, hks
+from hks_jax.signatures.heat import Normalisation
 from hks_jax.signatures.times import default_times
 from hks_jax.signatures.truncation import truncation
+from hks_jax.spectrum_free.auto import HKSMethod, hks, hks_auto
 
 DEFAULT_K = {2: 200, 3: 100}
 """Eigenpairs by dimension. A volume's factorisations cost so much more that fewer pairs take as long."""
@@ -45,6 +46,7 @@ class Settings:
     components: Literal["raise", "largest", "all"] = "raise"
     solver: str = "auto"
     normalisation: Normalisation = "raw"
+    method: HKSMethod = "spectral"
     dtype: Literal["float32", "float64"] = "float64"
 
 
@@ -77,14 +79,14 @@ def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Res
     field, pairs = compute_pairs(volume, settings, progress)
     with progress.stage("signature"):
         times = settings.times.explicit or tuple(default_times(pairs, settings.times.automatic).tolist())
-        values = np.asarray(hks(pairs, times, settings.normalisation))
+        values, origin = _signature(pairs, times, settings)
     mask = field.grid.mask
     return Result(
         volume.with_mask(mask),
         np.asarray(times),
         values,
         np.asarray(pairs.eigenvalues),
-        _report(volume, mask, settings, pairs, times),
+        _report(volume, mask, settings, pairs, times) | origin,
     )
 
 
@@ -120,6 +122,23 @@ def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) 
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])
     return field, pairs
+
+
+def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the signature and, where methods were chosen from, what the report says of the choice."""
+    if settings.method != "auto":
+        return np.asarray(hks(pairs, times, settings.normalisation, settings.method)), {}
+    found = hks_auto(pairs, times, settings.normalisation)
+    agreement = None
+    if np.isfinite(float(found.overlap_time)):
+        agreement = {"t": float(found.overlap_time), "difference": float(found.overlap_difference)}
+    of_pairs = np.asarray(found.spectral)
+    origin = {
+        "eigenpairs": [t for t, yes in zip(times, of_pairs, strict=True) if yes],
+        found.method: [t for t, yes in zip(times, of_pairs, strict=True) if not yes],
+        "agreement": agreement,
+    }
+    return np.asarray(found.values), {"method": {name: value for name, value in origin.items() if name != "none"}}
 
 
 def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:

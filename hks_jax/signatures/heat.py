@@ -37,10 +37,11 @@ def hks(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> 
     """
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
-    return spectral_diagonal(pairs, Heat(times), _normaliser(pairs, times, normalisation))
+    return spectral_diagonal(pairs, Heat(times), normaliser(pairs, times, normalisation))
 
 
-def _normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
+def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
+    """Return the factor at each time that `hks` multiplies the raw signature with."""
     if normalisation == "raw":
         return jnp.ones_like(times)
     if normalisation == "heat-trace":

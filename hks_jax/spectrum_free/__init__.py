@@ -1,0 +1,1 @@
+"""Heat kernel signatures without eigenpairs: exp(−tM⁻¹K)M⁻¹ by polynomials and by rational functions."""

@@ -1,0 +1,229 @@
+"""The heat kernel signature, each time by the method that reaches it: eigenpairs for the large, none for the small."""
+
+import math
+import warnings
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hks_jax.accuracy import AccuracyWarning
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.space import GridSpace
+from hks_jax.signatures import heat
+from hks_jax.signatures.heat import Normalisation
+from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.truncation import truncation
+from hks_jax.spectrum_free.hks import choose_method, hks_spectrum_free, plan, work
+from hks_jax.traced import is_traced
+
+_DEARER = 10.0
+"""The comparison may take so many times the work of the times that need it."""
+
+HKSMethod = Literal["spectral", "spectrum-free", "auto"]
+
+
+class AutomaticHKS(eqx.Module):
+    """A signature whose times come from two methods, and how they agree.
+
+    Attributes:
+        values: (n_times, *shape).
+        times: (n_times,).
+        spectral: (n_times,) bool, which times are from the eigenpairs; the others are spectrum-free.
+        tail: (n_times,) the estimate of what the eigenpairs leave out (`truncation`), which decided.
+        method: what the other times were computed by: ``"colouring"``, ``"selected-inversion"``, or ``"none"``.
+        overlap_time: a time that both computed, NaN where there is none: the shortest from the eigenpairs.
+        overlap_difference: the greatest difference there, relative to (4πt)^(−d/2).
+    """
+
+    values: Float[Array, "n_times *shape"]
+    times: Float[Array, " n_times"]
+    spectral: Bool[Array, " n_times"]
+    tail: Float[Array, " n_times"]
+    method: str = eqx.field(static=True)
+    overlap_time: Float[Array, ""]
+    overlap_difference: Float[Array, ""]
+
+    def summary(self) -> str:
+        """Say in a few lines which times came from where, and how the two agree."""
+        times, spectral = np.asarray(self.times), np.asarray(self.spectral)
+        lines = []
+        for name, which in (("eigenpairs", spectral), (self.method, ~spectral)):
+            if which.any():
+                lines.append(f"{int(which.sum())} of {times.size} times by {name}: {_listed(times[which])}")
+        if math.isfinite(float(self.overlap_time)):
+            lines.append(
+                f"both at t = {float(self.overlap_time):.4g}: they differ by {float(self.overlap_difference):.1e}"
+            )
+        return "\n".join(lines)
+
+
+def _listed(times: np.ndarray) -> str:
+    return ", ".join(f"{t:.4g}" for t in times[:8]) + (" …" if times.size > 8 else "")
+
+
+def hks(
+    pairs: Eigenpairs,
+    times: Any,
+    normalisation: Normalisation = "raw",
+    method: HKSMethod = "spectral",
+    tolerance: float = 1e-4,
+) -> Float[Array, "n_times *shape"]:
+    """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
+
+    Sun, Ovsjanikov and Guibas 2009, eq. 5; Zobel, Reininghaus and Hotz, section 2.
+
+    Args:
+        pairs: from `eigenpairs`.
+        times: (n_times,) positive, in (metric length)².
+        normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
+            domain's area or volume (→ 1 for large t); ``"flat"`` multiplies by (4πt)^(d/2) (→ 1 for small t inside).
+        method: ``"spectral"``: the sum over the pairs. ``"spectrum-free"``: without them, from the matrices that they
+            belong to (grids; see `hks_spectrum_free`). ``"auto"``: the pairs at the times that they resolve to the
+            tolerance, the other at the rest; `hks_auto` also reports which, and how they agree.
+        tolerance: of the last two, relative to (4πt)^(−d/2).
+
+    Returns:
+        (n_times, *shape); NaN outside the mask, 0 at Dirichlet nodes. Units of "raw": 1/(metric length)^d.
+
+    Raises:
+        ValueError: times that are not positive and finite, or an unknown normalisation or method; ``"heat-trace"``
+            without the spectrum; ``"auto"`` where values are traced.
+
+    Warns:
+        AccuracyWarning: times too small for the number of pairs or for the grid (see `truncation`).
+    """
+    if method == "spectral":
+        return heat.hks(pairs, times, normalisation)
+    if method == "auto":
+        return hks_auto(pairs, times, normalisation, tolerance).values
+    if method != "spectrum-free":
+        raise ValueError(f'method: got {method!r}; expected "spectral", "spectrum-free" or "auto"')
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    return _scaled(pairs, times, normalisation, _without(pairs.pencil, times, tolerance))
+
+
+def hks_auto(
+    pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw", tolerance: float = 1e-4
+) -> AutomaticHKS:
+    """Compute the heat kernel signature, each time by the method that reaches it, and report on it.
+
+    A time is left to the eigenpairs where the estimated share of what they leave out is below the tolerance. On grids
+    the others come from `hks_spectrum_free`. Where there are times of both kinds, the shortest of the former is
+    computed both ways, provided that this takes no more than ten times the work of the rest.
+
+    Args:
+        pairs: from `eigenpairs`.
+        times: (n_times,) positive.
+        normalisation: see `hks`.
+        tolerance: of both methods, relative to (4πt)^(−d/2).
+
+    Returns:
+        The values, with which times came from where, and how the two agree.
+
+    Raises:
+        ValueError: as `hks`; traced values, from which no choice can be made.
+        TypeError: times that need the other method on a surface mesh.
+
+    Warns:
+        AccuracyWarning: the two differ by more than ten times the tolerance, or times too small for the grid.
+    """
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    known_pairs, known_times = jax.lax.stop_gradient((pairs, times))
+    if is_traced((known_pairs.eigenvalues, known_times)):
+        raise ValueError(
+            'method: "auto" chooses by values, which are traced here (jax.jit, vmap); call hks with method="spectral" '
+            'or, for the small times, "spectrum-free"'
+        )
+    estimate = truncation(known_pairs, known_times)
+    spectral = np.asarray(estimate.tail) <= tolerance
+    nan = jnp.full((), jnp.nan, times.dtype)
+    if spectral.all():
+        values = heat.hks(pairs, times, normalisation)
+        return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, "none", nan, nan)
+    if not isinstance(pairs.space, GridSpace):
+        raise TypeError(
+            f"times: {int((~spectral).sum())} of {times.size} are too small for {pairs.k} pairs, and on a surface mesh "
+            "there is no other method; compute more eigenpairs, or use method='spectral'"
+        )
+    small = np.flatnonzero(~spectral)
+    pencil = pairs.pencil
+    settings = choose_method(pencil, times[small], "auto", tolerance)
+    raw = _without(pencil, times[small], tolerance, settings or "selected-inversion")
+    others = _scaled(pairs, times[small], normalisation, raw)
+    for message in _coarse(estimate, small):
+        warnings.warn(message, AccuracyWarning, stacklevel=2)
+    values = jnp.zeros((times.size, *others.shape[1:]), others.dtype).at[small].set(others)
+    overlap = difference = nan
+    if spectral.any():
+        large = np.flatnonzero(spectral)
+        of_pairs = heat.hks(pairs, times[large], normalisation)
+        values = values.at[large].set(of_pairs)
+        overlap = jnp.min(known_times[large])
+        least = work(settings, pencil, times[small])
+        difference = _difference(known_pairs, overlap[None], tolerance, _DEARER * least)
+        if float(difference) > 10 * tolerance:
+            warnings.warn(
+                f"at t = {float(overlap):.4g} the signatures with and without eigenpairs differ by "
+                f"{float(difference):.1e}, more than ten times the tolerance {tolerance:.1e}. Check the pairs' "
+                "residuals",
+                AccuracyWarning,
+                stacklevel=2,
+            )
+    name = "selected-inversion" if settings is None else "colouring"
+    return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, name, overlap, difference)
+
+
+def _without(
+    pencil: Pencil | MirrorPencil, times: Float[Array, " m"], tolerance: float, method: Any = "auto"
+) -> Float[Array, "m *shape"]:
+    return hks_spectrum_free(pencil, times, method=method, tolerance=tolerance)
+
+
+def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, values: Array) -> Array:
+    """Normalise a raw signature."""
+    if normalisation == "heat-trace":
+        raise ValueError(
+            'normalisation: "heat-trace" needs the whole spectrum; use "raw", "volume" or "flat", or method="spectral"'
+        )
+    return values * heat.normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _coarse(estimate: Any, small: np.ndarray) -> list[str]:
+    """Return what `truncation` has to say of the grid at some of its times; that k is too small is no matter there."""
+    some = eqx.tree_at(
+        lambda e: (e.times, e.tail, e.resolution_bias, e.coarse_fraction),
+        estimate,
+        (
+            estimate.times[small],
+            jnp.zeros(small.size),
+            estimate.resolution_bias[small],
+            estimate.coarse_fraction[small],
+        ),
+    )
+    return some.messages()
+
+
+def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
+    """Return how far the two methods are apart at one time, at most, relative to (4πt)^(−d/2).
+
+    NaN where that would take more work than is allowed.
+    """
+    pencil = pairs.pencil
+    assert isinstance(pencil, Pencil | MirrorPencil)
+    settings = (
+        plan(pencil, times, tolerance)
+        if pencil.space.dimension == 3
+        else choose_method(pencil, times, "auto", tolerance)
+    )
+    if work(settings, pencil, times) > most:
+        return jnp.full((), jnp.nan, times.dtype)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AccuracyWarning)
+        spectral = heat.hks(pairs, times)
+    gap = jnp.abs(spectral - _without(pencil, times, tolerance, settings or "selected-inversion"))
+    return jnp.nanmax(gap) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)

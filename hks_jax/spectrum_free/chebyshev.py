@@ -1,0 +1,227 @@
+"""The diagonal of exp(−tM⁻¹K)M⁻¹ by Chebyshev polynomials on coloured sources, and its derivative."""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float, Int
+
+from hks_jax.domain.static_array import StaticArray
+from hks_jax.eigen.first_order import first_order_only
+from hks_jax.spectrum_free.heat_operator import HeatOperator
+from hks_jax.spectrum_free.stencil import stencil_outer
+
+
+def heat_coefficients(times: Float[Array, " m"], top: float, degree: int) -> Float[Array, "m degree+1"]:
+    """Return the Chebyshev coefficients of exp(−tλ) on 0 ≤ λ ≤ top, by the cosine transform of its samples.
+
+    They are e^(−z) Iₙ(z) (twice that for n > 0, with alternating signs), z = t·top/2; as sums of samples they have
+    derivatives by t without further ado.
+    """
+    samples = degree + 32 + 4 * math.isqrt(degree)  # aliasing brings in coefficients from 2·samples − degree on
+    angles = (np.arange(samples) + 0.5) * (np.pi / samples)
+    weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
+    weights[:, 0] /= 2
+    values = jnp.exp(-times[:, None] * jnp.asarray(top * (1 + np.cos(angles)) / 2, times.dtype))
+    return jnp.matmul(values, jnp.asarray(weights, times.dtype), precision="highest")
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+def coloured_diagonal(
+    top: float,
+    columns: int,
+    colours: StaticArray,
+    operator: HeatOperator,
+    coefficients: Float[Array, "m degree+1"],
+) -> Float[Array, "m *shape"]:
+    """Return Σₙ cₙ Tₙ(2A/top − 1) P at the sources, for every row of coefficients; 0 at nodes without a colour.
+
+    Args:
+        top: what bounds the spectrum of A = PK from above; below it is 0.
+        columns: how many colours are worked on at once.
+        colours: int (*shape), 0, 1, … or −1; the vector of a colour is 1 at all its nodes.
+        operator: K, M and P.
+        coefficients: cₙ.
+    """
+
+    def block(number: Array, total: Array) -> Array:
+        sources = _sources(colours, columns, number, total.dtype)
+
+        def step(n: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            y, before, total = state
+            total = total + _outer(coefficients[:, n], sources, y)
+            return _twice(n, y.dtype) * _scaled(top, operator.apply(y), y) - before, y, total
+
+        y = operator.solve_mass(sources)
+        y, _, total = jax.lax.fori_loop(0, degree, step, (y, jnp.zeros_like(y), total))
+        return total + _outer(coefficients[:, degree], sources, y)
+
+    degree = coefficients.shape[1] - 1
+    start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
+    return jax.lax.fori_loop(0, _blocks(colours, columns), block, start)
+
+
+# y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with  = 2PK/top − 1, and the result is Σₙ cₙ v∘yₙ. Taking P for M⁻¹, of
+# which dM⁻¹ = −M⁻¹ dM M⁻¹, the tangents of aₙ = PKyₙ are P(dK yₙ + K dyₙ − dM aₙ), and dy₀ = −P dM y₀.
+#
+# Transposed: with the cotangent g, pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂, sₙ = Σₜ cₙ(t) g(t), f₀ = 1, fₙ = 2, from the
+# last n down to 0 (Clenshaw's recurrence), and the cotangents are
+#
+#     of K: Σₙ (2fₙ/top) pₙ₊₁ ⊗ yₙ,    of M: −p₀ ⊗ y₀ − Σₙ (2fₙ/top) pₙ₊₁ ⊗ aₙ,    of cₙ(t): Σ g(t)∘v∘yₙ.
+#
+# The yₙ are wanted in the order n = N − 1 … 0, and yₙ₋₁ = 2Âyₙ − yₙ₊₁ gives them in that order from the last two:
+# three-term recurrences run as well backwards as forwards, rounding grows like |Uₙ| ≤ n + 1 either way. So nothing
+# is stored that grows with the degree.
+@partial(coloured_diagonal.defjvp, symbolic_zeros=True)
+def _coloured_diagonal_jvp(
+    top: float, columns: int, colours: StaticArray, primals: tuple, tangents: tuple
+) -> tuple[Array, Array]:
+    operator, coefficients = primals
+    d_operator, d_coefficients = tangents
+    value = coloured_diagonal(top, columns, colours, operator, coefficients)
+    moved = _linked((d_operator.stiffness, d_operator.mass, d_coefficients))
+    if moved is None:
+        return value, jnp.zeros_like(value)
+    operator, coefficients = first_order_only((operator, coefficients))
+    forward = partial(_tangent, top, columns, colours, operator, coefficients)
+    backward = partial(_cotangent, top, columns, colours, operator, coefficients)
+    return value, _linear_map(forward, backward, moved, value)
+
+
+def _tangent(
+    top: float, columns: int, colours: StaticArray, operator: HeatOperator, coefficients: Array, moved: tuple
+) -> Float[Array, "m *shape"]:
+    d_stiffness, d_mass, d_coefficients = moved
+    degree = coefficients.shape[1] - 1
+
+    def block(number: Array, total: Array) -> Array:
+        sources = _sources(colours, columns, number, total.dtype)
+
+        def read(n: Any, y: Array, dy: Array) -> Array:
+            return _outer(d_coefficients[:, n], sources, y) + _outer(coefficients[:, n], sources, dy)
+
+        def step(n: Array, state: tuple) -> tuple:
+            y, before, dy, d_before, total = state
+            total = total + read(n, y, dy)
+            image = operator.apply(y)
+            change = operator.moved(d_stiffness, d_mass, y, image) + operator.apply_stiffness(dy)
+            factor = _twice(n, y.dtype)
+            following = factor * _scaled(top, image, y) - before
+            d_following = factor * _scaled(top, operator.solve_mass(change), dy) - d_before
+            return following, y, d_following, dy, total
+
+        y = operator.solve_mass(sources)
+        zero = jnp.zeros_like(y)
+        dy = operator.solve_mass(operator.moved(jnp.zeros_like(d_stiffness), d_mass, zero, y))
+        y, _, dy, _, total = jax.lax.fori_loop(0, degree, step, (y, zero, dy, zero, total))
+        return total + read(degree, y, dy)
+
+    start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
+    return jax.lax.fori_loop(0, _blocks(colours, columns), block, start)
+
+
+def _cotangent(
+    top: float, columns: int, colours: StaticArray, operator: HeatOperator, coefficients: Array, g: Array
+) -> tuple[Array, Array, Array]:
+    degree = coefficients.shape[1] - 1
+    periodic = operator.space.periodic
+
+    def block(number: Array, total: tuple) -> tuple:
+        sources = _sources(colours, columns, number, g.dtype)
+
+        def up(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            y, before = state
+            return _twice(n, y.dtype) * _scaled(top, operator.apply(y), y) - before, y
+
+        def read(y: Array) -> Array:
+            return _contract(g, jnp.sum(sources * y, axis=-1))
+
+        def source(n: Any) -> Array:
+            return jnp.tensordot(coefficients[:, n], g, 1, precision="highest")[..., None] * sources
+
+        def down(i: Array, state: tuple) -> tuple:
+            y, after, p, p_after, (of_stiffness, of_mass, of_coefficients) = state
+            n = degree - 1 - i
+            factor = _twice(n, y.dtype)
+            image = operator.apply(y)
+            weighted = (2 * factor / top) * p
+            of_stiffness = of_stiffness + stencil_outer(weighted, y, periodic)
+            of_mass = of_mass - operator.outer_mass(weighted, image)
+            of_coefficients = of_coefficients.at[:, n].add(read(y))
+            following = operator.solve_mass(source(n) + operator.apply_stiffness(weighted)) - factor * p - p_after
+            total = of_stiffness, of_mass, of_coefficients
+            return factor * _scaled(top, image, y) - after, y, following, p, total
+
+        y = operator.solve_mass(sources)
+        after, y = jax.lax.fori_loop(0, degree, up, (y, jnp.zeros_like(y)))
+        of_stiffness, of_mass, of_coefficients = total
+        total = of_stiffness, of_mass, of_coefficients.at[:, degree].add(read(after))
+        p = operator.solve_mass(source(degree))
+        state = jax.lax.fori_loop(0, degree, down, (y, after, p, jnp.zeros_like(p), total))
+        _, y, p, _, (of_stiffness, of_mass, of_coefficients) = state
+        return of_stiffness, of_mass - operator.outer_mass(p, y), of_coefficients
+
+    zeros = jax.tree.map(jnp.zeros_like, (operator.stiffness, operator.mass, coefficients))
+    return jax.lax.fori_loop(0, _blocks(colours, columns), block, zeros)
+
+
+def _scaled(top: float, image: Array, y: Array) -> Array:
+    """Return Ây, of PKy and y."""
+    return (2 / top) * image - y
+
+
+def _twice(n: Array, dtype: Any) -> Array:
+    return jnp.where(n == 0, 1, 2).astype(dtype)
+
+
+def _blocks(colours: StaticArray, columns: int) -> int:
+    return -(-(int(colours.value.max()) + 1) // columns)
+
+
+def _sources(colours: StaticArray, columns: int, number: Array, dtype: Any) -> Float[Array, "*shape b"]:
+    """Return the vectors of one block of colours."""
+    numbers: Int[Array, " b"] = number * columns + jnp.arange(columns, dtype=jnp.int32)
+    return (jnp.asarray(colours.value, jnp.int32)[..., None] == numbers).astype(dtype)
+
+
+def _outer(row: Float[Array, " m"], sources: Array, y: Array) -> Float[Array, "m *shape"]:
+    return jnp.multiply.outer(row, jnp.sum(sources * y, axis=-1))
+
+
+def _contract(g: Float[Array, "m *shape"], moment: Float[Array, "*shape"]) -> Float[Array, " m"]:
+    return jnp.matmul(g.reshape(g.shape[0], -1), moment.ravel(), precision="highest")
+
+
+def _linked(tangents: tuple) -> tuple | None:
+    """Return tangents with symbolic zeros as arrays, or None if all are zero.
+
+    The zeros are made to depend on the others: transposition then finds nothing constant among linear inputs.
+    """
+    moving = [leaf for leaf in tangents if not isinstance(leaf, SymbolicZero)]
+    if not moving:
+        return None
+    zero = sum(jnp.sum(0 * leaf) for leaf in moving)
+    return tuple(
+        jnp.zeros(leaf.shape, leaf.dtype) + zero if isinstance(leaf, SymbolicZero) else leaf for leaf in tangents
+    )
+
+
+def _linear_map(forward: Any, backward: Any, x: tuple, like: Array) -> Array:
+    """Return forward(x), a linear map whose transpose is backward.
+
+    As the second part of the solution of x = u, h − forward(x) = 0: JAX lets linear solves say how their transpose is
+    solved, under every transformation. The system itself would matter to second derivatives alone, which are refused.
+    """
+    nothing = jnp.zeros_like(like) + sum(jnp.sum(0 * leaf) for leaf in x)
+
+    def solve(_: Any, b: tuple) -> tuple:
+        return b[0], b[1] + forward(b[0])
+
+    def transpose_solve(_: Any, b: tuple) -> tuple:
+        return jax.tree.map(jnp.add, b[0], backward(b[1])), b[1]
+
+    return jax.lax.custom_linear_solve(lambda v: v, (x, nothing), solve, transpose_solve)[1]

@@ -1,0 +1,267 @@
+"""Signatures without eigenpairs against all eigenpairs, their bounds, derivatives, and the choice between methods."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from differences import directional
+from fields import flat, random_spd
+from scipy.special import ive
+
+import hks_jax as hj
+from hks_jax.fem.boundary import normalise_boundary
+from hks_jax.fem.space import GridSpace
+from hks_jax.spectrum_free.chebyshev import heat_coefficients
+from hks_jax.spectrum_free.colours import coefficient_sizes
+from hks_jax.spectrum_free.poles import exponential_poles
+from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
+
+MIXED = (("neumann", "dirichlet"), "periodic")
+
+
+def random_field(shape, mask=None, seed=5):
+    return hj.TensorField(hj.Grid(shape, 0.1, mask=mask), random_spd(np.random.default_rng(seed), shape, 0.4))
+
+
+def l_shape(shape):
+    mask = np.ones(shape, bool)
+    mask[: shape[0] // 2, : shape[1] // 3] = False
+    return mask
+
+
+def by_all_pairs(pencil, times):
+    """The signature from SciPy's dense solver."""
+    parts = []
+    for part in pencil.parts:
+        values, vectors = scipy.linalg.eigh(part.stiffness.to_dense(), part.mass.to_dense())
+        decay = np.exp(-np.multiply.outer(np.asarray(times), values))
+        parts.append(part.space.extend(jnp.asarray(decay @ vectors.T**2)))
+    return np.mean(parts, axis=0)
+
+
+def flat_scale(times, d):
+    return (4 * np.pi * np.asarray(times)).reshape(-1, *[1] * d) ** (-d / 2)
+
+
+@pytest.mark.parametrize(
+    ("shape", "boundary", "mass", "times"),
+    [
+        ((26, 23), "neumann", "lumped", [0.005, 0.01]),
+        ((26, 23), MIXED, "consistent", [0.005, 0.01]),
+        ((14, 12), "mirror", "lumped", [0.01]),
+        ((9, 10, 8), "neumann", "consistent", [0.005, 0.02]),
+        ((9, 10, 8), ("periodic", "dirichlet", "neumann"), "lumped", [0.005, 0.02]),
+    ],
+    ids=str,
+)
+def test_colouring_keeps_its_bound(shape, boundary, mass, times):
+    mask = l_shape(shape) if shape[1] > 12 else None
+    pencil = hj.assemble(random_field(shape, mask), boundary, mass)
+    settings = hj.colouring(pencil, times, tolerance=1e-5)
+    values = hj.hks_spectrum_free(pencil, times, method=settings)
+    expected = by_all_pairs(pencil, times)
+    np.testing.assert_array_equal(np.isnan(values), np.isnan(expected))
+    error = np.nanmax(np.abs(values - expected) / flat_scale(times, len(shape)), axis=tuple(range(1, len(shape) + 1)))
+    assert (error <= np.array(settings.error) + 1e-12).all()
+    assert max(settings.error) <= 1e-5
+
+
+def test_few_vectors_serve_a_large_grid_and_the_bound_is_not_absurd():
+    field, t = flat((64, 60), (1.0, 1.0), (False, True)), 3 / 63**2
+    pencil = hj.assemble(field, ("neumann", "periodic"), "lumped")
+    settings = hj.colouring(pencil, [t])
+    exact = hj.hks_spectrum_free(pencil, [t], method="selected-inversion")
+    error = float(jnp.max(jnp.abs(hj.hks_spectrum_free(pencil, [t], method=settings) - exact))) * 4 * np.pi * t
+    assert settings.n_vectors(pencil.space) < 64 * 60 / 8
+    assert error <= settings.error[0] <= 1e-4
+    # The constant of the bound is 1/D where it could be the kernel's diagonal, 4πt/h² = 38 times less.
+    assert settings.error[0] < 5000 * error
+    # Three quarters of the spacing do not keep the tolerance by much: the choice is not wasteful.
+    near = replace(settings, spacing=tuple(s // 2 for s in settings.spacing))
+    assert float(jnp.max(jnp.abs(hj.hks_spectrum_free(pencil, [t], method=near) - exact))) * 4 * np.pi * t > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("shape", "boundary", "mass"),
+    [
+        ((13, 12), "neumann", "consistent"),
+        ((9, 8), ("periodic", "periodic"), "consistent"),
+        ((8, 9), ("periodic", "periodic"), "lumped"),
+        ((8, 11), ("periodic", ("dirichlet", "neumann")), "consistent"),
+        ((8, 7), "mirror", "lumped"),
+    ],
+    ids=str,
+)
+def test_selected_inversion_is_exact_at_any_time(shape, boundary, mass):
+    mask = l_shape(shape) if boundary == "neumann" else None
+    pencil, times = hj.assemble(random_field(shape, mask), boundary, mass), [1e-4, 0.01, 10.0]
+    values = hj.hks_spectrum_free(pencil, times, method="selected-inversion")
+    np.testing.assert_allclose(values, by_all_pairs(pencil, times), rtol=1e-8, atol=1e-8)
+
+
+@cache
+def derivatives_by_all_pairs(mass):
+    """A loss on the signature of all pairs, its gradient, and its derivative by time."""
+    field, times = random_field((9, 10)), jnp.array([0.01, 0.03])
+    probe = np.random.default_rng(1).standard_normal((2, 9, 10))
+
+    def loss(tensors, times):
+        pairs = hj.eigenpairs(hj.TensorField(field.grid, tensors), 90, "neumann", "dense", mass)
+        return jnp.sum(probe * hj.hks(pairs, times))
+
+    return field, times, probe, *jax.grad(loss, (0, 1))(field.tensors, times)
+
+
+@pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
+@pytest.mark.parametrize(
+    ("method", "mass"), [("colouring", "lumped"), ("colouring", "consistent"), ("selected-inversion", "consistent")]
+)
+def test_derivatives(method, mass):
+    field, times, probe, of_tensors, of_times = derivatives_by_all_pairs(mass)
+
+    def loss(tensors, times):
+        moved = hj.TensorField(field.grid, tensors)
+        return jnp.sum(probe * hj.hks_spectrum_free(moved, times, mass=mass, method=method, tolerance=1e-9))
+
+    slope, slope_times = jax.grad(loss, (0, 1))(field.tensors, times)
+    np.testing.assert_allclose(slope, of_tensors, atol=1e-7 * np.abs(of_tensors).max())
+    np.testing.assert_allclose(slope_times, of_times, rtol=1e-7)
+    direction = jnp.asarray(random_spd(np.random.default_rng(2), (9, 10)))
+    _, forward = jax.jvp(lambda T: loss(T, times), (field.tensors,), (direction,))
+    np.testing.assert_allclose(forward, jnp.vdot(of_tensors, direction), rtol=1e-7)
+    if method == "selected-inversion":
+        # Without any eigensolver: central differences.
+        found = directional(lambda T: loss(T, times), field.tensors, direction, 1e-3)
+        np.testing.assert_allclose(forward, found, rtol=1e-7)
+
+
+def test_memory_of_a_gradient_does_not_grow_with_the_degree():
+    field, times = random_field((20, 22)), jnp.array([0.01])
+    settings = hj.colouring(field, times, mass="lumped")
+
+    def bytes_of(degree):
+        chosen = replace(settings, degree=degree)
+
+        def loss(tensors):
+            moved = hj.TensorField(field.grid, tensors)
+            return jnp.sum(hj.hks_spectrum_free(moved, times, mass="lumped", method=chosen))
+
+        memory = jax.jit(jax.grad(loss)).lower(field.tensors).compile().memory_analysis()
+        return memory.temp_size_in_bytes
+
+    one_block = 20 * 22 * settings.columns * 8
+    assert bytes_of(200) - bytes_of(20) < one_block
+
+
+def test_traced_values_need_settings_and_settings_must_fit():
+    field, times = random_field((9, 10)), jnp.array([0.01])
+
+    def loss(scale, **more):
+        moved = hj.TensorField(field.grid, scale * field.tensors)
+        return jnp.sum(hj.hks_spectrum_free(moved, times, mass="lumped", **more))
+
+    with pytest.raises(ValueError, match=r"hks_jax\.colouring"):
+        jax.jit(lambda s: loss(s, method="colouring"))(1.0)
+    # Traced, selected inversion needs no settings.
+    settings = hj.colouring(field, times, mass="lumped", tolerance=1e-9)
+    exact = jax.jit(loss)(1.0)
+    # On a metric half as large, lengths are shorter and the spectrum is larger than the settings are for.
+    slopes = jax.vmap(jax.value_and_grad(lambda s: loss(s, method=settings)))(jnp.array([1.0, 1.01, 0.5]))
+    np.testing.assert_allclose(slopes[0][0], exact, rtol=1e-9)
+    assert np.isfinite(slopes[0][:2]).all()
+    assert np.isfinite(slopes[1][:2]).all()
+    assert np.isnan(slopes[0][2])
+    assert np.isnan(slopes[1][2])
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        jax.grad(jax.grad(lambda s: loss(s, method=settings)))(1.0)
+
+
+def test_float32():
+    shape, times = (24, 22), [0.005, 0.01]
+    field = random_field(shape)
+    single = hj.TensorField(field.grid, jnp.asarray(field.tensors, jnp.float32))
+    exact = hj.hks_spectrum_free(field, times, mass="lumped", method="selected-inversion")
+    for method in ("colouring", "selected-inversion"):
+        values = hj.hks_spectrum_free(single, times, mass="lumped", method=method)
+        assert values.dtype == jnp.float32
+        np.testing.assert_allclose(values, exact, rtol=5e-4)
+
+
+def test_bounds_hold():
+    for shape, mass in (((12, 11), "consistent"), ((6, 7, 6), "lumped")):
+        pencil = hj.assemble(random_field(shape), "neumann", mass)
+        K, M = pencil.stiffness.to_dense(), pencil.mass.to_dense()
+        low = mass_bound(pencil)
+        true_low = scipy.linalg.eigvalsh(M, np.diag(np.sum(M, axis=1)))[0]
+        assert 0.9 * true_low - 0.02 <= low <= true_low + 1e-12
+        top, true_top = bounds(pencil, low, 40 if mass == "consistent" else 1).top, scipy.linalg.eigvalsh(K, M)[-1]
+        assert true_top * (1 - 1e-6) <= top <= 1.35 * true_top
+
+
+def test_coefficients_and_poles():
+    times, top = jnp.array([0.1, 7.0]), 9.0
+    found = heat_coefficients(times, top, 80)
+    for row, t in zip(found, np.asarray(times), strict=True):
+        n = np.arange(81)
+        np.testing.assert_allclose(np.abs(row), np.where(n == 0, 1, 2) * ive(n, t * top / 2), atol=1e-14)
+        assert coefficient_sizes(t * top / 2)[-1] < 1e-20
+    x = np.append(0, np.geomspace(1e-4, 1e6, 2001))
+    for pairs, error in ((1, 2e-2), (3, 3e-6), (5, 3e-10), (7, 2e-13)):
+        poles, weights = exponential_poles(pairs)
+        assert poles.size == pairs
+        assert np.abs(np.sum(weights / (x[:, None] - poles), axis=1).real - np.exp(-x)).max() < error
+
+
+def test_sources_of_a_colour_are_apart_also_around_a_periodic_axis():
+    space = GridSpace(hj.Grid((23, 17)), normalise_boundary(("periodic", "neumann"), 2))
+    colours = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0,)).colours(space).value
+    assert set(np.unique(colours)) == set(range(colours.max() + 1))
+    for colour in range(colours.max() + 1):
+        i, j = np.nonzero(colours == colour)
+        apart = np.abs(i[:, None] - i)
+        far = (np.minimum(apart, 23 - apart) >= 5) | (np.abs(j[:, None] - j) >= 4)
+        assert far[~np.eye(i.size, dtype=bool)].all()
+
+
+def test_auto_takes_each_time_from_the_method_that_reaches_it():
+    field, times = random_field((24, 22)), [0.02, 0.5, 1.0]
+    pairs = hj.eigenpairs(field, 60)
+    found = hj.hks_auto(pairs, times)
+    expected = by_all_pairs(pairs.pencil, times)
+    np.testing.assert_array_equal(found.spectral, [False, True, True])
+    np.testing.assert_allclose(found.values, expected, rtol=1e-3)
+    assert float(found.overlap_time) == 0.5
+    assert float(found.overlap_difference) < 1e-4
+    assert "1 of 3 times by selected-inversion: 0.02" in found.summary()
+    assert "both at t = 0.5" in found.summary()
+    np.testing.assert_array_equal(hj.hks(pairs, times, method="auto"), found.values)
+    np.testing.assert_allclose(
+        hj.hks(pairs, times[:1], "flat", method="spectrum-free")[0], expected[0] * 4 * np.pi * times[0], rtol=1e-3
+    )
+    assert hj.hks_auto(pairs, times[1:]).method == "none"
+    with pytest.raises(ValueError, match="traced"):
+        jax.jit(lambda t: hj.hks(pairs, t, method="auto"))(jnp.array(times))
+    with pytest.raises(ValueError, match="heat-trace"):
+        hj.hks(pairs, times, "heat-trace", method="spectrum-free")
+
+
+def test_errors_say_what_to_do():
+    field = flat((70, 70), (1.0, 1.0))
+    with pytest.raises(ValueError, match=r"eigenpairs, smaller times"):
+        hj.hks_spectrum_free(field, [0.5], mass="lumped", method="colouring")
+    with pytest.raises(ValueError, match="positive finite times"):
+        hj.hks_spectrum_free(field, [0.0])
+    with pytest.raises(ValueError, match="tolerance: got 2"):
+        hj.hks_spectrum_free(field, [0.1], method="colouring", tolerance=2)
+    with pytest.raises(ValueError, match="method: got 'magic'"):
+        hj.hks_spectrum_free(field, [0.1], method="magic")
+    with pytest.raises(ValueError, match="for 2D grids"):
+        hj.hks_spectrum_free(flat((5, 5, 5), (1.0, 1.0, 1.0)), [0.1], method="selected-inversion")
+    with pytest.raises(TypeError, match="SurfaceMesh"):
+        hj.hks_spectrum_free(hj.examples.bumpy_torus_mesh(8), [0.1])
+    with pytest.raises(ValueError, match="method: got 'none'"):
+        hj.hks(hj.eigenpairs(flat((5, 6), (1.0, 1.0)), 20), [0.1], method="none")
