@@ -119,7 +119,7 @@ def test_pairs_equal_the_dense_ones(name):
 
 
 def test_multiplicities_of_a_cube_are_complete():
-    n, k = 16, 30
+    n, k = 16, 29
     field = flat((n, n, n), (1.0, 1.0, 1.0))
     pairs = hj.eigenpairs(field, k, solver=hj.ChebyshevFilter(block=8))
     # Q1 on a uniform grid separates: (K₁⊗M₁⊗M₁ + …) has the sums of the intervals' own discrete eigenvalues.
@@ -143,7 +143,7 @@ def test_traced_batched_and_in_single_precision():
 
 
 def test_gradient_equals_the_dense_one(rng):
-    shape, k, times = (9, 8, 10), 8, jnp.array([0.02, 0.1])
+    shape, k, times = (9, 8, 10), 8, jnp.array([0.15, 0.4])
     tensors = jnp.asarray(random_spd(rng, shape, 0.3))
     weights = rng.standard_normal((2, *shape))
 
@@ -160,9 +160,8 @@ def test_bad_settings_and_meshes_are_refused():
     for settings in ({"block": 0}, {"max_rounds": 0}, {"spare": 0.0}, {"derivative_tolerance": 2.0}):
         with pytest.raises(ValueError, match=next(iter(settings))):
             hj.ChebyshevFilter(**settings)
-    mesh = hj.SurfaceMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2], [1, 3, 2]]))
     with pytest.raises(ValueError, match="grid"):
-        hj.eigenpairs(mesh, 1, solver="chebyshev-filter")
+        hj.eigenpairs(hj.examples.bumpy_torus_mesh(20), 1, solver="chebyshev-filter")
     with pytest.raises(ValueError, match="at most"):
         hj.eigenpairs(problem("neumann"), 400, solver="chebyshev-filter")
 

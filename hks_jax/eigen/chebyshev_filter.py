@@ -26,7 +26,7 @@ from hks_jax.traced import is_traced
 
 _FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
 """Rounds on the coarsest grid, from random functions, and on those between."""
-_ROOM = 5
+_ROOM = 12
 """Degrees of freedom per vector that a coarse grid must have."""
 _LEAST_NODES = 6
 """Nodes along each axis below which a grid is not coarsened."""
@@ -55,7 +55,7 @@ class ChebyshevFilter(Eigensolver):
 
     name: ClassVar[str] = "chebyshev-filter"
     tolerance: float = eqx.field(default=1e-8, static=True)
-    block: int = eqx.field(default=16, static=True)
+    block: int = eqx.field(default=32, static=True)
     spare: float = eqx.field(default=0.35, static=True)
     max_rounds: int = eqx.field(default=60, static=True)
     single_precision: bool = eqx.field(default=True, static=True)

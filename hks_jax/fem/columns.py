@@ -3,6 +3,7 @@
 In this layout each coefficient is read once for all columns: in 3D it is about twice as fast as row after row.
 """
 
+from collections.abc import Iterator
 from itertools import product
 
 import jax
@@ -34,12 +35,26 @@ def product_with_rim(
     coefficients: Float[Array, "offsets *shape"], x: Float[Array, "*rimmed b"]
 ) -> Float[Array, "*shape b"]:
     """Return the product with columns whose neighbours beyond all sides are there."""
-    shape = coefficients.shape[1:]
+    # A node's coefficients side by side in memory: read in 3^d places at once, the product takes twice as long.
+    together = jnp.moveaxis(coefficients, 0, -1)
     y = jnp.zeros((), x.dtype)
-    for c, start in zip(coefficients, product((0, 1, 2), repeat=len(shape)), strict=True):
-        stop = [s + n for s, n in zip(start, shape, strict=True)]
-        y = y + c[..., None] * jax.lax.slice(x, (*start, 0), (*stop, x.shape[-1]))
+    for o, neighbours in enumerate(_neighbours(x)):
+        y = y + together[..., o, None] * neighbours
     return y
+
+
+def stencil_outer(
+    p: Float[Array, "*shape b"], x: Float[Array, "*shape b"], periodic: tuple[bool, ...]
+) -> Float[Array, "offsets *shape"]:
+    """Return Σ_b p[i, b] x[i + o, b] for every offset: the derivative of Σ_b pᵀCx by the coefficients of C."""
+    return jnp.stack([jnp.sum(p * neighbours, axis=-1) for neighbours in _neighbours(with_rim(x, periodic))])
+
+
+def _neighbours(x: Float[Array, "*rimmed b"]) -> Iterator[Float[Array, "*shape b"]]:
+    """Go through the columns shifted by each offset, given with their rim."""
+    for start in product((0, 1, 2), repeat=x.ndim - 1):
+        stop = [s + n - 2 for s, n in zip(start, x.shape[:-1], strict=True)]
+        yield jax.lax.slice(x, (*start, 0), (*stop, x.shape[-1]))
 
 
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.domain.static_array import StaticArray
 from hks_jax.eigen.first_order import first_order_only
+from hks_jax.fem.columns import stencil_outer
 from hks_jax.spectrum_free.heat_operator import HeatOperator
-from hks_jax.spectrum_free.stencil import stencil_outer
 
 
 def heat_coefficients(times: Float[Array, " m"], top: float, degree: int) -> Float[Array, "m degree+1"]:

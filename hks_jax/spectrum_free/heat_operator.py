@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.fem.columns import stencil_outer, stencil_product
 from hks_jax.fem.operators import DiagonalOperator, StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
-from hks_jax.spectrum_free.stencil import stencil_outer, stencil_product
 
 
 class HeatOperator(eqx.Module):
