@@ -59,9 +59,11 @@ def _neighbours(x: Float[Array, "*rimmed b"]) -> Iterator[Float[Array, "*shape b
 
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
     """Return rows of flat nodal arrays as a block of columns."""
-    return jnp.moveaxis(rows.reshape(-1, *shape), 0, -1)
+    # The barriers, here and below, keep XLA from fusing the transposition with the products before or after it, which
+    # would then go through memory in the wrong order.
+    return jax.lax.optimization_barrier(jnp.moveaxis(rows.reshape(-1, *shape), 0, -1))
 
 
 def to_rows(columns: Float[Array, "*shape b"]) -> Float[Array, "b nodes"]:
     """Return a block of columns as rows of flat nodal arrays."""
-    return jnp.moveaxis(columns, -1, 0).reshape(columns.shape[-1], -1)
+    return jnp.moveaxis(jax.lax.optimization_barrier(columns), -1, 0).reshape(columns.shape[-1], -1)
