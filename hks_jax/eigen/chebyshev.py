@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.eigen.coarsening import Level
@@ -115,9 +114,3 @@ def upper_end(level: Level, periodic: tuple[bool, ...]) -> Float[Array, ""]:
     # Gershgorin's discs never fail, but are twice too large where tensors vary.
     discs = jnp.max(jnp.sum(jnp.abs(level.stiffness), axis=0) / level.lumped)
     return jnp.minimum(_MARGIN * bound, discs)
-
-
-def weyl(count: int, volume: Float[Array, ""], dimension: int) -> Float[Array, ""]:
-    """Return about where the eigenvalue of that number lies, by Weyl's law."""
-    constant = 4 * np.pi if dimension == 2 else (6 * np.pi**2) ** (2 / 3)
-    return constant * (count / volume) ** (2 / dimension)

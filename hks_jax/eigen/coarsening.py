@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.fem.colouring import axis_colours
 from hks_jax.fem.columns import stencil_product, to_columns, to_rows
 from hks_jax.fem.operators import DiagonalOperator, StencilOperator
 from hks_jax.fem.pencil import Pencil
@@ -124,7 +125,7 @@ def _colouring(
     shape: tuple[int, ...], periodic: tuple[bool, ...]
 ) -> tuple[Int[np.ndarray, "*shape"], list[Int[np.ndarray, "*shape"]]]:
     """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none."""
-    axes = [_axis_colours(n, wraps) for n, wraps in zip(shape, periodic, strict=True)]
+    axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, periodic, strict=True)]
     number = np.zeros(shape, int)
     for axis, colours in enumerate(axes):
         number = number * (colours.max() + 1) + colours.reshape([-1 if a == axis else 1 for a in range(len(shape))])
@@ -137,11 +138,3 @@ def _colouring(
         for start in product((0, 1, 2), repeat=len(shape))
     ]
     return number, neighbours
-
-
-def _axis_colours(n: int, periodic: bool) -> Int[np.ndarray, " n"]:
-    """Return colours along one axis: any three nodes in a row differ."""
-    fours = n % 3 if periodic else 0
-    if n < 4 * fours:
-        return np.arange(n)
-    return np.concatenate([np.tile(np.arange(4), fours), np.arange(n - 4 * fours) % 3])

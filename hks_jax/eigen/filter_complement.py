@@ -4,15 +4,13 @@ The filter of `hks_jax.eigen.chebyshev`, with its sign changed, is the precondit
 out after each step, by products of matrices for a block of right-hand sides at once.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from hks_jax.eigen.chebyshev import Band, correction, degree_for, upper_end
 from hks_jax.eigen.coarsening import finest_level
-from hks_jax.eigen.complement import MAX_ITERATIONS, SINGULAR
+from hks_jax.eigen.conjugate_gradients import conjugate_gradients, first_beyond
 from hks_jax.eigen.products import combine, inner_products
 from hks_jax.fem.columns import to_columns, to_rows
 from hks_jax.fem.pencil import Pencil
@@ -20,15 +18,6 @@ from hks_jax.fem.space import GridSpace
 
 _GAIN = 20.0
 """What the preconditioner's polynomial is at λ: more costs more products with K, less more projections."""
-
-
-class _Iteration(NamedTuple):
-    x: Float[Array, "b n_dof"]
-    r: Float[Array, "b n_dof"]
-    p: Float[Array, "b n_dof"]
-    energy: Float[Array, " b"]
-    errors: Float[Array, " b"]
-    steps: Int[Array, ""]
 
 
 def prepare(pencil: Pencil) -> Float[Array, ""]:
@@ -54,7 +43,7 @@ def solve(
     assert isinstance(space, GridSpace)
     level, periodic = finest_level(pencil), space.periodic
     k, tolerance = rhs.shape[0], max(tolerance, 10 * float(jnp.finfo(dtype).eps))
-    beyond = jnp.where(values[-1] > 0, values[-1] * (1 + 1 / values.size), 1)
+    beyond = first_beyond(values)
     band = Band(jnp.minimum(beyond, high / 2), high)
     images = jax.lax.map(pencil.mass.apply, vectors, batch_size=block)
 
@@ -70,31 +59,8 @@ def solve(
             z = correction(level, periodic, band, columns, shifts, degree)
             return without_known(-space.restrict(to_rows(z).reshape(-1, *level.shape)))
 
-        def going_on(state: _Iteration) -> Bool[Array, ""]:
-            return jnp.any(state.errors > tolerance) & (state.steps < MAX_ITERATIONS)
-
-        def step(state: _Iteration) -> _Iteration:
-            x, r, p, energy, errors, steps = state
-            active = errors > tolerance
-            image = pencil.mass.apply(p)
-            product = pencil.stiffness.apply(p) - shifts[:, None] * image
-            curvature = jnp.sum(p * product, axis=1)
-            # Where it nearly vanishes, an eigenvalue equal to λᵢ is left on the complement: there is no solution.
-            regular = curvature > SINGULAR * beyond * jnp.sum(p * image, axis=1)
-            length = jnp.where(active & regular, energy / jnp.where(regular, curvature, 1), 0)[:, None]
-            x, r = x + length * p, r - length * product
-            z = precondition(r)
-            following = jnp.sum(r * z, axis=1)
-            error = jnp.where(regular, jnp.sqrt(jnp.abs(following) / first), jnp.nan)
-            p = z + (following / jnp.where(active, energy, 1))[:, None] * p
-            return _Iteration(x, r, p, following, jnp.where(active, error, errors), steps + 1)
-
-        z = precondition(b)
-        energy = jnp.sum(b * z, axis=1)
-        first = jnp.where(energy > 0, energy, 1)
-        start = _Iteration(jnp.zeros_like(b), b, z, energy, jnp.where(energy > 0, 1.0, 0.0), jnp.zeros((), int))
-        end = jax.lax.while_loop(going_on, step, start)
-        return jnp.where((end.errors <= tolerance)[:, None], end.x, jnp.nan)
+        wanted = jnp.where(jnp.any(b != 0, axis=1), tolerance, jnp.inf)
+        return conjugate_gradients(pencil, precondition, shifts, b, wanted, beyond)
 
     rhs = rhs - combine(inner_products(vectors, rhs), images)
     count = -(-k // block)

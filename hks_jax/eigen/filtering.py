@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.eigen.chebyshev import Band, correction, degree_for, weyl
+from hks_jax.eigen.chebyshev import Band, correction, degree_for
 from hks_jax.eigen.coarsening import Level, interpolate
 from hks_jax.eigen.sharing import EVERYWHERE, own_blocks, shared, to_own_rows, to_slabs
 from hks_jax.eigen.subspace import block_of, local_level, measure, rayleigh_ritz
+from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.columns import stencil_product, to_rows
 from hks_jax.fem.halo import Slabs
 

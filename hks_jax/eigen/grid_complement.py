@@ -6,16 +6,16 @@ law eigenvalues are spread evenly enough for that. The factorisations depend on 
 products with a Jacobian at one point.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from hks_jax.eigen.complement import MAX_ITERATIONS, SINGULAR, group_numbers
+from hks_jax.eigen.complement import group_numbers
+from hks_jax.eigen.conjugate_gradients import conjugate_gradients, first_beyond
 from hks_jax.eigen.dissection import Dissection, dissect
 from hks_jax.eigen.multifrontal import Factorisation, factorise
 from hks_jax.eigen.products import combine, inner_products
@@ -26,18 +26,6 @@ _BLOCK = 32
 """Rows solved at once."""
 _MEMORY = 5e8
 """Bytes that factorisations may take together."""
-
-
-class _Iteration(NamedTuple):
-    """The state of conjugate gradients for one block of rows."""
-
-    x: Float[Array, "b n_dof"]
-    r: Float[Array, "b n_dof"]
-    p: Float[Array, "b n_dof"]
-    energy: Float[Array, " b"]
-    errors: Float[Array, " b"]
-    going: Bool[Array, " b"]
-    steps: Int[Array, ""]
 
 
 class _Groups(NamedTuple):
@@ -60,7 +48,7 @@ def prepare(pencil: Pencil, values: Float[Array, " p"], k: int, tolerance: float
     dissection = dissect(pencil.space)
     groups = _group(dissection, values, k, tolerance)
     # Between the distances a and b from Λ the geometric mean leaves the least condition.
-    beyond = _beyond(values)
+    beyond = first_beyond(values)
     targets = beyond - jnp.sqrt((beyond - values[groups.first]) * (beyond - values[groups.last]))
     factors = jax.lax.map(partial(factorise, dissection, pencil), _apart(values, targets))
     return Factorisation(dissection, factors.downward, factors.upward, factors.negative)
@@ -85,7 +73,7 @@ def solve(
         rhs: (k, n_dof), k ≤ p; row i belongs to λᵢ.
         tolerance: reduction of the error in the energy norm, relative to the largest row.
     """
-    k, beyond = rhs.shape[0], _beyond(values)
+    k, beyond = rhs.shape[0], first_beyond(values)
     # What rounded eigenvectors leave to be solved beyond their own accuracy is noise.
     tolerance = max(tolerance, 100 * float(jnp.finfo(rhs.dtype).eps))
     images = jax.lax.map(pencil.mass.apply, vectors, batch_size=_BLOCK)
@@ -108,7 +96,7 @@ def solve(
             z = factor.solve(r)
             return z - combine(inner_products(images, z), vectors)
 
-        return _conjugate_gradients(pencil, precondition, shifts, b, wanted, beyond)
+        return conjugate_gradients(pencil, precondition, shifts, b, wanted, beyond)
 
     parts = (
         jnp.asarray(of_block),
@@ -117,48 +105,6 @@ def solve(
         jnp.pad(wanted, (0, spare), constant_values=jnp.inf).reshape(blocks, _BLOCK),
     )
     return jax.lax.map(solve_block, parts).reshape(blocks * _BLOCK, -1)[:k]
-
-
-def _conjugate_gradients(
-    pencil: Pencil,
-    precondition: Callable[[Array], Array],
-    shifts: Float[Array, " b"],
-    rhs: Float[Array, "b n_dof"],
-    wanted: Float[Array, " b"],
-    beyond: Float[Array, ""],
-) -> Float[Array, "b n_dof"]:
-    """Solve (K − λᵢM) xᵢ = rhsᵢ for a block of rows; NaN where the error asked for is not reached."""
-
-    def going_on(state: _Iteration) -> Bool[Array, ""]:
-        return jnp.any(state.going) & (state.steps < MAX_ITERATIONS)
-
-    def step(state: _Iteration) -> _Iteration:
-        x, r, p, energy, errors, going, steps = state
-        image = pencil.mass.apply(p)
-        product = pencil.stiffness.apply(p) - shifts[:, None] * image
-        curvature = jnp.sum(p * product, axis=1)
-        # Where it nearly vanishes, an eigenvalue equal to λᵢ is left on the complement: there is no solution.
-        regular = curvature > SINGULAR * beyond * jnp.sum(p * image, axis=1)
-        length = jnp.where(going & regular, energy / jnp.where(regular, curvature, 1), 0)[:, None]
-        x, r = x + length * p, r - length * product
-        z = precondition(r)
-        following = jnp.sum(r * z, axis=1)
-        error = jnp.where(regular, jnp.sqrt(jnp.abs(following) / first) / wanted, jnp.inf)
-        errors = jnp.where(going, error, errors)
-        p = z + (following / jnp.where(going, energy, 1))[:, None] * p
-        return _Iteration(x, r, p, following, errors, going & regular & (error > 1), steps + 1)
-
-    z = precondition(rhs)
-    first = jnp.sum(rhs * z, axis=1)
-    asked = jnp.isfinite(wanted)
-    start = _Iteration(jnp.zeros_like(rhs), rhs, z, first, jnp.where(asked, jnp.inf, 0), asked, jnp.zeros((), int))
-    end = jax.lax.while_loop(going_on, step, start)
-    return jnp.where((end.errors <= 1)[:, None], end.x, jnp.nan)
-
-
-def _beyond(values: Float[Array, " p"]) -> Float[Array, ""]:
-    """Return an estimate Λ of the first eigenvalue that is left."""
-    return jnp.where(values[-1] > 0, values[-1] * (1 + 1 / values.size), 1)
 
 
 def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> _Groups:

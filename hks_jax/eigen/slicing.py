@@ -17,6 +17,7 @@ from hks_jax.eigen.dissection import Dissection
 from hks_jax.eigen.lanczos import block_lanczos
 from hks_jax.eigen.multifrontal import Factorisation, factorise
 from hks_jax.eigen.quality import ROWS, indistinct, rayleigh_quotient, relative_defect
+from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 
 _GROWTH = 2e6
@@ -93,10 +94,7 @@ class State(NamedTuple):
 def first_state(pencil: Pencil, plan: Plan) -> State:
     """Return the state in which nothing is known, the first shift chosen by Weyl's law."""
     n, d, dtype = pencil.space.n_dof, pencil.space.dimension, pencil.stiffness.dtype
-    # Weyl's law counts (λ/4π)·area in 2D, λ^(3/2)/6π²·volume in 3D.
-    target = min(plan.wanted, plan.slice_size) / 2 + 1
-    constant = 4 * jnp.pi if d == 2 else (6 * jnp.pi**2) ** (2 / 3)
-    shift = constant * (target / pencil.volume) ** (2 / d)
+    shift = weyl(min(plan.wanted, plan.slice_size) / 2 + 1, pencil.volume, d)
     return State(
         values=jnp.full(plan.capacity, jnp.inf, dtype),
         vectors=jnp.zeros((plan.capacity, n), dtype),

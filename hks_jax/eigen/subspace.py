@@ -49,9 +49,8 @@ def rayleigh_ritz(
 
     def products(number: Array) -> tuple[Array, Array]:
         columns = block_of(x, number, block, level.shape)
-        # Rows in memory: XLA would fold the transposition into the products of matrices, and lose half their speed.
-        image, moved = jax.lax.optimization_barrier([to_rows(y) for y in _images(level, periodic, slabs, columns)])
-        return inner_products(x, image), inner_products(x, moved)
+        image, moved = _images(level, periodic, slabs, columns)
+        return inner_products(x, to_rows(image)), inner_products(x, to_rows(moved))
 
     stiffness, mass = (p.reshape(m, m) for p in total(slabs, jax.lax.map(products, jnp.arange(m // block))))
     factor = jnp.linalg.cholesky((mass + mass.T) / 2)

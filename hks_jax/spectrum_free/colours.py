@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.special import ive
 
 from hks_jax.domain.static_array import StaticArray
+from hks_jax.fem.colouring import axis_colours
 from hks_jax.fem.space import GridSpace
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
 
@@ -47,7 +48,7 @@ class Colouring:
     def colours(self, space: GridSpace) -> StaticArray:
         """Number the colours of the free nodes, int (*shape); −1 at the others."""
         axes = [
-            _axis_colours(n, s, wraps)
+            axis_colours(n, s, wraps)
             for n, s, wraps in zip(space.node_shape, self.spacing, space.periodic, strict=True)
         ]
         counts = [int(axis.max()) + 1 for axis in axes]
@@ -60,14 +61,6 @@ class Colouring:
     def n_vectors(self, space: GridSpace) -> int:
         """Count the colours."""
         return int(self.colours(space).value.max()) + 1
-
-
-def _axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
-    if not wraps:
-        return np.arange(n) % min(spacing, n)
-    # As many runs as fit, some a node longer than others: the first of one run is `spacing` or more after the last.
-    runs = max(n // spacing, 1)
-    return np.concatenate([np.arange(len(run)) for run in np.array_split(np.arange(n), runs)])
 
 
 def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:
