@@ -69,6 +69,11 @@ def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:
     return np.where(n == 0, 1, 2) * ive(n, z)
 
 
+def coefficient_tails(z: float) -> Float[np.ndarray, " n+1"]:
+    """Return the sums of their moduli from each n on, and 0 at the end."""
+    return np.append(np.cumsum(coefficient_sizes(z)[::-1])[::-1], 0)
+
+
 def reach_bound(distance: Any, reach_time: Any, lumped: bool) -> Any:
     """Bound √(D_x D_y) times the kernel between nodes ``distance`` apart along an axis.
 
@@ -101,9 +106,8 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
     degree does not reach there (lumped mass).
     """
     lumped = float(limits.low) == 1
-    sizes = coefficient_sizes(time * float(limits.top) / 2)
-    tails = np.append(np.cumsum(sizes[::-1])[::-1], 0)  # tails[n]: the terms n, n + 1, …
-    beyond = float(tails[min(degree + 1, sizes.size)])
+    tails = coefficient_tails(time * float(limits.top) / 2)
+    beyond = float(tails[min(degree + 1, tails.size - 1)])
     d = space.dimension
     steps = [_steps(n, s, wraps) for n, s, wraps in zip(space.node_shape, spacing, space.periodic, strict=True)]
     decay = np.stack(
@@ -121,7 +125,7 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
         away = np.stack(
             np.meshgrid(*[np.arange(k) * s for k, s in zip(steps, spacing, strict=True)], indexing="ij")
         ).max(axis=0)
-        within = np.where(away <= degree, tails[np.minimum(away, sizes.size)], 0)
+        within = np.where(away <= degree, tails[np.minimum(away, tails.size - 1)], 0)
         decay = np.minimum(decay, within)
     decay[(0,) * d] = 0
     total = beyond / float(limits.low) + float(np.sum(copies * decay))
@@ -173,8 +177,7 @@ def choose(
     tolerance -= max(of_mass)
     for time in times:
         allowed = tolerance * kernel_scale(time, limits, d) * float(limits.least_mass) / 2
-        sizes = coefficient_sizes(time * float(limits.top) / 2)
-        tails = np.append(np.cumsum(sizes[::-1])[::-1], 0)
+        tails = coefficient_tails(time * float(limits.top) / 2)
         # It counts once at every source that the expansion reaches: the node itself and its neighbours of one colour.
         here = int(np.argmax(tails <= 0.1 / 3**d * allowed * float(limits.low))) - 1
         degree = max(degree, here)
@@ -216,8 +219,7 @@ def choose(
 
 def _least_degree(time: float, limits: Bounds, space: GridSpace, tolerance: float) -> int:
     allowed = tolerance * kernel_scale(time, limits, space.dimension) * float(limits.least_mass)
-    sizes = coefficient_sizes(time * float(limits.top) / 2)
-    tails = np.append(np.cumsum(sizes[::-1])[::-1], 0)
+    tails = coefficient_tails(time * float(limits.top) / 2)
     return max(int(np.argmax(tails <= allowed)) - 1, 1)
 
 
