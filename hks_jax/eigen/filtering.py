@@ -182,8 +182,9 @@ def _improve(
         moved = jnp.where(inside, low * level.lumped[..., None] * x, moved)
         residual = stencil_product(level.stiffness, x, periodic) - moved
         z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number], sharp)
-        x = x + jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
-        return jax.lax.dynamic_update_slice_in_dim(vectors, to_rows(x), own * plan.block, axis=0)
+        z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
+        rows = jax.lax.dynamic_slice_in_dim(vectors, own * plan.block, plan.block) + to_rows(z)
+        return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * plan.block, axis=0)
 
     def step(own: Array, vectors: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
         return jax.lax.cond(degrees[numbers[own]] > 0, filtered, lambda _, unchanged: unchanged, own, vectors)
