@@ -26,10 +26,16 @@ def timed_from_cold(function: Callable[..., Any], *args: Any, repeats: int) -> t
     times, result = [], None
     for _ in range(1 + repeats):
         result = None  # not to hold two at once
-        start = time.perf_counter()
-        result = jax.block_until_ready(function(*args))
-        times.append(time.perf_counter() - start)
+        seconds, result = timed_once(function, *args)
+        times.append(seconds)
     return times[0], min(times[1:]), result
+
+
+def timed_once(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:
+    """Return the time of one call, whatever it compiles included, and its result."""
+    start = time.perf_counter()
+    result = jax.block_until_ready(function(*args))
+    return time.perf_counter() - start, result
 
 
 def field(n: int, d: int = 2) -> hj.TensorField:

@@ -4,7 +4,8 @@
 
 Every measurement is a process of its own, so that its peak memory is its own too; one that takes longer than the limit,
 or more memory than there is, is reported as such. Timed is the eigensolver alone, from assembled matrices to
-eigenpairs, compilation apart (the second call; of `eigsh` the first). The residual is ‖Kφ − λMφ‖/‖Mφ‖/max(λ, λ₁).
+eigenpairs, compilation apart (the second call, where the first takes under four minutes). The residual is
+‖Kφ − λMφ‖/‖Mφ‖/max(λ, λ₁).
 """
 
 import argparse
@@ -28,7 +29,7 @@ def measure_here(name: str, n: int, k: int, memory: float) -> None:
 
     jax.config.update("jax_enable_x64", True)
     from eigensolvers import peak_memory
-    from machine import field, timed_from_cold
+    from machine import field, timed_once
 
     import hks_jax as hj
 
@@ -38,8 +39,10 @@ def measure_here(name: str, n: int, k: int, memory: float) -> None:
         values, vectors, found = eigsh(pencil.stiffness.to_scipy(), pencil.mass.to_scipy(), k)
     else:
         solver = {"chebyshev-filter": hj.ChebyshevFilter, "block-lanczos": hj.BlockLanczos}[name](tolerance=TOLERANCE)
-        first, seconds, (values, vectors, _) = timed_from_cold(solver.lowest, pencil, k, repeats=1)
-        found = {"seconds": seconds, "first_call_s": first}
+        first, (values, vectors, _) = timed_once(solver.lowest, pencil, k)
+        found = {"seconds": first, "first_call_s": first}
+        if first < 240:
+            found["seconds"], (values, vectors, _) = timed_once(solver.lowest, pencil, k)
     found["peak_GB"] = peak_memory()
     values, vectors = np.asarray(values), np.asarray(vectors)
     worst = 0.0
@@ -83,7 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", default=CASES, metavar="N/K", help="N³ nodes, K pairs")
     parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=SOLVERS)
-    parser.add_argument("--limit", type=float, default=1800.0, help="seconds for one measurement")
+    parser.add_argument("--limit", type=float, default=1200.0, help="seconds for one measurement")
     parser.add_argument("--memory", type=float, default=12.0, help="GB that eigsh may take")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--here", nargs=4, help=argparse.SUPPRESS)

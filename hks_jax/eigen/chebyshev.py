@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.eigen.coarsening import Level
-from hks_jax.fem.columns import stencil_product
+from hks_jax.fem.columns import stencil, stencil_product
 
 _STEPS = 16
 """Lanczos steps for the upper end of the spectrum."""
@@ -61,13 +61,13 @@ def correction(
     """
     dtype = residual.dtype
     centre, half = (band.high + band.low) / 2, (band.high - band.low) / 2
-    stiffness = (level.stiffness / level.lumped).astype(dtype)
-    mass = (level.mass / level.lumped).astype(dtype)
+    stiffness = stencil((level.stiffness / level.lumped).astype(dtype), periodic)
+    mass = stencil((level.mass / level.lumped).astype(dtype), periodic)
 
     def sharpened(y: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-        if mass.shape[0] == 1:
+        if level.mass.shape[0] == 1:
             return y
-        return jax.lax.cond(sharp, lambda: 2 * y - stencil_product(mass, y, periodic), lambda: y)
+        return jax.lax.cond(sharp, lambda: 2 * y - mass(y), lambda: y)
 
     w = sharpened(residual / level.lumped[..., None].astype(dtype))
     s = (jnp.minimum(value, band.low) - centre) / half
@@ -75,7 +75,7 @@ def correction(
     def step(_: Int[Array, ""], state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         before, z, ratio = state
         following = 1 / (2 * s - ratio)
-        grown = sharpened(stencil_product(stiffness, z, periodic)) - centre.astype(dtype) * z + w
+        grown = sharpened(stiffness(z)) - centre.astype(dtype) * z + w
         after = (2 * following / half).astype(dtype) * grown - (following * ratio).astype(dtype) * before
         return z, after, following
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from hks_jax.eigen.coarsening import Level
 from hks_jax.eigen.products import combine
 from hks_jax.eigen.sharing import first_of, total
-from hks_jax.fem.columns import product_with_rim, stencil_product, to_columns
+from hks_jax.fem.columns import product_with_rim, side_by_side, stencil_product, to_columns
 from hks_jax.fem.halo import Slabs
 
 _CHUNK = 1 << 14
@@ -49,7 +49,7 @@ def rayleigh_ritz(
 
     def products(number: Array) -> tuple[Array, ...]:
         images = _images(level, periodic, slabs, block_of(x, number, block, level.shape))
-        # As columns: turned into rows first, XLA would compute the stencils in the order of the rows, seven times slower.
+        # As columns: were they turned into rows, XLA would compute the stencils in that order, seven times slower.
         return tuple(combine(x, image.reshape(nodes, block)) for image in images)
 
     found = total(slabs, jax.lax.map(products, jnp.arange(m // block)))
@@ -103,5 +103,5 @@ def _images(
         return stencil_product(level.stiffness, columns, periodic), stencil_product(level.mass, columns, periodic)
     rimmed = slabs.with_halo(columns)
     diagonal = level.mass.shape[0] == 1
-    moved = level.mass[0][..., None] * columns if diagonal else product_with_rim(level.mass, rimmed)
-    return product_with_rim(level.stiffness, rimmed), moved
+    moved = level.mass[0][..., None] * columns if diagonal else product_with_rim(side_by_side(level.mass), rimmed)
+    return product_with_rim(side_by_side(level.stiffness), rimmed), moved

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from hks_jax.fem.columns import product_with_rim, with_rim
+from hks_jax.fem.columns import product_with_rim, side_by_side, with_rim
 from hks_jax.traced import is_traced
 
 
@@ -114,7 +114,7 @@ class Slabs:
         """Return the product on this device's slab."""
         if coefficients.shape[0] == 1:
             return coefficients[0][..., None] * x
-        return product_with_rim(coefficients, self.with_halo(x))
+        return product_with_rim(side_by_side(coefficients), self.with_halo(x))
 
     def with_halo(self, x: Float[Array, "*slab b"]) -> Float[Array, "*rimmed b"]:
         """Return the slab with the neighbours' adjacent planes, and its rim along the other axes."""

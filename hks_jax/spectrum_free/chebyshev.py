@@ -54,12 +54,13 @@ def coloured_diagonal(
         def step(n: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             y, before, total = state
             total = total + _outer(coefficients[:, n], sources, y)
-            return _twice(n, y.dtype) * _scaled(top, operator.apply(y), y) - before, y, total
+            return _twice(n, y.dtype) * _scaled(top, products.apply(y), y) - before, y, total
 
-        y = operator.solve_mass(sources)
+        y = products.solve_mass(sources)
         y, _, total = jax.lax.fori_loop(0, degree, step, (y, jnp.zeros_like(y), total))
         return total + _outer(coefficients[:, degree], sources, y)
 
+    products = operator.products()
     degree = coefficients.shape[1] - 1
     start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
     return jax.lax.fori_loop(0, _blocks(colours, columns), block, start)
@@ -97,6 +98,8 @@ def _tangent(
 ) -> Float[Array, "m *shape"]:
     d_stiffness, d_mass, d_coefficients = moved
     degree = coefficients.shape[1] - 1
+    products = operator.products()
+    change_of = products.changed_by(d_stiffness, d_mass)
 
     def block(number: Array, total: Array) -> Array:
         sources = _sources(colours, columns, number, total.dtype)
@@ -107,16 +110,16 @@ def _tangent(
         def step(n: Array, state: tuple) -> tuple:
             y, before, dy, d_before, total = state
             total = total + read(n, y, dy)
-            image = operator.apply(y)
-            change = operator.moved(d_stiffness, d_mass, y, image) + operator.apply_stiffness(dy)
+            image = products.apply(y)
+            change = change_of(y, image) + products.apply_stiffness(dy)
             factor = _twice(n, y.dtype)
             following = factor * _scaled(top, image, y) - before
-            d_following = factor * _scaled(top, operator.solve_mass(change), dy) - d_before
+            d_following = factor * _scaled(top, products.solve_mass(change), dy) - d_before
             return following, y, d_following, dy, total
 
-        y = operator.solve_mass(sources)
+        y = products.solve_mass(sources)
         zero = jnp.zeros_like(y)
-        dy = operator.solve_mass(operator.moved(jnp.zeros_like(d_stiffness), d_mass, zero, y))
+        dy = products.solve_mass(change_of(zero, y))
         y, _, dy, _, total = jax.lax.fori_loop(0, degree, step, (y, zero, dy, zero, total))
         return total + read(degree, y, dy)
 
@@ -128,14 +131,14 @@ def _cotangent(
     top: float, columns: int, colours: StaticArray, operator: HeatOperator, coefficients: Array, g: Array
 ) -> tuple[Array, Array, Array]:
     degree = coefficients.shape[1] - 1
-    periodic = operator.space.periodic
+    products = operator.products()
 
     def block(number: Array, total: tuple) -> tuple:
         sources = _sources(colours, columns, number, g.dtype)
 
         def up(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             y, before = state
-            return _twice(n, y.dtype) * _scaled(top, operator.apply(y), y) - before, y
+            return _twice(n, y.dtype) * _scaled(top, products.apply(y), y) - before, y
 
         def read(y: Array) -> Array:
             return _contract(g, jnp.sum(sources * y, axis=-1))
@@ -147,23 +150,23 @@ def _cotangent(
             y, after, p, p_after, (of_stiffness, of_mass, of_coefficients) = state
             n = degree - 1 - i
             factor = _twice(n, y.dtype)
-            image = operator.apply(y)
+            image = products.apply(y)
             weighted = (2 * factor / top) * p
-            of_stiffness = of_stiffness + stencil_outer(weighted, y, periodic)
-            of_mass = of_mass - operator.outer_mass(weighted, image)
+            of_stiffness = of_stiffness + stencil_outer(weighted, y, products.periodic)
+            of_mass = of_mass - products.outer_mass(weighted, image)
             of_coefficients = of_coefficients.at[:, n].add(read(y))
-            following = operator.solve_mass(source(n) + operator.apply_stiffness(weighted)) - factor * p - p_after
+            following = products.solve_mass(source(n) + products.apply_stiffness(weighted)) - factor * p - p_after
             total = of_stiffness, of_mass, of_coefficients
             return factor * _scaled(top, image, y) - after, y, following, p, total
 
-        y = operator.solve_mass(sources)
+        y = products.solve_mass(sources)
         after, y = jax.lax.fori_loop(0, degree, up, (y, jnp.zeros_like(y)))
         of_stiffness, of_mass, of_coefficients = total
         total = of_stiffness, of_mass, of_coefficients.at[:, degree].add(read(after))
-        p = operator.solve_mass(source(degree))
+        p = products.solve_mass(source(degree))
         state = jax.lax.fori_loop(0, degree, down, (y, after, p, jnp.zeros_like(p), total))
         _, y, p, _, (of_stiffness, of_mass, of_coefficients) = state
-        return of_stiffness, of_mass - operator.outer_mass(p, y), of_coefficients
+        return of_stiffness, of_mass - products.outer_mass(p, y), of_coefficients
 
     zeros = jax.tree.map(jnp.zeros_like, (operator.stiffness, operator.mass, coefficients))
     return jax.lax.fori_loop(0, _blocks(colours, columns), block, zeros)

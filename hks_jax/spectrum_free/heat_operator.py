@@ -1,11 +1,13 @@
 """A grid's pencil as what polynomials in M⁻¹K need: K, M, and M⁻¹ as a fixed polynomial."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hks_jax.fem.columns import stencil_outer, stencil_product
+from hks_jax.fem.columns import stencil, stencil_outer
 from hks_jax.fem.operators import DiagonalOperator, StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
@@ -39,23 +41,29 @@ class HeatOperator(eqx.Module):
         """Whether the mass is diagonal."""
         return self.mass.ndim == self.space.dimension
 
-    def apply_stiffness(self, x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-        """Return Kx."""
-        return stencil_product(self.stiffness, x, self.space.periodic)
+    def products(self) -> "HeatProducts":
+        """Return the products: to be called outside the loop that they are for."""
+        return HeatProducts(self)
 
-    def apply_mass(self, x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-        """Return Mx."""
-        return self._multiply(self.mass, x)
 
-    def _multiply(self, mass: Array, x: Array) -> Array:
-        return mass[..., None] * x if self.lumped else stencil_product(mass, x, self.space.periodic)
+class HeatProducts:
+    """What polynomials are made of: K, M, P and PK times nodal columns, their stencils made ready once."""
+
+    def __init__(self, operator: HeatOperator) -> None:
+        self.operator = operator
+        self.periodic = operator.space.periodic
+        self.apply_stiffness = stencil(operator.stiffness, self.periodic)
+        self.apply_mass = self._mass(operator.mass)
+
+    def _mass(self, mass: Array) -> Callable[[Array], Array]:
+        return (lambda x: mass[..., None] * x) if self.operator.lumped else stencil(mass, self.periodic)
 
     def solve_mass(self, r: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
         """Return Pr."""
-        scaled = self.inverse_row_sums[..., None]
-        if self.lumped:
+        scaled, low = self.operator.inverse_row_sums[..., None], self.operator.low
+        if self.operator.lumped:
             return scaled * r
-        middle, half = (1 + self.low) / 2, (1 - self.low) / 2
+        middle, half = (1 + low) / 2, (1 - low) / 2
 
         def step(_: int, state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             x, r, update, ratio = state
@@ -65,19 +73,20 @@ class HeatOperator(eqx.Module):
             return x + update, r, update, following
 
         first = scaled * r / middle
-        return jax.lax.fori_loop(1, self.mass_degree, step, (first, r, first, half / middle))[0]
+        return jax.lax.fori_loop(1, self.operator.mass_degree, step, (first, r, first, half / middle))[0]
 
     def apply(self, x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
         """Return PKx ≈ M⁻¹Kx."""
         return self.solve_mass(self.apply_stiffness(x))
 
-    def moved(self, d_stiffness: Array, d_mass: Array, x: Array, image: Array) -> Array:
-        """Return dK x − dM y: with y = M⁻¹Kx, M⁻¹ times it is the change of y."""
-        return stencil_product(d_stiffness, x, self.space.periodic) - self._multiply(d_mass, image)
+    def changed_by(self, d_stiffness: Array, d_mass: Array) -> Callable[[Array, Array], Array]:
+        """Return (x, y) ↦ dK x − dM y: with y = M⁻¹Kx, M⁻¹ times it is the change of y."""
+        stiffness, mass = stencil(d_stiffness, self.periodic), self._mass(d_mass)
+        return lambda x, y: stiffness(x) - mass(y)
 
     def outer_mass(self, p: Array, x: Array) -> Array:
         """Return the derivative of Σ_b pᵀMx by the entries of M."""
-        return jnp.sum(p * x, axis=-1) if self.lumped else stencil_outer(p, x, self.space.periodic)
+        return jnp.sum(p * x, axis=-1) if self.operator.lumped else stencil_outer(p, x, self.periodic)
 
 
 def heat_operator(pencil: Pencil, low: Float[Array, ""] | float = 1.0, mass_degree: int = 1) -> HeatOperator:

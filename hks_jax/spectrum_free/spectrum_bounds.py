@@ -49,8 +49,10 @@ def mass_bound(pencil: Pencil) -> Float[Array, ""]:
     scaled = operator.inverse_row_sums[..., None]
     sums = jnp.where(scaled > 0, 1 / jnp.where(scaled > 0, scaled, 1), 0)
 
+    products = operator.products()
+
     def rest(x: Array) -> Array:
-        return sums * x - operator.apply_mass(x)
+        return sums * x - products.apply_mass(x)
 
     greatest = _largest(rest, lambda r: scaled * r, sums, pencil.space.n_dof, _MASS_STEPS)
     return jnp.clip(1 - greatest, 1e-3, 0.9)
@@ -66,7 +68,8 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     inverse = operator.inverse_row_sums
     d, free = pencil.space.dimension, pencil.space.free
     sums = jnp.where(free, 1 / jnp.where(free, inverse, 1), 0)
-    top = _largest(operator.apply_stiffness, operator.solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
+    products = operator.products()
+    top = _largest(products.apply_stiffness, products.solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
     sizes = jnp.abs(operator.stiffness) * inverse
     if operator.lumped:
         top = jnp.minimum(top, jnp.max(jnp.sum(sizes, axis=0)))
