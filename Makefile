@@ -43,8 +43,9 @@ notebooks: $(STAMPS)/dti $(STAMPS)/brain
 	    echo "$$notebook"; MPLBACKEND=Agg $(BIN)/python "$$notebook"; \
 	done
 
+# Not --quiet: what is not printed is not counted, and the build would pass with broken links.
 docs: $(STAMPS)/docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) demo site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -8,7 +8,7 @@ from functools import cache
 @cache
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """Return the parser of every command."""
-    os.environ["COLUMNS"] = "110"  # argparse wraps its help to it
+    os.environ["COLUMNS"] = "90"  # argparse wraps its help to it
     from hks_jax.cli import build_parser
 
     (subparsers,) = (a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction))
