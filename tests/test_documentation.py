@@ -19,8 +19,11 @@ def facade(module=""):
 
 
 def documented():
+    """Return the headings of the reference with what is shown under them."""
     pages = sorted((ROOT / "docs" / "reference").glob("*.md"))
-    return re.findall(r"^::: (\S+)$", "\n".join(page.read_text(encoding="utf-8") for page in pages), re.MULTILINE)
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    entries = re.findall(r"^::: (\S+)(?:\n    options: \{heading: (\S+)\})?$", text, re.MULTILINE)
+    return [(heading or name, name) for name, heading in entries]
 
 
 def test_the_reference_has_every_public_name_once():
@@ -29,13 +32,19 @@ def test_the_reference_has_every_public_name_once():
         assert getattr(hj, module)  # imported when asked for, so not in the façade
         names += [f"hks_jax.{module}.{name}" for name in facade(module)]
     assert len(names) > 80
-    assert sorted(documented()) == sorted([*names, "hks_jax.domain.examples"])
+    assert sorted(name for name, _ in documented()) == sorted([*names, "hks_jax.examples"])
+
+
+def test_the_reference_shows_functions_and_not_the_modules_of_the_same_name():
+    for heading, shown in documented():
+        if heading != "hks_jax.examples":
+            assert not (ROOT / shown.replace(".", "/")).with_suffix(".py").exists(), f"{heading}: {shown} is a module"
 
 
 @pytest.mark.parametrize("name", ["fit_metric", "identifiability"])
 def test_what_is_imported_when_asked_for_is_in_the_reference(name):
     assert getattr(hj, name) is getattr(hj.inverse, name)
-    assert f"hks_jax.inverse.{name}" in documented()
+    assert f"hks_jax.inverse.{name}" in dict(documented())
 
 
 def test_every_page_is_in_the_navigation():

@@ -1,6 +1,5 @@
 """A Markdown extension: code that is a public name, as `eigenpairs` or `hj.eigenpairs`, links to its reference."""
 
-import ast
 import re
 from functools import cache
 from pathlib import Path
@@ -10,38 +9,32 @@ from markdown import Markdown
 from markdown.extensions import Extension
 from markdown.treeprocessors import Treeprocessor
 
-PACKAGE = Path(__file__).parents[2] / "hks_jax"
 REFERENCE = Path(__file__).parents[1] / "reference"
 
 
-def public_names(module: str = "") -> list[str]:
-    """Return what a module gives to its users: what its façade imports as itself."""
-    tree = ast.parse((PACKAGE / module / "__init__.py").read_text(encoding="utf-8"))
-    imports = (alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names)
-    return [alias.name for alias in imports if alias.asname == alias.name]
+def documented() -> dict[str, str]:
+    """Return the names that the reference documents, ``hks_jax.Grid``, with what mkdocstrings calls them there.
 
-
-def documented() -> list[str]:
-    """Return what the reference documents, as it writes it: ``hks_jax.Grid``."""
-    pages = sorted(REFERENCE.glob("*.md"))
-    return [
-        name for page in pages for name in re.findall(r"^::: (\S+)", page.read_text(encoding="utf-8"), re.MULTILINE)
-    ]
+    The two differ where a module has the name of its function, which mkdocstrings would take for the module.
+    """
+    entry = re.compile(r"^::: (\S+)(?:\n    options: \{heading: (\S+)\})?$", re.MULTILINE)
+    texts = [page.read_text(encoding="utf-8") for page in sorted(REFERENCE.glob("*.md"))]
+    return {heading or identifier: identifier for text in texts for identifier, heading in entry.findall(text)}
 
 
 @cache
 def links() -> dict[str, str]:
     """Return the places in the reference of what one may write in the text."""
     found = {}
-    for name in documented():
+    for name, identifier in documented().items():
         module, _, short = name.removeprefix("hks_jax.").rpartition(".")
         written = {name, f"hj.{name.removeprefix('hks_jax.')}"}
-        if module in ("", "domain", "inverse"):
+        if module in ("", "inverse"):
             written |= {short, f"hj.{short}"}
         elif module == "plot" and "_" in short:  # others are everyday words
             written |= {short}
         # The package's own names first: `degenerate_points` is a picture as well.
-        found |= {text: name for text in written if module == "" or text not in found}
+        found |= {text: identifier for text in written if module == "" or text not in found}
     return found
 
 

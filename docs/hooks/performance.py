@@ -109,6 +109,8 @@ def text(value: Any, column: str = "") -> str:
         if value and abs(value) < 1e-2:
             return re.sub(r"e-0?", "e-", f"{value:.2g}" if abs(value) > 1e-3 else f"{value:.1e}").replace(".0e", "e")
         return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+    if isinstance(value, int):
+        return f"{value:,}"
     if isinstance(value, list):
         return " × ".join(text(v) for v in value)
     return str(value)
