@@ -205,6 +205,21 @@ def volume() -> Figure:
     return plot.volume_panels(hj.hks(pairs, times), times, grid, node=(15, 14, 10))
 
 
+def surfaces() -> Figure:
+    """Surfaces of equal value in a volume, rendered by PyVista (`pip install "hks-jax[pyvista]"`)."""
+    n = 24
+    grid = hj.Grid((n, n, n), 2 / n, -1.0)
+    x, y, z = np.moveaxis(np.pi * grid.nodes, -1, 0)
+    factor = np.exp(0.8 * (np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)))
+    field = hj.TensorField(grid, factor[..., None, None] * np.eye(3))
+    (values,) = hj.hks(hj.eigenpairs(field, 120, "periodic", multiplet="drop"), [0.2])
+    figure = plot.new_figure(4.8, 3.8)
+    ax = figure.subplots()
+    mappable = plot.isosurfaces(ax, values, grid, levels=2, opacity=0.6)
+    figure.colorbar(mappable, ax=ax, label="HKS at $t$ = 0.2", shrink=0.7)
+    return figure
+
+
 def torus() -> Figure:
     """A surface, coloured by its signature."""
     mesh = hj.examples.bumpy_torus_mesh(90)
@@ -227,6 +242,7 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
     "The boundary's influence": influence,
     "Beside Gaussian smoothing and heat flow": rows,
     "Volumes": volume,
+    "Surfaces of equal value": surfaces,
     "Sensitivity": derivative,
     "Fits": fit,
     "Surfaces": torus,

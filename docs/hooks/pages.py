@@ -105,10 +105,10 @@ def turned(markdown: str, page: str, places: dict[str, str]) -> str:
         target = posixpath.normpath(posixpath.join(folder, link[1]))
         if target.startswith("docs/"):
             place = target.removeprefix("docs/")
-        elif target in places:
+        elif places.get(target, page) != page:
             place = places[target]
         else:
-            return link[1]  # mkdocs will say that it leads nowhere
+            return link[1]  # from a notebook's page to its file; or nowhere, as mkdocs will say
         return posixpath.relpath(place, posixpath.dirname(page) or ".")
 
     return LINK.sub(turn, markdown)
