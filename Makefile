@@ -5,6 +5,7 @@
 #   make test-slow   the tests that take minutes
 #   make lint        lint, format and type checks
 #   make notebooks   run every notebook
+#   make docs        the documentation site, in site/
 #   make clean       remove what the above made
 
 PYTHON ?= python3
@@ -19,7 +20,7 @@ BIN := $(VENV)/bin
 STAMPS := $(VENV)/.stamps
 BRAIN := mdt==1.2.7
 
-.PHONY: demo test test-slow lint notebooks clean
+.PHONY: demo test test-slow lint notebooks docs clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMPS)/dti $(STAMPS)/brain
@@ -42,8 +43,12 @@ notebooks: $(STAMPS)/dti $(STAMPS)/brain
 	    echo "$$notebook"; MPLBACKEND=Agg $(BIN)/python "$$notebook"; \
 	done
 
+# Not --quiet: what is not printed is not counted, and the build would pass with broken links.
+docs: $(STAMPS)/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) demo site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(STAMPS)/venv:
@@ -54,8 +59,8 @@ $(STAMPS)/venv:
 	$(PYTHON) -m venv $(VENV)
 	@mkdir -p $(STAMPS) && touch $@
 
-# One extra of pyproject.toml each: dti, test, lint.
-$(STAMPS)/dti $(STAMPS)/test $(STAMPS)/lint: $(STAMPS)/%: pyproject.toml $(STAMPS)/venv
+# One extra of pyproject.toml each: dti, test, lint, docs.
+$(STAMPS)/dti $(STAMPS)/test $(STAMPS)/lint $(STAMPS)/docs: $(STAMPS)/%: pyproject.toml $(STAMPS)/venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$*]"
 	@touch $@
 

@@ -193,13 +193,31 @@ def fit() -> Figure:
 
 
 def volume() -> Figure:
-    """A volume over t, as three orthogonal slices; `orthogonal_slices` draws them on axes of yours."""
-    grid = hj.Grid.from_bounds(-1.0, 1.0, shape=(17, 17, 17))
-    bump = 1 + 8 * np.exp(-8 * np.sum((grid.nodes - [0.3, -0.2, 0.1]) ** 2, axis=-1))
-    field = hj.TensorField(grid, bump[..., None, None] * np.eye(3))
-    times = [0.05, 0.2, 0.8]
-    values = hj.hks(hj.eigenpairs(field, 200, solver="dense", multiplet="drop"), times)
-    return plot.volume_panels(values, times, grid, quantiles=(0.01, 0.99))
+    """A volume over t, as three orthogonal slices: first the narrow hill of the metric shows, then the wide one."""
+    n = 20
+    grid = hj.Grid((n, n, n), 2 / n, -1.0)
+    factor = np.ones(grid.shape)
+    for centre, sharpness in (([0.5, 0.4, 0.0], 6), ([-0.4, -0.4, 0.0], 1)):
+        factor += 3 * np.exp(sharpness * np.sum(np.cos(np.pi * (grid.nodes - centre)) - 1, axis=-1))
+    field = hj.TensorField(grid, factor[..., None, None] * np.eye(3))
+    pairs = hj.eigenpairs(field, 200, "periodic", "shift-invert", multiplet="drop")  # no side, no boundary effect
+    times = [0.06, 0.2, 0.6]
+    return plot.volume_panels(hj.hks(pairs, times), times, grid, node=(15, 14, 10))
+
+
+def surfaces() -> Figure:
+    """Surfaces of equal value in a volume, rendered by PyVista (`pip install "hks-jax[pyvista]"`)."""
+    n = 24
+    grid = hj.Grid((n, n, n), 2 / n, -1.0)
+    x, y, z = np.moveaxis(np.pi * grid.nodes, -1, 0)
+    factor = np.exp(0.8 * (np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)))
+    field = hj.TensorField(grid, factor[..., None, None] * np.eye(3))
+    (values,) = hj.hks(hj.eigenpairs(field, 120, "periodic", multiplet="drop"), [0.2])
+    figure = plot.new_figure(4.8, 3.8)
+    ax = figure.subplots()
+    mappable = plot.isosurfaces(ax, values, grid, levels=2, opacity=0.6)
+    figure.colorbar(mappable, ax=ax, label="HKS at $t$ = 0.2", shrink=0.7)
+    return figure
 
 
 def torus() -> Figure:
@@ -224,6 +242,7 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
     "The boundary's influence": influence,
     "Beside Gaussian smoothing and heat flow": rows,
     "Volumes": volume,
+    "Surfaces of equal value": surfaces,
     "Sensitivity": derivative,
     "Fits": fit,
     "Surfaces": torus,

@@ -15,6 +15,7 @@ from hks_jax.plot.figure import save_figure as save_figure
 from hks_jax.plot.fit import fit_panels as fit_panels
 from hks_jax.plot.images import hks_panels as hks_panels
 from hks_jax.plot.images import scalar_image as scalar_image
+from hks_jax.plot.isosurfaces import isosurfaces as isosurfaces
 from hks_jax.plot.lines import integral_lines as integral_lines
 from hks_jax.plot.rows import influence_map as influence_map
 from hks_jax.plot.rows import time_rows as time_rows

@@ -126,7 +126,7 @@ def volume_panels(
     Raises:
         ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
     """
-    _require_volume(grid)
+    require_volume(grid)
     t, titles = panel_titles(values, times, grid, titles, unit)
     volumes = [_volume(v, grid) for v in np.asarray(values)]
     if limits is None:
@@ -185,11 +185,12 @@ def _heights(grid: Grid) -> list[float]:
 
 
 def _volume(values: Any, grid: Grid) -> np.ma.MaskedArray:
-    _require_volume(grid)
+    require_volume(grid)
     return masked("values", values, grid)
 
 
-def _require_volume(grid: Grid) -> None:
+def require_volume(grid: Grid) -> None:
+    """Raise if a grid is not three-dimensional."""
     if grid.dimension != 3:
         raise ValueError(
             f"grid: got shape {grid.shape}; expected a grid of three dimensions. Use hks_panels in the plane"
