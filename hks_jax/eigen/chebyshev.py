@@ -1,11 +1,12 @@
 """Chebyshev polynomials of a pencil that damp the upper part of its spectrum."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.coarsening import Level
 from hks_jax.fem.columns import stencil, stencil_product
@@ -36,8 +37,10 @@ class Band(NamedTuple):
 #     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · λ/ζ + ….
 #
 # Where the mesh is coarse in one direction only, β depends on the direction of a mode as well, and near the edge of the
-# band the order by βμ may not be that by μ. Then one more term of Neumann's series, W = D⁻¹ + (I − D⁻¹M)D⁻¹, takes the
-# place of D⁻¹: βμ becomes (1 − (1 − β)²)μ, at most twice as large, and the scale 1 − 2(1 − β)².
+# band the order by βμ may not be that by μ; where it is coarse for the wanted modes altogether, modes of many times
+# their eigenvalues, β ≈ 3⁻ᵈ, come before them. Then W = Σⱼ (I − D⁻¹M)ʲ D⁻¹, n more terms of Neumann's series, takes
+# the place of D⁻¹: βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large, and as dψ/dμ = 1 − (n + 2)(1 − β)ⁿ⁺¹
+# the scale ζ/λ becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
 #
 # With the three-term recurrence of p in s(z) = (z − c)/e, c and e the band's centre and half width, and z_j = q_j w,
 # w = D⁻¹r, everything divided by p_j(ζ), whose ratios are σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}):
@@ -53,34 +56,42 @@ def correction(
     residual: Float[Array, "*shape b"],
     value: Float[Array, " b"],
     degree: Int[Array, ""],
-    sharp: Bool[Array, ""] | bool = False,
+    whole: Float[Array, "*shape b"] | float = 0.0,
+    terms: Int[Array, ""] | int = 0,
 ) -> Float[Array, "*shape b"]:
     """Return q(D⁻¹K) D⁻¹ residual with the polynomial that belongs to ``value`` ζ (at most the band's low end).
 
-    With ``sharp``, W in place of D⁻¹; value and band are then those of WK.
+    With ``terms`` n > 0, W in place of D⁻¹; value and band are then those of WK. Where a column of ``whole`` is not
+    zero it is x, the residual's is Kx, and p(D⁻¹K)/p(ζ) damps x as it is: D⁻¹Kx − ζx takes the place of D⁻¹r.
     """
     dtype = residual.dtype
     centre, half = (band.high + band.low) / 2, (band.high - band.low) / 2
     stiffness = stencil((level.stiffness / level.lumped).astype(dtype), periodic)
     mass = stencil((level.mass / level.lumped).astype(dtype), periodic)
 
-    def sharpened(y: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
+    def further(y: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
         if level.mass.shape[0] == 1:
             return y
-        return jax.lax.cond(sharp, lambda: 2 * y - mass(y), lambda: y)
+        return jax.lax.fori_loop(0, terms, lambda _, sum_: y + (sum_ - mass(sum_)), y)
 
-    w = sharpened(residual / level.lumped[..., None].astype(dtype))
-    s = (jnp.minimum(value, band.low) - centre) / half
+    reference = jnp.minimum(value, band.low)
+    s = (reference - centre) / half
 
-    def step(_: Int[Array, ""], state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        before, z, ratio = state
-        following = 1 / (2 * s - ratio)
-        grown = sharpened(stiffness(z)) - centre.astype(dtype) * z + w
-        after = (2 * following / half).astype(dtype) * grown - (following * ratio).astype(dtype) * before
-        return z, after, following
+    def run(inverse: Callable[[Array], Array]) -> Float[Array, "*shape b"]:
+        w = inverse(residual / level.lumped[..., None].astype(dtype)) - reference.astype(dtype) * whole
 
-    first = jnp.zeros_like(w), (1 / (s * half)).astype(dtype) * w, 1 / s
-    return jax.lax.fori_loop(1, degree, step, first)[1]
+        def step(_: Int[Array, ""], state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            before, z, ratio = state
+            following = 1 / (2 * s - ratio)
+            grown = inverse(stiffness(z)) - centre.astype(dtype) * z + w
+            after = (2 * following / half).astype(dtype) * grown - (following * ratio).astype(dtype) * before
+            return z, after, following
+
+        first = jnp.zeros_like(w), (1 / (s * half)).astype(dtype) * w, 1 / s
+        return jax.lax.fori_loop(1, degree, step, first)[1]
+
+    # Apart, so that without further terms all of a step is one computation.
+    return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
 
 
 def degree_for(band: Band, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:

@@ -21,8 +21,13 @@ _GAIN = 40.0
 _SPREAD = 1e5
 """How much more than a mode at the edge of the band the lowest may grow: beyond it, rounding does."""
 _LEAST_DEGREE = 4
-_SPLIT = 0.06
-"""How far the lumped mass may shift modes of like eigenvalues apart before the filter needs a better inverse."""
+_MARGIN = 1.1
+"""What may be missing from the last vector's eigenvalue by Weyl's law."""
+_SPLIT, _APART = 0.02, 1.5
+"""How far the lumped mass may shift modes of like eigenvalues apart, and how far above the wanted ones it must leave
+those of more than twice their eigenvalues, before the filter needs a better inverse."""
+_MOST_TERMS = 15
+"""Further terms of its Neumann series, at most."""
 
 
 class Plan(NamedTuple):
@@ -59,6 +64,7 @@ class State(NamedTuple):
         vectors: (m, nodes) M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab.
         defects: (m,) ‖Kx − θMx‖/‖Mx‖.
         lumped_values: (m,) xᵀKx / xᵀDx with the lumped mass D.
+        terms: further terms of the mass's inverse that were needed so far.
         rounds: rounds so far on this grid.
     """
 
@@ -66,6 +72,7 @@ class State(NamedTuple):
     vectors: Float[Array, "m nodes"]
     defects: Float[Array, " m"]
     lumped_values: Float[Array, " m"]
+    terms: Int[Array, ""]
     rounds: Int[Array, ""]
 
 
@@ -93,13 +100,13 @@ def from_random(
 
         def damped(key: Array) -> Float[Array, "b nodes"]:
             x = jnp.where(level.free[..., None], jax.random.normal(key, (*level.shape, plan.block), high.dtype), 0)
-            residual = stencil_product(level.stiffness, x, periodic) - low * level.lumped[..., None] * x
-            return to_rows(x + correction(level, periodic, band, residual, jnp.full(plan.block, low), degree))
+            image = stencil_product(level.stiffness, x, periodic)
+            return to_rows(x + correction(level, periodic, band, image, jnp.full(plan.block, low), degree, x))
 
         numbers = own_blocks(slabs, plan.size // plan.block)
         keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
         rows = jax.lax.map(damped, keys).reshape(-1, level.lumped.size)
-        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, rows), jnp.zeros((), int))
+        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, rows), jnp.zeros((), int), jnp.zeros((), int))
 
     return shared(slabs, run, EVERYWHERE, _layout(slabs))(level, low, high)
 
@@ -118,7 +125,7 @@ def from_coarse(
             return to_rows(interpolate(block_of(rows, number, plan.block, coarse_shape), level, periodic))
 
         fine = jax.lax.map(of_block, jnp.arange(rows.shape[0] // plan.block)).reshape(rows.shape[0], -1)
-        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, fine), jnp.zeros((), int))
+        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, fine), jnp.zeros((), int), jnp.zeros((), int))
 
     layout = _layout(slabs)
     return shared(slabs, run, (EVERYWHERE, layout.vectors), layout)(level, coarse.vectors)
@@ -150,14 +157,11 @@ def _improve(
     state: State,
 ) -> State:
     spare = jnp.arange(plan.size) >= plan.wanted
-    # β of the modes: what the lumped mass makes of their eigenvalues.
-    ratio = jnp.where(state.values > 0, state.lumped_values / jnp.where(state.values > 0, state.values, 1), 1)
-    near = state.values >= state.values[plan.wanted - 1] / 2
-    sharp = jnp.ptp(jnp.where(near & (ratio > 0.5), ratio, ratio[plan.wanted - 1])) > _SPLIT
-    filtered_values = jnp.where(sharp, state.values * (1 - (1 - ratio) ** 2), state.lumped_values)
-    factor = jnp.where(sharp, 1 - 2 * (1 - ratio) ** 2, ratio)
-    high = jnp.where(sharp, 2, 1) * high
-    low = jnp.minimum(jnp.max(filtered_values), high / 2)
+    terms, filtered_values, factor = _lumping(plan, state)
+    high = (1 + terms) * high
+    # Where the vectors beyond the wanted ones are no eigenvectors yet, the band begins where Weyl's law has the last.
+    edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(level.shape))
+    low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
     band = Band(low, high)
     left = spare | (True if rounding is None else ~_converged(plan, rounding, state))
     # The spare vectors need no more than the last wanted one.
@@ -176,12 +180,12 @@ def _improve(
             jax.lax.dynamic_slice_in_dim(v, number * plan.block, plan.block)
             for v in (state.values, filtered_values, factor)
         )
-        inside = zeta > low
-        moved = theta * stencil_product(level.mass, x, periodic)
         # What is in the band itself has no residual worth the name: it is damped as it is.
-        moved = jnp.where(inside, low * level.lumped[..., None] * x, moved)
+        inside = zeta > low
+        moved = jnp.where(inside, 0, theta * stencil_product(level.mass, x, periodic))
         residual = stencil_product(level.stiffness, x, periodic) - moved
-        z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number], sharp)
+        whole = jnp.where(inside, x, 0).astype(dtype)
+        z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number], whole, terms)
         z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
         rows = jax.lax.dynamic_slice_in_dim(vectors, own * plan.block, plan.block) + to_rows(z)
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * plan.block, axis=0)
@@ -191,20 +195,41 @@ def _improve(
 
     rows = to_own_rows(slabs, plan.block, state.vectors)
     vectors = to_slabs(slabs, plan.block, jax.lax.fori_loop(0, numbers.size, step, rows))
-    return _ritz(level, periodic, plan, vectors, state.rounds + 1)
+    return _ritz(level, periodic, plan, vectors, terms, state.rounds + 1)
+
+
+def _lumping(plan: Plan, state: State) -> tuple[Int[Array, ""], Float[Array, " m"], Float[Array, " m"]]:
+    """Return how many further terms the inverse of the mass needs, and with them ψ and the scale of each vector."""
+    values, wanted = state.values, state.values[plan.wanted - 1]
+    # 1 − β of the modes: what the lumped mass takes from their eigenvalues.
+    missing = 1 - jnp.where(values > 0, state.lumped_values / jnp.where(values > 0, values, 1), 1)
+    powers = jnp.arange(1, _MOST_TERMS + 2)[:, None]
+    lost = missing**powers
+    near = (values >= wanted / 2) & (values <= 2 * wanted)
+    spread = jnp.max(jnp.where(near, lost, 0), axis=1) - jnp.min(jnp.where(near, lost, jnp.inf), axis=1)
+    beyond = jnp.min(jnp.where(values > 2 * wanted, (1 - lost) * values, jnp.inf), axis=1)
+    enough = (spread <= _SPLIT) & (beyond >= _APART * wanted)
+    # Never fewer than before: what they keep away would come back.
+    terms = jnp.maximum(state.terms, jnp.where(jnp.any(enough), jnp.argmax(enough), _MOST_TERMS))
+    return terms, (1 - lost[terms]) * values, 1 - (terms + 1) * lost[terms]
 
 
 def _ritz(
-    level: Level, periodic: tuple[bool, ...], plan: Plan, vectors: Float[Array, "m nodes"], rounds: Int[Array, ""]
+    level: Level,
+    periodic: tuple[bool, ...],
+    plan: Plan,
+    vectors: Float[Array, "m nodes"],
+    terms: Int[Array, ""],
+    rounds: Int[Array, ""],
 ) -> State:
     slabs = plan.slabs(level.shape, periodic)
     level = local_level(level, slabs)
     values, vectors = rayleigh_ritz(level, periodic, plan.block, vectors, slabs)
     measured = measure(level, periodic, plan.block, values, vectors, slabs)
-    return State(values, vectors, measured.defects, measured.lumped_values, rounds)
+    return State(values, vectors, measured.defects, measured.lumped_values, terms, rounds)
 
 
 def _layout(slabs: Slabs | None) -> State:
     """Return how a state is laid out: the vectors in slabs, the rest on every device."""
     vectors = EVERYWHERE if slabs is None else PartitionSpec(None, slabs.name)
-    return State(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]
+    return State(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]
