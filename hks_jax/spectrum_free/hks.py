@@ -49,7 +49,7 @@ def hks_spectrum_free(
         domain: a tensor field on a grid, or a pencil of one from `assemble`.
         times: (n_times,) positive, in (metric length)².
         boundary: see `assemble`; belongs to the pencil if one is given.
-        mass: likewise. ``"lumped"`` is 20 to 100 times as fast with colouring.
+        mass: likewise. ``"lumped"`` is 50 to 100 times as fast with colouring.
         method: ``"colouring"``: Chebyshev polynomials on sums of point sources that are far enough apart, 2D and 3D,
             all times from the same vectors. ``"selected-inversion"`` (2D): rational approximation and block-wise
             inversion, to about 1e-10 at any time, one time after another. ``"auto"``: whichever takes less work. Or a
