@@ -102,6 +102,7 @@ def test_info_of_tensors(tensors, tmp_path, capsys):
     assert found["inside"] == disc().sum()
     assert (found["components"], found["not_positive_definite"]) == (1, 0)
     assert any("whose tensor is zero count as outside" in note for note in found["notes"])
+    assert found["suits"]["inverse"]["k"] == 100  # what 'hks' takes for a volume
     values = np.linalg.eigvalsh(D)
     assert found["eigenvalues"]["least"] == pytest.approx(1.1 * values[0], rel=1e-5)
     assert found["eigenvalues"]["largest"] == pytest.approx(2.2 * values[-1], rel=1e-5)
@@ -186,7 +187,10 @@ def test_convert_orders_masks_and_repairs(tmp_path, capsys):
     captured = capsys.readouterr()
     assert "warning: 1 tensors are not positive definite and are written as they are; see --repair" in captured.err
     assert captured.out == f"{tmp_path / 't.nii.gz'}\n"
-    assert main([*arguments, "--repair", "nearest", "-q"]) == 0
+    assert main([*arguments, "--repair", "nearest", "-q", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["files"] == [str(tmp_path / "t.nii.gz")]
+    assert (summary["order"], summary["repair"]["voxels"], summary["not_positive_definite"]) == ("fsl", 1, 0)
     image = nib.load(tmp_path / "t.nii.gz")
     assert int(image.header["intent_code"]) == 1005
     read = read_tensors(tmp_path / "t.nii.gz")
