@@ -80,16 +80,16 @@ assert difference(by_time[-1], signatures[-1, 0]) < 1e-5  # 60 pairs leave out l
 # vectors are dealt anew. They come back in slabs across the first axis, one on each device.
 
 # %%
-box = hj.Grid((2 * mesh.size, 10, 8), 0.1)
+box = hj.Grid((2 * mesh.size, 8, 6), 0.1)
 u = np.moveaxis(box.nodes, -1, 0)
 factor = np.exp(0.5 * np.sin(3 * u[0]) * np.cos(2 * u[1] + u[2]))
 field = hj.TensorField(box, factor[..., None, None] * np.diag([1.0, 2.0, 0.5]))
-together = hj.eigenpairs(field, 20, solver=hj.ChebyshevFilter(block=8, mesh=mesh))
-one = hj.eigenpairs(field, 20, solver="dense")
+together = hj.eigenpairs(field, 12, solver=hj.ChebyshevFilter(block=4, mesh=mesh))
+one = hj.eigenpairs(field, 12, solver="dense")
 print(together.summary())
 parts = together.eigenfunctions.addressable_shards
 print(f"eigenfunctions {together.eigenfunctions.shape} in {len(parts)} slabs {parts[0].data.shape}")
-assert parts[0].data.shape == (20, 2, 10, 8)
+assert parts[0].data.shape == (12, 2, 8, 6)
 assert together.converged.all()
 assert difference(together.eigenvalues, one.eigenvalues) < 1e-9
 assert difference(hj.hks(together, [0.1, 1.0]), hj.hks(one, [0.1, 1.0])) < 1e-8
@@ -146,8 +146,8 @@ figure = hj.plot.new_figure(11, 3.6)
 batches, space, work = figure.subplots(1, 3)
 for shard in signatures.addressable_shards:
     first = shard.index[0].start
-    batches.add_patch(Rectangle((shard.device.id - 0.4, first - 0.45), 0.8, 1.9, facecolor="tab:blue", alpha=0.6))
-    batches.text(shard.device.id, first + 0.5, f"{first}, {first + 1}", ha="center", va="center", fontsize="small")
+    batches.add_patch(Rectangle((shard.device.id - 0.45, first - 0.45), 0.9, 1.9, facecolor="tab:blue", alpha=0.6))
+    batches.text(shard.device.id, first + 0.5, f"{first}, {first + 1}", ha="center", va="center", fontsize="x-small")
 batches.set(xlim=(-0.7, mesh.size - 0.3), ylim=(-1, 2 * mesh.size), xlabel="device", ylabel="metric")
 batches.set_title("a batch")
 hj.plot.scalar_image(space, of_nodes[:, :, 5], hj.Grid(tall.shape[:2], 1.0), colorbar=False)

@@ -359,7 +359,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
         (["--order", "fsl"], ["order", "npz holds whole matrices"]),
         (["--erode", "40"], ["leaves nothing"]),
         (["--mask", "absent.npy"], ["absent.npy", "no such file"]),
-        (["--colour", "red"], ["unrecognized arguments: --colour"]),
+        (["--colour", "red"], ["unrecognized arguments: --colour", "see hks-jax hks --help"]),
     ],
 )
 def test_bad_arguments_are_one_line_and_code_2(npz, tmp_path, capsys, arguments, words):
@@ -567,6 +567,7 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
         ([], {"times": FIT_TIMES[:2]}, ["hks of shape (3, 14, 13)", "times of shape (2,)"]),
         ([], {"hks": np.nan}, ["target: 1 of 546 observed values are NaN", "(2, 3, 4)"]),
         (["--init", "init.npz"], {}, ["--init: got tensors of shape (14, 12)", "the target's shape (14, 13)"]),
+        (["--init", "volume.npz"], {}, ["shape (5, 4, 3)", "hks-jax convert volume.npz slice.npz --slice"]),
         (["--metric", "inverse"], {}, ["--metric", "--init"]),
         (["--init", "init.nii.gz"], {}, ["--metric: choose"]),
         (["--init", "init.nrrd"], {}, ["--metric: choose"]),
@@ -581,6 +582,7 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
         values[2, 3, 4], changes = changes["hks"], {}
     write_target("target.npz", values, **changes)
     np.savez("init.npz", tensors=metric())
+    np.savez("volume.npz", tensors=np.broadcast_to(np.eye(3), (5, 4, 3, 3, 3)))
     before = sorted(tmp_path.iterdir())
     assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2
     assert sorted(tmp_path.iterdir()) == before

@@ -236,6 +236,11 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
     if args.init is None:
         return TensorField(grid, target.volume.tensors.astype(args.dtype))
     volume = read_tensors(args.init, args.order)
+    if volume.dimension > grid.dimension:
+        raise ValueError(
+            f"--init: got a volume of shape {volume.shape}; expected the target's shape {grid.shape}. Cut the slice "
+            f"out first: hks-jax convert {args.init} slice.npz --slice z=14, and --init slice.npz"
+        )
     if volume.shape != grid.shape:
         raise ValueError(
             f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. "

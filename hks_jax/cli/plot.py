@@ -22,7 +22,7 @@ curve over the times for each point.
 
 EPILOG = """\
 examples:
-  hks-jax plot out/hks.npz -o panels.png --times auto:4 --range shared --quantiles 0.01,0.99 --unit s
+  hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9 --unit s
   hks-jax plot out/hks.npz -o curves.pdf --points 80,95 60,40 --unit s --scaled
 """
 
