@@ -11,13 +11,15 @@ import pytest
 
 import hks_jax as hj
 from hks_jax import paper
-from hks_jax.cli import demo, main, picture
+from hks_jax.cli import demo, fit, main, picture
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.arguments import Times, parse_boundary, parse_times
 from hks_jax.cli.picture import away_from_rim, bounding_box
 from hks_jax.cli.progress import Progress
+from hks_jax.inverse.fit import OPTIMISERS
 from hks_jax.inverse.metric_fit import RESULTS
+from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12)
@@ -90,11 +92,15 @@ def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
         assert read["eigenvalues"].shape == (25,)
 
 
-def test_report_says_what_was_done(npz, tmp_path):
+def test_report_says_what_was_done(npz, tmp_path, capsys):
     out = tmp_path / "out"
     # A time that 25 pairs do not resolve: the report carries the warning and a large truncation.
-    assert main(["hks", str(npz), "-o", str(out), "-q", "-k", "25", "--times", "0.01", "2"]) == 0
+    arguments = ["-q", "--json", "-k", "25", "--times", "0.01", "2"]
+    assert main(["hks", str(npz), "-o", str(out), *arguments]) == 0
     report = json.loads((out / "report.json").read_text())
+    printed = json.loads(capsys.readouterr().out)
+    assert printed.pop("files") == [str(out / name) for name in QUIET_FILES]
+    assert printed == report
     assert report["settings"] == {
         "metric": "tensor",
         "k": 25,
@@ -311,20 +317,27 @@ def test_demo_fits_and_draws_an_installed_brain(tmp_path, monkeypatch, capsys):
     brain = hj.io.ExampleBrain(*(tmp_path / name for name in ("d.nii", "b", "g", "m.nii")))
     monkeypatch.setattr(demo, "find_example_brain", lambda: brain)
     monkeypatch.setattr(demo, "N_PAIRS", 60)
-    assert main(["demo", "-o", str(tmp_path / "out"), "-q"]) == 0
-    assert capsys.readouterr().out == ""
+    assert main(["demo", "-o", str(tmp_path / "out"), "-q", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert [path.rpartition("/")[2] for path in summary["files"]] == ["hks.nii.gz", *QUIET_FILES]
+    assert (summary["settings"]["k"], len(summary["times"])) == (60, 7)
     image = nib.load(tmp_path / "out" / "hks.nii.gz")
     assert image.shape == (20, 22, 1, 7)
     inside = np.isfinite(image.get_fdata()[:, :, 0, 0])
     assert inside.sum() < mask[..., 0].sum() - 60  # the rim is gone
 
 
-def test_paper_passes_its_flags_on(tmp_path, monkeypatch):
+def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
     calls = []
-    monkeypatch.setattr(paper, "run", lambda *args: calls.append(args[:3]))
     out = tmp_path / "out"
+    monkeypatch.setattr(paper, "run", lambda *args: calls.append(args[:3]) or [out / "figure3.png"])
     assert main(["paper", "-q", "-o", str(out), "--full", "--only", "table1", "figure3"]) == 0
     assert main(["paper", "-q", "-o", str(out)]) == 0
+    assert capsys.readouterr().out == ""
+    assert main(["paper", "-q", "-o", str(out), "--json", "--only", "figure3"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["files"], summary["full"]) == ([str(out / "figure3.png")], False)
+    assert calls.pop() == (out, False, ["figure3"])
     assert calls == [(out, True, ["table1", "figure3"]), (out, False, None)]
 
 
@@ -346,7 +359,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch):
         (["--order", "fsl"], ["order", "npz holds whole matrices"]),
         (["--erode", "40"], ["leaves nothing"]),
         (["--mask", "absent.npy"], ["absent.npy", "no such file"]),
-        (["--colour", "red"], ["unrecognized arguments: --colour"]),
+        (["--colour", "red"], ["unrecognized arguments: --colour", "see hks-jax hks --help"]),
     ],
 )
 def test_bad_arguments_are_one_line_and_code_2(npz, tmp_path, capsys, arguments, words):
@@ -374,10 +387,14 @@ def test_bad_files_are_one_line_and_code_2(npz, nifti, tmp_path, capsys):
 
 def test_no_command_and_help(capsys):
     assert main([]) == 2
-    assert "COMMAND" in capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "find the metric that has a given signature" in captured.err  # the help, not a bare error
     for arguments in (["--help"], ["hks", "--help"], ["demo", "--help"], ["paper", "--help"], ["--version"]):
         assert main(arguments) == 0
-    assert f"hks-jax {hj.__version__}" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert f"hks-jax {hj.__version__}" in captured.out
+    assert captured.out.count("examples:") == 4
 
 
 def test_a_failed_computation_is_code_1(npz, tmp_path, capsys, monkeypatch):
@@ -455,6 +472,17 @@ def test_picture_helpers():
 
 # ---------------------------------------------------------------------------------------------------- fits
 
+
+def test_what_fit_offers_is_what_there_is():
+    assert tuple(PARAMETRISATIONS) == fit.PARAMETRISATIONS
+    assert fit.OPTIMISERS == OPTIMISERS
+
+
+def test_help_does_not_wait_for_the_optimisers():
+    script = "import sys, hks_jax.cli; assert 'optimistix' not in sys.modules; hks_jax.cli.build_parser()"
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
 FIT_GRID = hj.Grid((14, 13), 1 / 13)
 FIT_TIMES = np.array([0.02, 0.05, 0.1])
 FIT_ARGUMENTS = ["--parametrisation", "conformal", "-k", "40", "--h1", "1e-8"]  # the same ones compile once
@@ -477,7 +505,7 @@ def write_target(path, values, **changes):
 def test_fit_end_to_end_recovers_the_metric(conformal, tmp_path, capsys):
     tensors, values = conformal
     target, out = write_target(tmp_path / "target.npz", values), tmp_path / "out"
-    arguments = ["--max-steps", "4", "-q", *FIT_ARGUMENTS]
+    arguments = ["--max-steps", "4", "-q", "--json", *FIT_ARGUMENTS]
     assert main(["fit", str(target), "-o", str(out), *arguments]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["fit.npz", "fit.png", "report.json", "tensors.npz"]
     assert (out / "fit.png").read_bytes()[:4] == b"\x89PNG"
@@ -505,7 +533,11 @@ def test_fit_end_to_end_recovers_the_metric(conformal, tmp_path, capsys):
     }
     assert {"reading", "fitting"} <= set(report["seconds"])
     assert {"optimistix", "jax", "device"} <= set(report["versions"])
-    assert report["warnings"] == [capsys.readouterr().err.removeprefix("warning: ").rstrip()]
+    captured = capsys.readouterr()
+    assert report["warnings"] == [captured.err.removeprefix("warning: ").rstrip()]
+    printed = json.loads(captured.out)
+    assert printed.pop("files") == [str(file) for file in sorted(out.iterdir())]
+    assert printed == report
     assert "steps exhausted" in report["warnings"][0]
 
 
@@ -535,8 +567,11 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
         ([], {"times": FIT_TIMES[:2]}, ["hks of shape (3, 14, 13)", "times of shape (2,)"]),
         ([], {"hks": np.nan}, ["target: 1 of 546 observed values are NaN", "(2, 3, 4)"]),
         (["--init", "init.npz"], {}, ["--init: got tensors of shape (14, 12)", "the target's shape (14, 13)"]),
+        (["--init", "volume.npz"], {}, ["shape (5, 4, 3)", "hks-jax convert volume.npz slice.npz --slice"]),
         (["--metric", "inverse"], {}, ["--metric", "--init"]),
         (["--init", "init.nii.gz"], {}, ["--metric: choose"]),
+        (["--init", "init.nrrd"], {}, ["--metric: choose"]),
+        (["--init", "init.vti"], {}, ["--metric: choose"]),
         (["--h1", "-1"], {}, ["--h1: got '-1'; expected a positive number"]),
     ],
 )
@@ -547,6 +582,7 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
         values[2, 3, 4], changes = changes["hks"], {}
     write_target("target.npz", values, **changes)
     np.savez("init.npz", tensors=metric())
+    np.savez("volume.npz", tensors=np.broadcast_to(np.eye(3), (5, 4, 3, 3, 3)))
     before = sorted(tmp_path.iterdir())
     assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2
     assert sorted(tmp_path.iterdir()) == before

@@ -57,11 +57,14 @@ def error_of(capsys, arguments):
     return errors[0]
 
 
-def test_a_scan_to_pictures_by_one_command(scan, tmp_path):
+def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
     out, mask = tmp_path / "out", str(tmp_path / "m.nii.gz")
     arguments = ["--mask", mask, "--slice", "z=3", "--metric", "inverse", "-k", "10", "--times", "2e4", "4e4"]
+    assert main(["info", *scan, *arguments[:4]]) == 0
+    assert "warning: 1 tensors inside have an eigenvalue near zero" in capsys.readouterr().err
     arguments += ["--repair", "nearest:1e-6"]
     assert main(["hks", *scan, "-o", str(out), "-q", *arguments]) == 0
+    assert capsys.readouterr().err == ""
     assert sorted(file.name for file in out.iterdir()) == ["hks.nii.gz", "hks.npz", "hks.png", "report.json"]
     report = json.loads((out / "report.json").read_text())
     assert report["input"]["order"] == "fit"
@@ -102,6 +105,7 @@ def test_info_of_tensors(tensors, tmp_path, capsys):
     assert found["inside"] == disc().sum()
     assert (found["components"], found["not_positive_definite"]) == (1, 0)
     assert any("whose tensor is zero count as outside" in note for note in found["notes"])
+    assert found["suits"]["inverse"]["k"] == 100  # what 'hks' takes for a volume
     values = np.linalg.eigvalsh(D)
     assert found["eigenvalues"]["least"] == pytest.approx(1.1 * values[0], rel=1e-5)
     assert found["eigenvalues"]["largest"] == pytest.approx(2.2 * values[-1], rel=1e-5)
@@ -186,7 +190,10 @@ def test_convert_orders_masks_and_repairs(tmp_path, capsys):
     captured = capsys.readouterr()
     assert "warning: 1 tensors are not positive definite and are written as they are; see --repair" in captured.err
     assert captured.out == f"{tmp_path / 't.nii.gz'}\n"
-    assert main([*arguments, "--repair", "nearest", "-q"]) == 0
+    assert main([*arguments, "--repair", "nearest", "-q", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["files"] == [str(tmp_path / "t.nii.gz")]
+    assert (summary["order"], summary["repair"]["voxels"], summary["not_positive_definite"]) == ("fsl", 1, 0)
     image = nib.load(tmp_path / "t.nii.gz")
     assert int(image.header["intent_code"]) == 1005
     read = read_tensors(tmp_path / "t.nii.gz")
@@ -209,7 +216,9 @@ def test_convert_fits_scans_and_refuses_what_cannot_be(scan, tmp_path, capsys):
     assert "expected a name that ends in .npz" in error_of(capsys, ["convert", str(target), str(tmp_path / "t.mif")])
     assert "is FILE itself" in error_of(capsys, ["convert", str(target), str(target)])
     before = sorted(tmp_path.iterdir())
-    arguments = ["convert", str(target), str(tmp_path / "s.nii.gz"), "--slice", "z=1"]
+    arguments = ["convert", str(target), str(tmp_path / "s.nii.gz"), "--slice", "z=9"]
+    assert "--slice: index: got z = 9; expected 0 … 4" in error_of(capsys, arguments)
+    arguments[-1] = "z=1"
     assert "NIfTI has no 2×2 tensors" in error_of(capsys, arguments)
     assert sorted(tmp_path.iterdir()) == before
 

@@ -10,6 +10,14 @@ import numpy as np
 from hks_jax import __version__
 from hks_jax.cli import convert, curvature, demo, fit, hks, info, paper, plot, spectrum
 
+EPILOG = """\
+examples:
+  hks-jax demo
+  hks-jax info tensor.nii.gz
+  hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
+  hks-jax hks --help
+"""
+
 SUBCOMMANDS = (hks, spectrum, curvature, fit, plot, info, convert, demo, paper)
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -35,7 +43,12 @@ class Parser(argparse.ArgumentParser):
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all subcommands."""
-    parser = Parser(prog="hks-jax", description="Heat kernel signatures of tensor fields.")
+    parser = Parser(
+        prog="hks-jax",
+        description="Heat kernel signatures of tensor fields.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--version", action="version", version=f"hks-jax {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for subcommand in SUBCOMMANDS:
@@ -52,8 +65,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     0: done; 1: the computation failed; 2: bad input; 130: interrupted. Output files appear whole
     and, but for `paper` and the checkpoint of `fit`, all at the end: unless it is 0, there are none.
     """
+    argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
+    if not argv:
+        parser.print_help(sys.stderr)
+        return BAD_INPUT
     try:
-        args = build_parser().parse_args(argv)
+        args, unknown = parser.parse_known_args(argv)
+        if unknown:
+            Parser(prog=args.prog).error(f"unrecognized arguments: {' '.join(unknown)}")
     except SystemExit as stop:  # argparse has printed its message
         return int(stop.code or 0)
     try:

@@ -16,6 +16,10 @@ class Times(NamedTuple):
 
 
 DEFAULT_TIMES = Times((), 6)
+DEFAULT_K = {2: 200, 3: 100}
+"""Eigenpairs by dimension. A volume's factorisations cost so much more that fewer pairs take as long."""
+RESOLVED = {2: 4.6, 3: 5.7}
+"""λ_k·t, by dimension, from which on the pairs beyond k are 1 % of the signature (see `hks_jax.truncation`)."""
 
 
 def parse_slice(text: str) -> tuple[str, int]:

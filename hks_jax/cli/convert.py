@@ -1,14 +1,21 @@
 """``hks-jax convert FILE OUT``: tensors from any format that is read to any that is written."""
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import Any
 
+from hks_jax.cli.inputs import add_json_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.io import find_invalid, save_tensors
 from hks_jax.io.save import SUFFIXES
+
+DESCRIPTION = f"""\
+Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT in the format of its suffix:
+{", ".join(SUFFIXES)}. Components are turned to the axes that the format has them in.
+"""
 
 EPILOG = """\
 examples:
@@ -23,13 +30,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "convert",
         help="write the tensors of a file in another format",
-        description="Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT in the "
-        f"format of its suffix: {', '.join(SUFFIXES)}. Components are turned to the axes that the format has them in.",
+        description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_arguments(parser)
     parser.add_argument("output", metavar="OUT", type=Path, help="the file to write; an existing one is replaced")
+    add_json_argument(parser)
     return parser
 
 
@@ -50,5 +57,11 @@ def run(args: argparse.Namespace) -> None:
             progress.warn(f"{invalid} tensors are not positive definite and are written as they are; see --repair")
         with progress.stage("writing", str(args.output)):
             save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
-    if not args.quiet:
+    if args.json:
+        from hks_jax.cli.job import describe_input
+        from hks_jax.cli.outputs import plain
+
+        found = {**describe_input(volume, volume.mask), "not_positive_definite": invalid, "files": [str(args.output)]}
+        print(json.dumps(plain(found), ensure_ascii=False))
+    elif not args.quiet:
         print(args.output)

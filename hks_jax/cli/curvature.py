@@ -104,14 +104,14 @@ def run(args: argparse.Namespace) -> None:
 
 def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume) -> Any:
     """Return the picture: colours on either side of zero, as many as the values reach but for a few."""
-    from hks_jax.domain.grid import Grid
+    from hks_jax.cli.picture import cropped
     from hks_jax.plot import new_figure, scalar_image
 
-    grid = Grid(volume.shape, volume.spacing, volume.origin)
+    grid, box = cropped(volume, np.isfinite(curvature))
     limit = float(np.nanquantile(np.abs(curvature), COLOURED)) or 1.0
-    aspect = min(max(volume.shape[1] * volume.spacing[1] / (volume.shape[0] * volume.spacing[0]), 0.3), 3.0)
+    aspect = min(max(grid.shape[1] * grid.spacing[1] / (grid.shape[0] * grid.spacing[0]), 0.3), 3.0)
     figure = new_figure(4.8, 3.6 * aspect + 0.6)
     ax = figure.subplots()
-    scalar_image(ax, curvature, grid, cmap="RdBu_r", vmin=-limit, vmax=limit, label="in 1/length² of the metric")
+    scalar_image(ax, curvature[box], grid, cmap="RdBu_r", vmin=-limit, vmax=limit, label="in 1/length² of the metric")
     ax.set_title("Gaussian curvature", fontsize="medium")
     return figure

@@ -8,8 +8,21 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.cli.inputs import add_json_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
+
+DESCRIPTION = """\
+Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The brain comes with the PyPI wheel
+mdt==1.2.7 (install it with --no-deps), the fit needs "hks-jax[dti]"; without them, or with --phantom, an analytic
+phantom takes the brain's place.
+"""
+
+EPILOG = """\
+examples:
+  hks-jax demo
+  hks-jax demo --phantom -o phantom
+"""
 
 B_MAX = 1000.0
 """s/mm²; a single tensor describes the signal well up to there."""
@@ -27,13 +40,14 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "demo",
         help="compute and draw the signature of a brain slice",
-        description="Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The brain "
-        'comes with the PyPI wheel mdt==1.2.7 (install it with --no-deps), the fit needs "hks-jax[dti]"; without '
-        "them, or with --phantom, an analytic phantom takes the brain's place.",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
     add("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="folder for the results (demo)")
     add("--phantom", action="store_true", help="use the phantom in any case")
+    add_json_argument(parser)
     return parser
 
 
@@ -41,7 +55,7 @@ def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     from hks_jax.cli.arguments import Times
     from hks_jax.cli.job import Settings, compute
-    from hks_jax.cli.outputs import check_folder, write_outputs
+    from hks_jax.cli.outputs import check_folder, show_files, write_outputs
     from hks_jax.cli.picture import draw
     from hks_jax.plot import number_text
 
@@ -73,7 +87,9 @@ def run(args: argparse.Namespace) -> None:
             image="" if brain is None else ".nii.gz",
             command=sys.argv,
         )
-    if not args.quiet:
+    if args.json:
+        show_files(files, args.quiet, as_json=True)
+    elif not args.quiet:
         print(f"The picture is {next(file for file in files if file.suffix == '.png')}")
 
 

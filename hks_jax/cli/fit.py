@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.arguments import parse_boundary
+from hks_jax.cli.inputs import add_json_argument
 from hks_jax.cli.progress import Progress
-from hks_jax.inverse.fit import OPTIMISERS
-from hks_jax.inverse.parametrisation import PARAMETRISATIONS
+from hks_jax.cli.reading import FILES, image_suffix
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, read_tensors, save, save_tensors
 from hks_jax.io.masks import as_mask
-from hks_jax.io.nifti import is_nifti
 from hks_jax.io.npz import load_npz
 from hks_jax.io.provenance import digest
 
@@ -39,6 +38,9 @@ example:
 """
 
 REQUIRED = ("hks", "times", "spacing", "origin")
+PARAMETRISATIONS = ("log-euclidean", "cholesky", "conformal", "eigenvalues", "rotation")
+OPTIMISERS = ("gauss-newton", "lbfgs", "bfgs")
+"""As in `hks_jax.inverse`, which is slow to import: a test keeps them the same."""
 
 
 class Target(NamedTuple):
@@ -67,17 +69,17 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("target", metavar="TARGET", type=Path, help="the signature: .npz")
     add("-o", "--output", metavar="OUT", type=Path, required=True, help="folder for the results")
-    add("--init", type=Path, metavar="FILE", help="tensors to start from: .nii, .nii.gz or .npz (default: identity)")
+    add("--init", type=Path, metavar="FILE", help=f"tensors to start from: {FILES} (default: identity)")
     add(
         "--metric",
         choices=("tensor", "inverse", "adjugate"),
         help="the metric of the tensors D of --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹; "
-        "must be chosen for NIfTI; an npz holds the metric itself unless you choose",
+        "must be chosen but for NumPy's files, which hold the metric itself unless you choose",
     )
-    add("--order", choices=tuple(ORDERS), help="order of the six components of --init, where NIfTI does not declare it")
+    add("--order", choices=tuple(ORDERS), help="order of the components of --init, where the file does not declare it")
     add(
         "--parametrisation",
-        choices=tuple(PARAMETRISATIONS),
+        choices=PARAMETRISATIONS,
         default="log-euclidean",
         help="what varies: the whole tensor as log-euclidean (default) or cholesky; or of --init a conformal factor, "
         "the eigenvalues, or the rotation",
@@ -112,6 +114,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--optimiser", choices=OPTIMISERS, default="gauss-newton", help="default gauss-newton")
     add("--checkpoint", type=Path, metavar="FILE", help="written after each step; if it is there, go on from it")
     add("--dtype", choices=("float32", "float64"), default="float64", help="precision (default float64)")
+    add_json_argument(parser)
     return parser
 
 
@@ -124,11 +127,13 @@ def run(args: argparse.Namespace) -> None:
     """
     if args.init is None and (args.metric or args.order):
         raise ValueError(f"--{'metric' if args.metric else 'order'}: is about the tensors of --init; give both or none")
-    if args.init is not None and args.metric is None and is_nifti(args.init):
-        raise ValueError("--metric: choose inverse, tensor or adjugate; a NIfTI of diffusion tensors D is no metric")
+    if args.init is not None and args.metric is None and image_suffix(args.init):
+        raise ValueError(
+            "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors D, which are no metric"
+        )
 
     from hks_jax.cli.job import ComputationError, unreached_sides, use_dtype
-    from hks_jax.cli.outputs import check_folder
+    from hks_jax.cli.outputs import check_folder, show_files
     from hks_jax.inverse.fit import fit_metric
     from hks_jax.inverse.metric_fit import RESULTS
     from hks_jax.inverse.regulariser import H1, Regulariser, TotalVariation
@@ -173,8 +178,7 @@ def run(args: argparse.Namespace) -> None:
         if not fit.converged:
             progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; what was best is written")
         files = _write(args, fit, target, progress)
-    if not args.quiet:
-        print("\n".join(map(str, files)))
+    show_files(files, args.quiet, args.json)
 
 
 def read_target(path: Path) -> Target:
@@ -232,6 +236,11 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
     if args.init is None:
         return TensorField(grid, target.volume.tensors.astype(args.dtype))
     volume = read_tensors(args.init, args.order)
+    if volume.dimension > grid.dimension:
+        raise ValueError(
+            f"--init: got a volume of shape {volume.shape}; expected the target's shape {grid.shape}. Cut the slice "
+            f"out first: hks-jax convert {args.init} slice.npz --slice z=14, and --init slice.npz"
+        )
     if volume.shape != grid.shape:
         raise ValueError(
             f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. "

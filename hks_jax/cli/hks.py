@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.arguments import parse_times, parse_voxel
-from hks_jax.cli.inputs import add_eigenpair_arguments, add_tensor_arguments, read_volume, require_metric
+from hks_jax.cli.inputs import (
+    add_eigenpair_arguments,
+    add_json_argument,
+    add_tensor_arguments,
+    read_volume,
+    require_metric,
+)
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume
@@ -67,6 +73,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="sum over eigenpairs (default), do without them, or choose by t, k and the spacing: auto reports which "
         "times came from where and how the two agree",
     )
+    add_json_argument(parser)
     return parser
 
 
@@ -75,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
     times = parse_times(args.times)
     require_metric(args)
     from hks_jax.cli.job import Settings, compute
-    from hks_jax.cli.outputs import check_folder, write_outputs
+    from hks_jax.cli.outputs import check_folder, show_files, write_outputs
     from hks_jax.cli.picture import draw, draw_volume
 
     check_folder(args.output)
@@ -105,8 +112,7 @@ def run(args: argparse.Namespace) -> None:
             image=image_suffix(args.file),
             command=sys.argv,
         )
-    if not args.quiet:
-        print("\n".join(map(str, files)))
+    show_files(files, args.quiet, args.json)
 
 
 def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:

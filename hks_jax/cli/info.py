@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.cli.arguments import DEFAULT_K, RESOLVED
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
@@ -16,15 +17,18 @@ from hks_jax.io.provenance import digest
 from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.vtk_image import holds_dataset
 
+DESCRIPTION = f"""\
+Say what is in a file of tensors: shape, order of components and how it was determined, frame, mask and its pieces,
+eigenvalues, tensors that are not positive definite, and the k and t that would suit. Of a mesh
+({", ".join(MESHES)}): size, boundary, pieces, and the same.
+"""
+
 EPILOG = """\
 examples:
   hks-jax info tensor.nii.gz --mask mask.nii.gz
   hks-jax info dti.nrrd --slice z=14 --json
 """
 
-DEFAULT_K = 200
-RESOLVED = {2: 4.6, 3: 5.7}
-"""λ_k·t from which the pairs beyond k are 1 % of the signature."""
 COARSE = 6.0
 """t/h² from which the grid's spacing h biases it by at most 1 %."""
 
@@ -34,9 +38,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "info",
         help="say what is in a file, and which k and t would suit it",
-        description="Say what is in a file of tensors: shape, order of components and how it was determined, frame, "
-        "mask and its pieces, eigenvalues, tensors that are not positive definite, and the k and t that would suit. Of "
-        f"a mesh ({', '.join(MESHES)}): size, boundary, pieces, and the same.",
+        description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -132,7 +134,7 @@ def _times(d: int, volume: float, width2: float, size: float, nodes: int) -> dic
     """Return the least time that the spacing allows, what k it takes, what the default k allows, and the largest."""
     weyl = volume / (4 * np.pi if d == 2 else 6 * np.pi**2)  # N(λ) = weyl · λ^(d/2)
     least = COARSE * width2
-    k = max(1, min(DEFAULT_K, nodes // 4))
+    k = max(1, min(DEFAULT_K[d], nodes // 4))
     return {
         "least_time": least,
         "k_for_least_time": int(np.ceil(weyl * (RESOLVED[d] / least) ** (d / 2))),

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.cli.arguments import DEFAULT_TIMES, Times
+from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, Times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import MetricChoice, TensorField
@@ -26,9 +26,6 @@ from hks_jax.signatures.heat import Normalisation
 from hks_jax.signatures.times import default_times
 from hks_jax.signatures.truncation import truncation
 from hks_jax.spectrum_free.auto import HKSMethod, hks, hks_auto
-
-DEFAULT_K = {2: 200, 3: 100}
-"""Eigenpairs by dimension. A volume's factorisations cost so much more that fewer pairs take as long."""
 
 
 class ComputationError(RuntimeError):

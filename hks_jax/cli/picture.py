@@ -47,7 +47,9 @@ def draw(
     """
     values, inside = result.values, np.isfinite(result.values[0])
     if titles is None:
-        titles = [f"$t$ = {number_text(t)}" for t in result.times]
+        # Fitted tensors are in mm²/s, and their grids in mm.
+        seconds = result.volume.order == "fit" and result.report["settings"]["metric"] == "inverse"
+        titles = [f"$t$ = {number_text(t)}{' s' * seconds}" for t in result.times]
     if first is not None:
         titles, values = [first[0], *titles], np.concatenate([first[1][None], values])
     grid, box = cropped(result.volume, inside)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.cli.arguments import parse_slice, parse_times
+from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
 from hks_jax.cli.inputs import add_json_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
@@ -22,15 +22,13 @@ curve over the times for each point.
 
 EPILOG = """\
 examples:
-  hks-jax plot out/hks.npz -o panels.png --times auto:4 --range shared --quantiles 0.01,0.99 --unit s
+  hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9 --unit s
   hks-jax plot out/hks.npz -o curves.pdf --points 80,95 60,40 --unit s --scaled
 """
 
 NAMES = ("hks", "curvature")
 MANY = 12
 """Images at most, unless times are chosen."""
-RESOLVED = {2: 4.6, 3: 5.7}
-"""λt of the last eigenvalue from which on a truncated spectrum resolves t to 1 % (see `hks_jax.truncation`)."""
 
 
 class Saved(NamedTuple):

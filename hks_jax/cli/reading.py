@@ -52,7 +52,10 @@ def read(args: argparse.Namespace, progress: Progress) -> TensorVolume:
     if mask is not None and mask.shape == volume.shape:
         volume, mask = volume.with_mask(mask), None
     if args.slice is not None:
-        volume = volume.slice(*args.slice)
+        try:
+            volume = volume.slice(*args.slice)
+        except ValueError as error:
+            raise ValueError(f"--slice: {error}") from error
     if mask is not None:  # it may be one of the slice alone
         if mask.shape != volume.shape:
             raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
@@ -65,7 +68,18 @@ def read(args: argparse.Namespace, progress: Progress) -> TensorVolume:
         volume = volume if volume.repair["voxels"] else replace(volume, notes=(*volume.notes, "repair: not needed"))
     for note in volume.notes:
         progress.note(note)
+    if args.bval is not None and (clipped := _count_clipped(volume)):
+        progress.warn(
+            f"{clipped} tensors inside have an eigenvalue near zero: DIPY clips fits that are not positive definite. "
+            "Distances in D⁻¹ are enormous there; --erode 1 takes the rim off, --repair nearest:1e-4 replaces them"
+        )
     return volume
+
+
+def _count_clipped(volume: TensorVolume) -> int:
+    """Count the fitted tensors inside with an eigenvalue below a hundredth of the median mean eigenvalue."""
+    values = np.linalg.eigvalsh(volume.tensors[volume.inside])
+    return int((values[:, 0] < 0.01 * np.median(values.mean(axis=-1))).sum())
 
 
 def image_suffix(path: Path) -> str:

@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
             "weyl_count": weyl_count(pairs, pairs.eigenvalues, field),
         }
         chosen = asdict(settings)
-        for name in ("times", "normalisation"):
+        for name in ("times", "normalisation", "method"):
             del chosen[name]
         report = {
             "input": describe_input(volume, field.grid.mask),

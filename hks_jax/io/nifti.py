@@ -91,7 +91,7 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
     if order is None and not declared:
         raise ValueError(
             f"{name}: six components, but the file does not declare their order (its NIfTI intent is not "
-            f"symmetric-matrix), and programs differ. Pass order: one of {choices()}"
+            f"symmetric-matrix), and programs differ. Pass order (--order), one of {choices()}"
         )
     notes, open_frame = [], order is None and frame is None
     if order is None:

@@ -126,7 +126,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
         if order is None:
             raise ValueError(
                 f"{name}: {components.shape[-1]} components along axis {axis}, but the file does not declare their "
-                f"order (its kind is no kind of tensor), and programs differ. Pass order: one of {choices()}"
+                f"order (its kind is no kind of tensor), and programs differ. Pass order (--order), one of {choices()}"
             )
         tensors, used = unpack(components, order), order
     else:

@@ -92,7 +92,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     elif order is None and not declared:
         raise ValueError(
             f"{name}: six components in {chosen.GetName()!r}, which the file does not declare as tensors, and programs "
-            f"differ in their order. Pass order: one of {choices()}"
+            f"differ in their order. Pass order (--order), one of {choices()}"
         )
     else:
         order = order or "vtk"
