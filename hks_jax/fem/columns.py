@@ -6,10 +6,10 @@ In this layout each coefficient is read once for all columns: in 3D it is about 
 import math
 from collections.abc import Callable, Iterator
 from itertools import product
+from operator import mul
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -18,40 +18,31 @@ def stencil(
 ) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
     """Return x ↦ y[i] = Σₒ coefficients[o, i] x[i + o], offsets in the order of ``product((-1, 0, 1), repeat=d)``.
 
-    A single coefficient per node is a diagonal. What is done to the coefficients is done here: for products in a loop,
-    call this outside.
+    A single coefficient per node is a diagonal. Those across a side that is not periodic must be 0. What is done to the
+    coefficients is done here: for products in a loop, call this outside.
     """
     if coefficients.shape[0] == 1:
         return lambda x: coefficients[0][..., None] * x
     if any(periodic):
         together = side_by_side(coefficients)
         return lambda x: product_with_rim(together, with_rim(x, periodic))
-    # Node after node in one row, a neighbour is a fixed distance away. Those beyond the grid's sides, where the row
-    # goes on elsewhere, have no coefficient.
+    # Node after node in one row, a neighbour is a fixed distance away. Across the sides, where the row goes on
+    # elsewhere, there is nothing: elements end there, and their entries were never written.
     shape = coefficients.shape[1:]
-    offsets = np.array(list(product((-1, 0, 1), repeat=len(shape))))
-    inside = [(places >= 0) & (places < n) for places, n in zip(_places(offsets, shape), shape, strict=True)]
-    beyond = ~np.logical_and.reduce(np.broadcast_arrays(*inside))
-    together = side_by_side(jnp.where(beyond, 0, coefficients))
-    strides = np.array([math.prod(shape[axis + 1 :]) for axis in range(len(shape))])
-    nodes, reach = math.prod(shape), int(strides.sum())
+    together, nodes = side_by_side(coefficients), math.prod(shape)
+    strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+    distances = [sum(map(mul, offset, strides)) for offset in product((-1, 0, 1), repeat=len(shape))]
+    reach = distances[-1]
 
     def apply(x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
         b = x.shape[-1]
         padded = jnp.pad(x.reshape(nodes, b), ((reach, reach), (0, 0)))
         row, y = together.reshape(nodes, -1), jnp.zeros((), x.dtype)
-        for o, distance in enumerate(reach + offsets @ strides):
-            y = y + row[:, o, None] * jax.lax.slice(padded, (distance, 0), (distance + nodes, b))
+        for o, distance in enumerate(distances):
+            y = y + row[:, o, None] * jax.lax.slice(padded, (reach + distance, 0), (reach + distance + nodes, b))
         return y.reshape(x.shape)
 
     return apply
-
-
-def _places(offsets: np.ndarray, shape: tuple[int, ...]) -> list[np.ndarray]:
-    """Return where each offset leads along each axis: (offsets, 1, …, n, …, 1)."""
-    d = len(shape)
-    along = [np.arange(n).reshape([n if a == axis else 1 for a in range(d)]) for axis, n in enumerate(shape)]
-    return [offsets[:, axis].reshape(-1, *(1,) * d) + places for axis, places in enumerate(along)]
 
 
 def stencil_product(
