@@ -1,6 +1,6 @@
 """``python -m hks_jax`` is ``hks-jax``."""
 
-from hks_jax.cli import main
+from hks_jax.cli import run_and_exit
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run_and_exit()

@@ -141,8 +141,8 @@ assert ratios[0] < 0.9
 # %% [markdown]
 # ## What noise does to it
 #
-# Of a phantom the true tensors are known. The signature averages over what heat reaches: its error is below that of the
-# tensors, and falls with t.
+# Of a phantom the true tensors are known. The signature averages over what heat reaches: its error is a fraction of
+# that of the tensors.
 
 # %%
 if truth is not None:
@@ -153,7 +153,7 @@ if truth is not None:
     print(
         f"median error of the tensors {np.median(of_tensors[deep]):.1%}, of the signature", [f"{e:.1%}" for e in errors]
     )
-    assert errors[-1] < errors[0] < np.median(of_tensors[deep])
+    assert max(errors) < 0.5 * np.median(of_tensors[deep])
 
 # %% [markdown]
 # ## Files, and the same by one command

@@ -251,7 +251,7 @@ assert min(ranges["4πt·HKS"]) > 0.5
 # A torus of revolution, and the same in coordinates y that are bent: x = ψ(y). Nothing about the surface has changed,
 # and the signature moves along with its points. So does a function that diffuses; one that is blurred does not. But
 # trace, determinant and anisotropy are scalars of the matrix, not of the metric: in other coordinates they are others
-# from the start, and no smoothing mends that.
+# from the start, and no smoothing mends that. Here the trace.
 
 # %%
 n, times = 50, jnp.array([0.4, 1.2])

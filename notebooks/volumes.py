@@ -123,8 +123,9 @@ assert np.all(error < settings.error)
 assert max(settings.error) < 1e-4
 
 # %% [markdown]
-# What it is good for: there the signature is its expansion, 4πt·HKS = 1 + Kt/3 + …, down to where the grid's spacing
-# biases it, and the curvature can be read off.
+# At such times the signature is its expansion, 4πt·HKS = 1 + Kt/3 + …, from which the curvature can be read off, until
+# at smaller ones yet the grid's spacing h biases it, by up to 0.06 h²/t. That is of the grid, not of the method: a
+# finer one moves it to the left, where no spectrum follows.
 
 # %%
 series = np.asarray(hj.hks_expansion(field, times, order=2))

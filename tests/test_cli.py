@@ -1,8 +1,10 @@
 """The command line, end to end: files in, files out, one line and a code for what goes wrong."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 
 import equinox as eqx
 import nibabel as nib
@@ -420,6 +422,33 @@ def test_nothing_is_left_of_an_interrupted_or_failed_write(npz, tmp_path, capsys
     arguments = ["hks", str(npz), "-o", str(tmp_path / "out"), "-k", "10", "--times", "2"]
     assert one_error(capsys, main(arguments), "interrupted" if code == 130 else "disk full") == code
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_ctrl_c_amid_a_computation_leaves_nothing_but_one_line(tmp_path):
+    n = 36
+    np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(3), (n, n, n, 3, 3)))
+    command = [
+        sys.executable,
+        "-m",
+        "hks_jax",
+        "hks",
+        str(tmp_path / "t.npz"),
+        "-o",
+        str(tmp_path / "out"),
+        "-k",
+        "150",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        line = ""
+        while "eigenpairs" not in line:
+            line = process.stderr.readline()
+        time.sleep(2)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert (out, err.splitlines()[-1]) == ("", "hks-jax hks: error: interrupted")
+    assert "Traceback" not in err
+    assert [file.name for file in tmp_path.iterdir()] == ["t.npz"]
 
 
 def test_debug_shows_the_traceback():

@@ -1,6 +1,7 @@
 """The command line, ``hks-jax``: errors become one line on stderr and an exit code."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -86,6 +87,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         return _fail(args, f"{type(error).__name__}: {error}", FAILED, error)
     return 0
+
+
+def run_and_exit() -> NoReturn:
+    """Run the command line as a program.
+
+    An interrupt leaves JAX's threads computing, and Python would crash while it takes them down: it leaves at once.
+    """
+    code = main()
+    if code == INTERRUPTED:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _fail(args: argparse.Namespace, message: str, code: int, error: Exception | None = None) -> int:
