@@ -31,10 +31,10 @@ def timed_from_cold(function: Callable[..., Any], *args: Any, repeats: int) -> t
     return times[0], min(times[1:]), result
 
 
-def timed_once(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:
+def timed_once(function: Callable[..., Any], *args: Any, **more: Any) -> tuple[float, Any]:
     """Return the time of one call, whatever it compiles included, and its result."""
     start = time.perf_counter()
-    result = jax.block_until_ready(function(*args))
+    result = jax.block_until_ready(function(*args, **more))
     return time.perf_counter() - start, result
 
 

@@ -10,16 +10,14 @@ nodes, unit metric, lumped mass, t = 4h². The file is written anew after every 
 
 import argparse
 import resource
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from machine import RESULTS, write
+from machine import RESULTS, timed_once, write
 
 import hks_jax as hj
 
@@ -31,13 +29,6 @@ def smooth(n: int) -> hj.TensorField:
     return hj.examples.figure4_fields(n, major=1.25, minor=0.8)["cells"]
 
 
-def timed(function: Callable[..., Any], *args: Any, **more: Any) -> tuple[float, Any]:
-    """Return the seconds of one call, compilation included, and its result."""
-    start = time.perf_counter()
-    result = jax.block_until_ready(function(*args, **more))
-    return time.perf_counter() - start, result
-
-
 def relative(values: jax.Array, reference: jax.Array) -> float:
     """Return the greatest error relative to the reference's value at the node."""
     return float(jnp.max(jnp.abs(values / reference - 1)))
@@ -46,7 +37,7 @@ def relative(values: jax.Array, reference: jax.Array) -> float:
 def by_colouring(field: hj.TensorField, t: float, mass: str, reference: jax.Array | None) -> dict:
     """Measure colouring at one time."""
     settings = hj.colouring(field, [t], mass=mass)
-    seconds, values = timed(hj.hks_spectrum_free, field, [t], mass=mass, method=settings)
+    seconds, values = timed_once(hj.hks_spectrum_free, field, [t], mass=mass, method=settings)
     flat = (4 * np.pi * t) ** (-field.grid.dimension / 2)
     row = {
         "method": "colouring",
@@ -71,7 +62,7 @@ def small() -> Iterator[dict]:
     field = smooth(N)
     t = 4 * field.grid.spacing[0] ** 2
     for mass in ("lumped", "consistent"):
-        seconds, reference = timed(hj.hks_spectrum_free, field, [t], mass=mass, method="selected-inversion")
+        seconds, reference = timed_once(hj.hks_spectrum_free, field, [t], mass=mass, method="selected-inversion")
         yield {"method": "selected inversion", "mass": mass, "t_in_h2": 4.0, "seconds": seconds}
         yield by_colouring(field, t, mass, reference)
 
@@ -80,11 +71,11 @@ def agree() -> Iterator[dict]:
     """Compare with 500 pairs where they suffice."""
     field = smooth(N)
     for mass in ("lumped", "consistent"):
-        seconds, pairs = timed(hj.eigenpairs, field, 500, mass=mass)
+        seconds, pairs = timed_once(hj.eigenpairs, field, 500, mass=mass)
         last = float(pairs.next_eigenvalue)
         yield {"method": "500 pairs", "mass": mass, "solver": pairs.solver_name, "seconds": seconds}
         t = 22 / last
-        seconds, values = timed(hj.hks_spectrum_free, field, [t], mass=mass, method="selected-inversion")
+        seconds, values = timed_once(hj.hks_spectrum_free, field, [t], mass=mass, method="selected-inversion")
         row = {"method": "selected inversion", "mass": mass, "t_in_h2": t / field.grid.spacing[0] ** 2}
         yield row | {"seconds": seconds, "relative_error": relative(values, hj.hks(pairs, [t]))}
         if mass == "lumped":
@@ -103,9 +94,9 @@ def gradient() -> Iterator[dict]:
             moved = hj.TensorField(field.grid, tensors)  # noqa: B023
             return jnp.mean(jnp.log(hj.hks_spectrum_free(moved, times, mass="lumped", method=settings)))  # noqa: B023
 
-        value_s, _ = timed(jax.jit(loss), field.tensors)
+        value_s, _ = timed_once(jax.jit(loss), field.tensors)
         run = jax.jit(jax.grad(loss))
-        seconds, slope = timed(run, field.tensors)
+        seconds, slope = timed_once(run, field.tensors)
         rng = np.random.default_rng(0)
         direction = rng.standard_normal(field.tensors.shape)
         direction = jnp.asarray(direction + np.swapaxes(direction, -1, -2))
