@@ -13,7 +13,7 @@ from hks_jax.eigen.coarsening import Level, interpolate
 from hks_jax.eigen.sharing import EVERYWHERE, own_blocks, shared, to_own_rows, to_slabs
 from hks_jax.eigen.subspace import block_of, local_level, measure, rayleigh_ritz
 from hks_jax.eigen.weyl import weyl
-from hks_jax.fem.columns import stencil_product, to_rows
+from hks_jax.fem.columns import stencil, stencil_product, to_rows
 from hks_jax.fem.halo import Slabs
 
 _GAIN = 40.0
@@ -172,6 +172,7 @@ def _improve(
     dtype = jnp.float32 if plan.single_precision else state.values.dtype
 
     numbers = own_blocks(slabs, plan.size // plan.block)
+    stiffness, mass = stencil(level.stiffness, periodic), stencil(level.mass, periodic)
 
     def filtered(own: Array, vectors: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
         number = numbers[own]
@@ -182,8 +183,8 @@ def _improve(
         )
         # What is in the band itself has no residual worth the name: it is damped as it is.
         inside = zeta > low
-        moved = jnp.where(inside, 0, theta * stencil_product(level.mass, x, periodic))
-        residual = stencil_product(level.stiffness, x, periodic) - moved
+        moved = jnp.where(inside, 0, theta * mass(x))
+        residual = stiffness(x) - moved
         whole = jnp.where(inside, x, 0).astype(dtype)
         z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number], whole, terms)
         z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)

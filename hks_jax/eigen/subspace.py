@@ -1,5 +1,6 @@
 """Rayleigh–Ritz in a subspace of nodal functions kept as rows, block by block, so that memory is bounded."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ from jaxtyping import Array, Float
 from hks_jax.eigen.coarsening import Level
 from hks_jax.eigen.products import combine
 from hks_jax.eigen.sharing import first_of, total
-from hks_jax.fem.columns import product_with_rim, side_by_side, stencil_product, to_columns
+from hks_jax.fem.columns import product_with_rim, side_by_side, stencil, to_columns
 from hks_jax.fem.halo import Slabs
 
 _CHUNK = 1 << 14
@@ -47,8 +48,10 @@ def rayleigh_ritz(
     """
     m, nodes = x.shape
 
+    images_of = _images(level, periodic, slabs)
+
     def products(number: Array) -> tuple[Array, ...]:
-        images = _images(level, periodic, slabs, block_of(x, number, block, level.shape))
+        images = images_of(block_of(x, number, block, level.shape))
         # As columns: were they turned into rows, XLA would compute the stencils in that order, seven times slower.
         return tuple(combine(x, image.reshape(nodes, block)) for image in images)
 
@@ -82,11 +85,12 @@ def measure(
     slabs: Slabs | None = None,
 ) -> Measured:
     """Return how good the pairs are."""
+    images_of = _images(level, periodic, slabs)
 
     def of_block(number: Array) -> tuple[Array, ...]:
         columns = block_of(x, number, block, level.shape)
         theta = jax.lax.dynamic_slice_in_dim(values, number * block, block)
-        image, moved = _images(level, periodic, slabs, columns)
+        image, moved = images_of(columns)
         products = (image - theta * moved) ** 2, moved**2, columns * image, level.lumped[..., None] * columns**2
         return tuple(jnp.sum(p, tuple(range(columns.ndim - 1))) for p in products)
 
@@ -96,12 +100,19 @@ def measure(
 
 
 def _images(
-    level: Level, periodic: tuple[bool, ...], slabs: Slabs | None, columns: Float[Array, "*shape b"]
-) -> tuple[Float[Array, "*shape b"], Float[Array, "*shape b"]]:
-    """Return the columns' products with K and M."""
+    level: Level, periodic: tuple[bool, ...], slabs: Slabs | None
+) -> Callable[[Float[Array, "*shape b"]], tuple[Float[Array, "*shape b"], Float[Array, "*shape b"]]]:
+    """Return the function from columns to their products with K and M: to be made outside the loop it is for."""
     if slabs is None:
-        return stencil_product(level.stiffness, columns, periodic), stencil_product(level.mass, columns, periodic)
-    rimmed = slabs.with_halo(columns)
-    diagonal = level.mass.shape[0] == 1
-    moved = level.mass[0][..., None] * columns if diagonal else product_with_rim(side_by_side(level.mass), rimmed)
-    return product_with_rim(side_by_side(level.stiffness), rimmed), moved
+        stiffness, mass = stencil(level.stiffness, periodic), stencil(level.mass, periodic)
+        return lambda columns: (stiffness(columns), mass(columns))
+    coefficients, diagonal = side_by_side(level.stiffness), level.mass.shape[0] == 1
+    of_mass = level.mass[0][..., None] if diagonal else side_by_side(level.mass)
+
+    def images(columns: Float[Array, "*shape b"]) -> tuple[Float[Array, "*shape b"], Float[Array, "*shape b"]]:
+        rimmed = slabs.with_halo(columns)
+        return product_with_rim(coefficients, rimmed), of_mass * columns if diagonal else product_with_rim(
+            of_mass, rimmed
+        )
+
+    return images
