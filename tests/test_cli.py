@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 
 import equinox as eqx
@@ -449,6 +450,32 @@ def test_ctrl_c_amid_a_computation_leaves_nothing_but_one_line(tmp_path):
     assert (out, err.splitlines()[-1]) == ("", "hks-jax hks: error: interrupted")
     assert "Traceback" not in err
     assert [file.name for file in tmp_path.iterdir()] == ["t.npz"]
+
+
+def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(tmp_path):
+    # The signal comes while a callback runs that the collector calls, where Python discards every exception.
+    script = """
+        import gc, os, signal, time
+        from hks_jax.cli import demo, run_and_exit
+
+        def callback(phase, info):
+            gc.callbacks.remove(callback)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+
+        def run(args):
+            gc.callbacks.append(callback)
+            gc.collect()
+            for _ in range(400):
+                time.sleep(0.1)
+
+        demo.run = run
+        run_and_exit()
+    """
+    program = [sys.executable, "-c", textwrap.dedent(script), "demo"]
+    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=50)
+    assert done.returncode == 130
+    assert (done.stdout, done.stderr) == ("", "hks-jax demo: error: interrupted\n")
 
 
 def test_debug_shows_the_traceback():

@@ -1,8 +1,10 @@
 """The command line, ``hks-jax``: errors become one line on stderr and an exit code."""
 
+import _thread
 import argparse
 import os
 import sys
+import threading
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -94,12 +96,22 @@ def run_and_exit() -> NoReturn:
 
     An interrupt leaves JAX's threads computing, and Python would crash while it takes them down: it leaves at once.
     """
+    sys.unraisablehook = _interrupt_again
     code = main()
     if code == INTERRUPTED:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _interrupt_again(unraisable: "sys.UnraisableHookArgs") -> None:
+    # Python discards what is raised in finalisers and in callbacks of the garbage collector (JAX has one). An interrupt
+    # that lands there comes again a moment later, when the callback is over.
+    if isinstance(unraisable.exc_value, KeyboardInterrupt):
+        threading.Timer(0.05, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _fail(args: argparse.Namespace, message: str, code: int, error: Exception | None = None) -> int:
