@@ -16,7 +16,7 @@ from jaxtyping import Int
 from hks_jax.fem.operators import stencil_pattern
 from hks_jax.fem.space import GridSpace
 
-_CELL = {2: 49, 3: 64}
+_CELL = {2: 25, 3: 64}
 """The number of nodes from which on a cell is divided further: fewer operations against more, smaller batches."""
 
 
@@ -117,10 +117,14 @@ def _bisect(space: GridSpace) -> tuple[np.ndarray, np.ndarray, int]:
         for axis in range(d):
             np.minimum.at(low[:, axis], q, x[:, axis])
             np.maximum.at(high[:, axis], q, x[:, axis])
-        along = x[np.arange(left.size), np.argmax(high - low, axis=1)[q]]
+        longest = np.argmax(high - low, axis=1)
+        along = x[np.arange(left.size), longest[q]]
         ordered = along[np.lexsort((along, q))]
         cut = ordered[np.minimum(np.cumsum(counts) - counts + counts // 2, left.size - 1)]
         separates = along == cut[q]
+        if d == 2:  # two lines of an even number leave equal halves, and batches without padding
+            even = (high - low)[np.arange(fronts), longest] % 2 == 1
+            separates |= even[q] & (along == cut[q] - 1)
         if depth == 0:  # what is cut once more here is no longer periodic
             separates |= np.any((x == 0) & np.asarray(space.periodic), axis=1)
         level[left[separates]] = depth

@@ -5,32 +5,44 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.multifrontal import Factorisation
-from hks_jax.eigen.products import combine, inner_products
+from hks_jax.eigen.products import combine_pieces, components, gram, times
+from hks_jax.fem.operators import OfColumns
 from hks_jax.fem.pencil import Pencil
 from hks_jax.traced import is_traced
 
-_CHUNK = 128
-"""Called plainly, the basis grows by so many rows at a time: projecting on rows that are still empty costs as much."""
+_PIECE = 128
+"""Rows of the basis kept together: blocks are projected on whole pieces, but not on those that are still empty."""
+
+_STRETCH = 8
+"""Called plainly, how many pairs of steps are one computation, between which it can be interrupted."""
 
 
 class _Blocks(NamedTuple):
     """Two neighbouring blocks of the basis, and the image under M of the latter."""
 
-    before: Float[Array, "b n_dof"]
-    block: Float[Array, "b n_dof"]
-    image: Float[Array, "b n_dof"]
+    before: Float[Array, "n_dof b"]
+    block: Float[Array, "n_dof b"]
+    image: Float[Array, "n_dof b"]
     coupling: Float[Array, "b b"]
 
 
-class _Projected(NamedTuple):
-    """Blocks of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, two on the diagonal and two below it."""
+class _State(NamedTuple):
+    """What has been computed so far.
 
-    diagonal: Float[Array, "2 b b"]
-    below: Float[Array, "2 b b"]
+    Attributes:
+        basis: known eigenvectors and the blocks so far, M-orthonormal rows, in pieces; the rest is zero.
+        blocks: the last two blocks, of which the latter is not yet in the basis.
+        diagonal: the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV.
+        below: the blocks below it.
+    """
+
+    basis: tuple[Float[Array, "rows n_dof"], ...]
+    blocks: _Blocks
+    diagonal: Float[Array, "pairs 2 b b"]
+    below: Float[Array, "pairs 2 b b"]
 
 
 def block_lanczos(
@@ -44,131 +56,135 @@ def block_lanczos(
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     Neighbouring blocks are kept orthogonal by the recurrence, and two at a time by one pass against the whole basis,
-    which reads it from memory half as often and leaves it M-orthonormal to rounding. Traced, the steps are a loop of
-    XLA's over a basis of fixed size; called plainly, a loop here, over one that grows.
+    which reads it from memory half as often and leaves it M-orthonormal to rounding. The steps are a loop of XLA's.
 
     Args:
         pencil: K and M.
         factor: the factorisation of K − σM.
         start: the first block, any vectors.
-        known: M-orthonormal eigenvectors, or zero rows.
+        known: M-orthonormal eigenvectors, or zero rows; w a multiple of b.
         steps: how many blocks; even.
         wanted: how many Ritz pairs to return.
 
     Returns:
         The Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors.
     """
-    b = start.shape[0]
     pairs = steps // 2
-    blocks = _begin(pencil, start, known)
-    if is_traced(factor):
-        empty = jnp.zeros((pairs, 2, b, b), start.dtype)
-
-        def body(j: int, state: tuple[Array, _Blocks, _Projected]) -> tuple[Array, _Blocks, _Projected]:
-            rows, blocks, matrix = state
-            (_, rows), blocks, part = _two_steps(pencil, factor, [known, rows], blocks, 2 * j * b)
-            return rows, blocks, _Projected(*(all_.at[j].set(one) for all_, one in zip(matrix, part, strict=True)))
-
-        state = jnp.zeros((steps * b, start.shape[1]), start.dtype), blocks, _Projected(empty, empty)
-        rows, _, matrix = jax.lax.fori_loop(0, pairs, body, state)
-        basis = [known, rows]
-    else:
-        basis, parts = [known], []
-        size = max(_CHUNK // (2 * b), 1) * 2 * b
-        for row in range(0, steps * b, 2 * b):
-            if row % size == 0:
-                basis.append(jnp.zeros((min(size, steps * b - row), start.shape[1]), start.dtype))
-            basis, blocks, part = _two_steps(pencil, factor, basis, blocks, row % size)
-            parts.append(part)
-        matrix = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-    return _ritz_pairs(matrix, basis[1:], wanted)
+    state = _begin(pencil, start, known, pairs)
+    stretch = pairs if is_traced(factor) else _STRETCH
+    for first in range(0, pairs, stretch):
+        state = _advance(pencil, factor, state, len(known), first, min(first + stretch, pairs))
+    return _ritz_pairs(state, len(known), wanted)
 
 
-def _two_steps(
-    pencil: Pencil, factor: Factorisation, basis: list[Array], blocks: _Blocks, row: int | Array
-) -> tuple[list[Array], _Blocks, _Projected]:
-    """Write the last block and one more into the basis, and return the block that follows these."""
-    b = blocks.block.shape[0]
-    diagonal, rest = _recur(blocks, factor.solve(blocks.image))
-    middle, image, coupling = _orthonormal(pencil, rest)
-    diagonal_2, rest = _recur(_Blocks(blocks.block, middle, image, coupling), factor.solve(image))
-    basis = [*basis[:-1], _write(basis[-1], blocks.block, row)]
-    both, images = _join(pencil, middle, image, rest)
-    for rows in basis:
-        both = _project(rows, both, images)
-    middle, rest = _part(both, image)
-    basis = [*basis[:-1], _write(basis[-1], middle, row + b)]
-    following, image, coupling_2 = _orthonormal(pencil, rest)
-    part = _Projected(jnp.stack([diagonal, diagonal_2]), jnp.stack([coupling, coupling_2]))
-    return basis, _Blocks(middle, following, image, coupling_2), part
-
-
-@jax.jit
-def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "w n_dof"]) -> _Blocks:
-    """Return the first block."""
-    block = start
+@partial(jax.jit, static_argnames="pairs")
+def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "w n_dof"], pairs: int) -> _State:
+    """Return the state before the first step: the first block is orthogonal to what is known."""
+    mass, block, b = pencil.mass.of_columns(), start.T, len(start)
     for _ in range(2):
-        block, image, _ = _orthonormal(pencil, _project(known, block, pencil.mass.apply(block)))
-    return _Blocks(jnp.zeros_like(block), block, image, jnp.zeros((len(start), len(start)), start.dtype))
+        block = block - components(known, mass(block)).T
+        block, image, _ = _orthonormal(mass, block, mass(block))
+    piece, rows = max(_PIECE // b, 1) * b, len(known) + 2 * pairs * b
+    basis = []
+    for at in range(0, rows, piece):
+        part = known[at : at + piece]
+        basis.append(jnp.pad(part, ((0, min(piece, rows - at) - len(part)), (0, 0))))
+    none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((pairs, 2, b, b), start.dtype)
+    return _State(tuple(basis), _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix)
 
 
-@jax.jit
-def _recur(blocks: _Blocks, x: Float[Array, "b n_dof"]) -> tuple[Float[Array, "b b"], Float[Array, "b n_dof"]]:
+@partial(jax.jit, static_argnames="offset", donate_argnames="state")
+def _advance(
+    pencil: Pencil, factor: Factorisation, state: _State, offset: int, first: int | Array, last: int | Array
+) -> _State:
+    """Take the pairs of steps from the first to before the last; their blocks begin at the basis' row ``offset``."""
+    mass, b = pencil.mass.of_columns(), state.blocks.block.shape[1]
+
+    def two_steps(pair: Array, state: _State) -> _State:
+        # Write the last block and one more into the basis, and find the block that follows these.
+        row = offset + 2 * b * pair
+        _, block, image, _ = state.blocks
+        diagonal, rest = _recur(state.blocks, factor.solve_columns(image))
+        middle, image, coupling = _orthonormal(mass, rest, mass(rest))
+        diagonal_2, rest = _recur(_Blocks(block, middle, image, coupling), factor.solve_columns(image))
+        basis, rest_image = _write(state.basis, block, row), mass(rest)
+        parts = _within(basis, jnp.concatenate([image, rest_image], axis=1), row + b)
+        middle, rest = middle - parts[:b].T, rest - parts[b:].T
+        rest = rest - times(middle, gram(image, rest))
+        basis = _write(basis, middle, row + b)
+        # What the projection takes away is too little to change the image of what it leaves.
+        following, image, coupling_2 = _orthonormal(mass, rest, rest_image)
+        return _State(
+            basis,
+            _Blocks(middle, following, image, coupling_2),
+            state.diagonal.at[pair].set(jnp.stack([diagonal, diagonal_2])),
+            state.below.at[pair].set(jnp.stack([coupling, coupling_2])),
+        )
+
+    return jax.lax.fori_loop(first, last, two_steps, state)
+
+
+def _recur(blocks: _Blocks, x: Float[Array, "n_dof b"]) -> tuple[Float[Array, "b b"], Float[Array, "n_dof b"]]:
     """Return what x = (K − σM)⁻¹M · block has in the block itself, and x without that block and the one before."""
     before, block, image, coupling = blocks
-    diagonal = inner_products(image, x)
+    diagonal = gram(image, x)
     diagonal = (diagonal + diagonal.T) / 2
-    return diagonal, x - combine(diagonal, block) - combine(coupling.T, before)
+    return diagonal, x - times(block, diagonal) - times(before, coupling)
 
 
-@jax.jit
-def _orthonormal(pencil: Pencil, x: Float[Array, "b n_dof"]) -> tuple[Array, Array, Float[Array, "b b"]]:
-    """Return M-orthonormal rows y, My, and the factor R of x = Ry."""
-    total = jnp.eye(x.shape[0], dtype=x.dtype)
-    for _ in range(2):
-        image = pencil.mass.apply(x)
-        gram = inner_products(x, image)
-        norms = jnp.sqrt(jnp.diagonal(gram))
+def _orthonormal(
+    mass: OfColumns, x: Float[Array, "n_dof b"], image: Float[Array, "n_dof b"]
+) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"], Float[Array, "b b"]]:
+    """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ; the image of x is given."""
+    total = jnp.eye(x.shape[1], dtype=x.dtype)
+    for again in (False, True):
+        image = mass(x) if again else image
+        products = gram(x, image)
+        norms = jnp.sqrt(jnp.diagonal(products))
         norms = jnp.where(norms > 0, norms, 1)
-        sizes, mix = jnp.linalg.eigh(gram / norms / norms[:, None])
+        sizes, mix = jnp.linalg.eigh(products / norms / norms[:, None])
         sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(x.dtype).eps * sizes[-1]))
-        change = (mix / sizes / norms[:, None]).T
-        x = combine(change, x)
-        total = jnp.matmul(total, norms[:, None] * mix * sizes, precision="highest")
-    return x, combine(change, image), total
+        change = mix / sizes / norms[:, None]
+        x = times(x, change)
+        total = times(total, norms[:, None] * mix * sizes)
+    return x, times(image, change), total
 
 
-@jax.jit
-def _project(basis: Float[Array, "rows n_dof"], x: Array, image: Array) -> Array:
-    """Return x, whose image under M is given, orthogonal to the basis."""
-    return x - combine(inner_products(basis, image), basis)
+def _within(
+    basis: tuple[Float[Array, "rows n_dof"], ...], images: Float[Array, "n_dof c"], filled: Array
+) -> Float[Array, "n_dof c"]:
+    """Return what vectors, whose images under M are given, have in the first rows of the basis."""
+
+    def add(rows: Array, parts: Array) -> Array:
+        return parts + components(rows, images)
+
+    parts, at = jnp.zeros(images.shape[::-1], images.dtype), 0
+    for rows in basis:
+        parts = jax.lax.cond(filled > at, add, lambda _, parts: parts, rows, parts)
+        at += len(rows)
+    return jax.lax.optimization_barrier(parts)
 
 
-@jax.jit
-def _join(pencil: Pencil, middle: Array, image: Array, rest: Array) -> tuple[Array, Array]:
-    """Return two blocks as one, and their images under M."""
-    return jnp.concatenate([middle, rest]), jnp.concatenate([image, pencil.mass.apply(rest)])
+def _write(
+    basis: tuple[Float[Array, "rows n_dof"], ...], block: Float[Array, "n_dof b"], row: Array
+) -> tuple[Float[Array, "rows n_dof"], ...]:
+    """Return the basis with the block as its rows from the given one on."""
+    block, written, at = jax.lax.optimization_barrier(block.T), [], 0
+    for rows in basis:
+        here, place = (row >= at) & (row < at + len(rows)), jnp.clip(row - at, 0, len(rows) - len(block))
+        old = jax.lax.dynamic_slice_in_dim(rows, place, len(block))
+        written.append(jax.lax.dynamic_update_slice_in_dim(rows, jnp.where(here, block, old), place, axis=0))
+        at += len(rows)
+    return tuple(written)
 
 
-@jax.jit
-def _part(both: Array, image: Array) -> tuple[Array, Array]:
-    """Return two blocks apart, the latter orthogonal to the former, whose image under M is given."""
-    middle, rest = jnp.split(both, 2)
-    return middle, rest - combine(inner_products(image, rest), middle)
-
-
-@partial(jax.jit, donate_argnums=0)
-def _write(basis: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], row: int | Array) -> Array:
-    return jax.lax.dynamic_update_slice_in_dim(basis, block, row, axis=0)
-
-
-@partial(jax.jit, static_argnames="wanted")
+@partial(jax.jit, static_argnames=("offset", "wanted"))
 def _ritz_pairs(
-    matrix: _Projected, basis: list[Float[Array, "rows n_dof"]], wanted: int
+    state: _State, offset: int, wanted: int
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
-    pairs, _, b, _ = matrix.diagonal.shape
+    pairs, _, b, _ = state.diagonal.shape
     steps = 2 * pairs
-    diagonal, below = matrix.diagonal.reshape(steps, b, b), matrix.below.reshape(steps, b, b)[:-1]
+    diagonal, below = state.diagonal.reshape(steps, b, b), state.below.reshape(steps, b, b)[:-1]
     full = jnp.zeros((steps, b, steps, b), diagonal.dtype)
     i = jnp.arange(steps)
     full = full.at[i, :, i, :].set(diagonal)
@@ -176,9 +192,4 @@ def _ritz_pairs(
     full = full.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
     theta, modes = jnp.linalg.eigh(full.reshape(steps * b, steps * b))
     order = jnp.argsort(-jnp.abs(theta))[:wanted]
-    ends = np.cumsum([len(rows) for rows in basis])[:-1]
-    mixes = jnp.split(modes[:, order].T, ends, axis=1)
-    vectors = jnp.zeros((), diagonal.dtype)
-    for mix, rows in zip(mixes, basis, strict=True):
-        vectors = vectors + combine(mix, rows)
-    return theta[order], vectors
+    return theta[order], combine_pieces(jnp.pad(modes[:, order].T, ((0, 0), (offset, 0))), state.basis)

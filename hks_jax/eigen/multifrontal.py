@@ -36,6 +36,10 @@ class Factorisation(eqx.Module):
 
     def solve(self, rhs: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
         """Solve (K − σM) x = rhs for each row."""
+        return _solve(self, rhs.T).T
+
+    def solve_columns(self, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+        """Solve (K − σM) x = rhs for each column."""
         return _solve(self, rhs)
 
 
@@ -74,13 +78,13 @@ def _eliminate(
 
 
 @jax.jit
-def _solve(factor: Factorisation, rhs: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
-    columns, width = rhs.T, rhs.shape[0]
+def _solve(factor: Factorisation, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+    width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None
     for level, matrix in zip(factor.dissection.levels[::-1], factor.downward[::-1], strict=True):
         s = level.own.shape[1]
-        force, onward = _gather(columns, level.own), jnp.zeros((), rhs.dtype)
+        force, onward = _gather(rhs, level.own), jnp.zeros((), rhs.dtype)
         if passed is not None:
             total = _gather(passed, level.children[0]) + _gather(passed, level.children[1])
             force, onward = force + total[:, :s], total[:, s:]
@@ -94,7 +98,7 @@ def _solve(factor: Factorisation, rhs: Float[Array, "b n_dof"]) -> Float[Array, 
         x = own.pop() - jnp.matmul(matrix, boundary, precision="highest")
         above = jnp.concatenate([x, boundary], axis=1).reshape(-1, width)
         solutions.append(x.reshape(-1, width))
-    return jnp.concatenate(solutions)[factor.dissection.order].T
+    return jnp.concatenate(solutions)[factor.dissection.order]
 
 
 def _coefficients(pencil: Pencil, shift: Float[Array, ""]) -> Float[Array, " entries"]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.eigen.dissection import Dissection
 from hks_jax.eigen.lanczos import block_lanczos
 from hks_jax.eigen.multifrontal import Factorisation, factorise
-from hks_jax.eigen.quality import ROWS, indistinct, rayleigh_quotient, relative_defect
+from hks_jax.eigen.quality import indistinct, quotients_and_defects
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 
@@ -46,8 +46,8 @@ class Plan(NamedTuple):
 
     @property
     def ritz(self) -> int:
-        """Ritz pairs looked at in each slice."""
-        return min(self.block * self.steps, self.slice_size * 6 // 5)
+        """Ritz pairs looked at in each slice, in whole blocks."""
+        return min(self.steps, -(-self.slice_size * 6 // 5 // self.block)) * self.block
 
     @property
     def window(self) -> int:
@@ -55,7 +55,8 @@ class Plan(NamedTuple):
 
         Those far away are not found before what is nearer, but of a large multiplet a slice finds only a part.
         """
-        return max(self.slice_size // 4, min(self.slice_size // 2, 48))
+        size = max(self.slice_size // 4, min(self.slice_size // 2, 48))
+        return -(-size // self.block) * self.block
 
     @property
     def capacity(self) -> int:
@@ -206,11 +207,7 @@ def _accept(
     shift, index = state.shift, jnp.arange(plan.capacity)
     near = shift + 1 / theta
 
-    def measure(vector: Float[Array, " n_dof"]) -> tuple[Array, Array]:
-        value = rayleigh_quotient(pencil, vector)
-        return value, relative_defect(pencil, value, vector)
-
-    values, residuals = jax.lax.map(measure, vectors, batch_size=ROWS)
+    values, residuals = quotients_and_defects(pencil, vectors, plan.block)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[pencil.space.n_null]
     scale = jnp.maximum(jnp.abs(values), first_nonzero)
     rounding = jnp.minimum(indistinct(pencil, values.dtype) / scale, 0.01)

@@ -1,6 +1,7 @@
 """Symmetric linear operators on a function space: stencils on grids, triplets on meshes, diagonals."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
 
@@ -12,9 +13,11 @@ from jaxtyping import Array, Float
 from scipy.sparse import coo_matrix, csc_matrix
 
 from hks_jax.domain.static_array import StaticArray
+from hks_jax.fem.columns import stencil
 from hks_jax.fem.space import FunctionSpace, GridSpace
 
 Pattern = tuple[np.ndarray, np.ndarray]
+OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 
 _ROWS, _LARGE = 8, 1 << 22
 """Large arrays are multiplied in blocks of so many rows, written out one by one: the transpose, which sums over the
@@ -29,6 +32,10 @@ class Operator(eqx.Module):
     @abstractmethod
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""
+
+    def of_columns(self) -> OfColumns:
+        """Return the product with a block of columns; for products in a loop, call this outside."""
+        return lambda x: self.apply(x.T).T
 
     @abstractmethod
     def triplets(self) -> tuple[Float[Array, " nnz"], Pattern]:
@@ -103,6 +110,20 @@ class StencilOperator(Operator):
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""
         return self.space.restrict(self.apply_nodal(self.space.extend(x, outside=0.0)))
+
+    def of_columns(self) -> OfColumns:
+        """Return the product with a block of columns, twice as fast as with rows."""
+        product_with, shape = stencil(self.coefficients, self.space.periodic), self.space.node_shape
+        free, numbers = np.flatnonzero(self.space.free), self.space.degrees_of_freedom
+        if free.size == numbers.size:
+            return lambda x: product_with(x.reshape(*shape, -1)).reshape(x.shape)
+        numbers = np.where(numbers < 0, free.size, numbers)  # out of range, where there is none
+
+        def product_of_free(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+            nodal = x.at[numbers].get(mode="fill", fill_value=0)
+            return product_with(nodal.reshape(*shape, -1)).reshape(nodal.shape)[free]
+
+        return product_of_free
 
     def triplets(self) -> tuple[Float[Array, " nnz"], Pattern]:
         """Return the entries and their static (rows, columns)."""
@@ -185,6 +206,10 @@ class DiagonalOperator(Operator):
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""
         return self.entries * x
+
+    def of_columns(self) -> OfColumns:
+        """Return the product with a block of columns."""
+        return lambda x: self.entries[:, None] * x
 
     def triplets(self) -> tuple[Float[Array, " nnz"], Pattern]:
         """Return the entries and their static (rows, columns)."""
