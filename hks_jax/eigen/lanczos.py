@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.multifrontal import Factorisation
 from hks_jax.eigen.products import combine_pieces, components, gram, times
@@ -41,8 +41,8 @@ class _State(NamedTuple):
 
     basis: tuple[Float[Array, "rows n_dof"], ...]
     blocks: _Blocks
-    diagonal: Float[Array, "pairs 2 b b"]
-    below: Float[Array, "pairs 2 b b"]
+    diagonal: Float[Array, "room 2 b b"]
+    below: Float[Array, "room 2 b b"]
 
 
 def block_lanczos(
@@ -50,7 +50,8 @@ def block_lanczos(
     factor: Factorisation,
     start: Float[Array, "b n_dof"],
     known: Float[Array, "w n_dof"],
-    steps: int,
+    room: int,
+    pairs: Int[Array, ""],
     wanted: int,
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
@@ -63,33 +64,36 @@ def block_lanczos(
         factor: the factorisation of K − σM.
         start: the first block, any vectors.
         known: M-orthonormal eigenvectors, or zero rows; w a multiple of b.
-        steps: how many blocks; even.
+        room: for how many pairs of blocks there is room; static.
+        pairs: how many pairs of blocks to compute.
         wanted: how many Ritz pairs to return.
 
     Returns:
-        The Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors.
+        The Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors; zero where there are
+        fewer.
     """
-    pairs = steps // 2
-    state = _begin(pencil, start, known, pairs)
-    stretch = pairs if is_traced(factor) else _STRETCH
-    for first in range(0, pairs, stretch):
-        state = _advance(pencil, factor, state, len(known), first, min(first + stretch, pairs))
+    state = _begin(pencil, start, known, room)
+    if is_traced(factor):
+        state = _advance(pencil, factor, state, len(known), 0, pairs)
+    else:
+        for first in range(0, int(pairs), _STRETCH):
+            state = _advance(pencil, factor, state, len(known), first, min(first + _STRETCH, int(pairs)))
     return _ritz_pairs(state, len(known), wanted)
 
 
-@partial(jax.jit, static_argnames="pairs")
-def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "w n_dof"], pairs: int) -> _State:
+@partial(jax.jit, static_argnames="room")
+def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "w n_dof"], room: int) -> _State:
     """Return the state before the first step: the first block is orthogonal to what is known."""
     mass, block, b = pencil.mass.of_columns(), start.T, len(start)
     for _ in range(2):
         block = block - components(known, mass(block)).T
         block, image, _ = _orthonormal(mass, block, mass(block))
-    piece, rows = max(_PIECE // b, 1) * b, len(known) + 2 * pairs * b
+    piece, rows = max(_PIECE // b, 1) * b, len(known) + 2 * room * b
     basis = []
     for at in range(0, rows, piece):
         part = known[at : at + piece]
         basis.append(jnp.pad(part, ((0, min(piece, rows - at) - len(part)), (0, 0))))
-    none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((pairs, 2, b, b), start.dtype)
+    none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, 2, b, b), start.dtype)
     return _State(tuple(basis), _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix)
 
 
@@ -182,8 +186,8 @@ def _write(
 def _ritz_pairs(
     state: _State, offset: int, wanted: int
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
-    pairs, _, b, _ = state.diagonal.shape
-    steps = 2 * pairs
+    room, _, b, _ = state.diagonal.shape
+    steps = 2 * room
     diagonal, below = state.diagonal.reshape(steps, b, b), state.below.reshape(steps, b, b)[:-1]
     full = jnp.zeros((steps, b, steps, b), diagonal.dtype)
     i = jnp.arange(steps)

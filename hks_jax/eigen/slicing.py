@@ -33,21 +33,24 @@ class Plan(NamedTuple):
     Attributes:
         wanted: how many eigenpairs.
         block: vectors per Lanczos block.
-        steps: blocks per slice.
         slice_size: eigenvalues that a slice is expected to find, half of them below its shift.
         max_slices: factorisations before giving up.
     """
 
     wanted: int
     block: int
-    steps: int
     slice_size: int
     max_slices: int
 
     @property
+    def pairs(self) -> int:
+        """Pairs of Lanczos blocks that a slice takes at most."""
+        return int(pairs_for(self, self.slice_size))
+
+    @property
     def ritz(self) -> int:
         """Ritz pairs looked at in each slice, in whole blocks."""
-        return min(self.steps, -(-self.slice_size * 6 // 5 // self.block)) * self.block
+        return min(2 * self.pairs, -(-self.slice_size * 6 // 5 // self.block)) * self.block
 
     @property
     def window(self) -> int:
@@ -62,6 +65,14 @@ class Plan(NamedTuple):
     def capacity(self) -> int:
         """Room for eigenpairs."""
         return self.wanted + self.block + self.ritz
+
+
+def pairs_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
+    """Return how many pairs of Lanczos blocks find so many eigenvalues.
+
+    Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
+    """
+    return -(-(21 * size + 120 * plan.block) // (20 * plan.block))
 
 
 class State(NamedTuple):
@@ -168,22 +179,25 @@ def _consider(
 
 def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State) -> State:
     """Find the eigenpairs around the shift."""
-    window, low, high = _window(plan, state)
-    theta, vectors = block_lanczos(pencil, factor, state.start, window, plan.steps, plan.ritz)
+    window, low, high, pairs = _window(plan, state)
+    theta, vectors = block_lanczos(pencil, factor, state.start, window, plan.pairs, pairs, plan.ritz)
     rest = state._replace(vectors=None)
     return _accept(pencil, factor.negative, plan, tolerance, theta, vectors, low, high, state.vectors, rest)
 
 
 @partial(jax.jit, static_argnames="plan")
-def _window(plan: Plan, state: State) -> tuple[Float[Array, "window n_dof"], Float[Array, ""], Float[Array, ""]]:
-    """Return the known eigenvectors nearest to the shift, and the interval in which nothing else is known."""
+def _window(plan: Plan, state: State) -> tuple[Float[Array, "window n_dof"], Array, Array, Int[Array, ""]]:
+    """Return the known eigenvectors nearest to the shift, the interval in which nothing else is known, and how many
+    pairs of steps to take: the last slice has fewer eigenvalues to find."""
     assert state.vectors is not None
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))
     window = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
     others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest[: plan.window]), jnp.nan, state.values)
     low = jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf)
     high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
-    return window, low, high
+    left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
+    size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2, plan.slice_size)
+    return window, low, high, jnp.minimum(pairs_for(plan, size), plan.pairs)
 
 
 @partial(jax.jit, static_argnames=("plan", "tolerance"), donate_argnames="known_vectors")
@@ -215,7 +229,7 @@ def _accept(
     # Above the first that did not converge, or farther away than those looked at, some are missing.
     above = near > shift
     limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
-    reach = shift + 1 / jnp.min(jnp.abs(theta))
+    reach = shift + 1 / jnp.min(jnp.where(theta != 0, jnp.abs(theta), jnp.inf))
     accepted = converged & (values > low) & (values < jnp.minimum(jnp.minimum(limit, reach), high))
 
     order = jnp.argsort(jnp.where(accepted, values, jnp.inf))
