@@ -140,7 +140,7 @@ def test_eigenvalues_are_counted_without_being_computed(rng, domain):
 
 
 def test_eigenvalues_found_beyond_those_wanted_are_forgotten():
-    plan = Plan(wanted=5, block=2, steps=4, slice_size=5, max_slices=9)
+    plan = Plan(wanted=5, block=2, slice_size=5, max_slices=9)
     values = jnp.asarray(np.random.default_rng(0).permutation(plan.capacity).astype(float))
     state = jax.eval_shape(partial(first_state, plan=plan), hj.assemble(flat((12, 12), (1.0, 1.0))))
     state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state)

@@ -7,14 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from hks_jax.eigen.basis import Basis, begin, combined, within, write
 from hks_jax.eigen.multifrontal import Factorisation
-from hks_jax.eigen.products import combine_pieces, components, gram, times
+from hks_jax.eigen.products import combine, gram, products_with_columns, times
 from hks_jax.fem.operators import OfColumns
 from hks_jax.fem.pencil import Pencil
 from hks_jax.traced import is_traced
-
-_PIECE = 128
-"""Rows of the basis kept together: blocks are projected on whole pieces, but not on those that are still empty."""
 
 _STRETCH = 8
 """Called plainly, how many pairs of steps are one computation, between which it can be interrupted."""
@@ -33,13 +31,13 @@ class _State(NamedTuple):
     """What has been computed so far.
 
     Attributes:
-        basis: known eigenvectors and the blocks so far, M-orthonormal rows, in pieces; the rest is zero.
+        basis: known eigenvectors and the blocks so far, M-orthonormal rows; the rest is zero.
         blocks: the last two blocks, of which the latter is not yet in the basis.
         diagonal: the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV.
         below: the blocks below it.
     """
 
-    basis: tuple[Float[Array, "rows n_dof"], ...]
+    basis: Basis
     blocks: _Blocks
     diagonal: Float[Array, "room 2 b b"]
     below: Float[Array, "room 2 b b"]
@@ -78,7 +76,7 @@ def block_lanczos(
     else:
         for first in range(0, int(pairs), _STRETCH):
             state = _advance(pencil, factor, state, len(known), first, min(first + _STRETCH, int(pairs)))
-    return _ritz_pairs(state, len(known), wanted)
+    return _ritz_pairs(state, len(known), pairs, wanted)
 
 
 @partial(jax.jit, static_argnames="room")
@@ -86,15 +84,11 @@ def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "
     """Return the state before the first step: the first block is orthogonal to what is known."""
     mass, block, b = pencil.mass.of_columns(), start.T, len(start)
     for _ in range(2):
-        block = block - components(known, mass(block)).T
-        block, image, _ = _orthonormal(mass, block, mass(block))
-    piece, rows = max(_PIECE // b, 1) * b, len(known) + 2 * room * b
-    basis = []
-    for at in range(0, rows, piece):
-        part = known[at : at + piece]
-        basis.append(jnp.pad(part, ((0, min(piece, rows - at) - len(part)), (0, 0))))
+        block = block - combine(products_with_columns(known, mass(block)).T, known).T
+        block, image, _ = _orthonormal(mass, block)
+    basis = begin(known, len(known) + 2 * room * b, b)
     none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, 2, b, b), start.dtype)
-    return _State(tuple(basis), _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix)
+    return _State(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix)
 
 
 @partial(jax.jit, static_argnames="offset", donate_argnames="state")
@@ -109,15 +103,14 @@ def _advance(
         row = offset + 2 * b * pair
         _, block, image, _ = state.blocks
         diagonal, rest = _recur(state.blocks, factor.solve_columns(image))
-        middle, image, coupling = _orthonormal(mass, rest, mass(rest))
+        middle, image, coupling = _orthonormal(mass, rest)
         diagonal_2, rest = _recur(_Blocks(block, middle, image, coupling), factor.solve_columns(image))
-        basis, rest_image = _write(state.basis, block, row), mass(rest)
-        parts = _within(basis, jnp.concatenate([image, rest_image], axis=1), row + b)
+        basis = write(state.basis, block, row)
+        parts = within(basis, jnp.concatenate([image, mass(rest)], axis=1), row + b)
         middle, rest = middle - parts[:b].T, rest - parts[b:].T
         rest = rest - times(middle, gram(image, rest))
-        basis = _write(basis, middle, row + b)
-        # What the projection takes away is too little to change the image of what it leaves.
-        following, image, coupling_2 = _orthonormal(mass, rest, rest_image)
+        basis = write(basis, middle, row + b)
+        following, image, coupling_2 = _orthonormal(mass, rest)
         return _State(
             basis,
             _Blocks(middle, following, image, coupling_2),
@@ -137,12 +130,12 @@ def _recur(blocks: _Blocks, x: Float[Array, "n_dof b"]) -> tuple[Float[Array, "b
 
 
 def _orthonormal(
-    mass: OfColumns, x: Float[Array, "n_dof b"], image: Float[Array, "n_dof b"]
+    mass: OfColumns, x: Float[Array, "n_dof b"]
 ) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"], Float[Array, "b b"]]:
-    """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ; the image of x is given."""
+    """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ."""
     total = jnp.eye(x.shape[1], dtype=x.dtype)
-    for again in (False, True):
-        image = mass(x) if again else image
+    for _ in range(2):
+        image = mass(x)
         products = gram(x, image)
         norms = jnp.sqrt(jnp.diagonal(products))
         norms = jnp.where(norms > 0, norms, 1)
@@ -154,46 +147,19 @@ def _orthonormal(
     return x, times(image, change), total
 
 
-def _within(
-    basis: tuple[Float[Array, "rows n_dof"], ...], images: Float[Array, "n_dof c"], filled: Array
-) -> Float[Array, "n_dof c"]:
-    """Return what vectors, whose images under M are given, have in the first rows of the basis."""
-
-    def add(rows: Array, parts: Array) -> Array:
-        return parts + components(rows, images)
-
-    parts, at = jnp.zeros(images.shape[::-1], images.dtype), 0
-    for rows in basis:
-        parts = jax.lax.cond(filled > at, add, lambda _, parts: parts, rows, parts)
-        at += len(rows)
-    return jax.lax.optimization_barrier(parts)
-
-
-def _write(
-    basis: tuple[Float[Array, "rows n_dof"], ...], block: Float[Array, "n_dof b"], row: Array
-) -> tuple[Float[Array, "rows n_dof"], ...]:
-    """Return the basis with the block as its rows from the given one on."""
-    block, written, at = jax.lax.optimization_barrier(block.T), [], 0
-    for rows in basis:
-        here, place = (row >= at) & (row < at + len(rows)), jnp.clip(row - at, 0, len(rows) - len(block))
-        old = jax.lax.dynamic_slice_in_dim(rows, place, len(block))
-        written.append(jax.lax.dynamic_update_slice_in_dim(rows, jnp.where(here, block, old), place, axis=0))
-        at += len(rows)
-    return tuple(written)
-
-
 @partial(jax.jit, static_argnames=("offset", "wanted"))
 def _ritz_pairs(
-    state: _State, offset: int, wanted: int
+    state: _State, offset: int, pairs: Int[Array, ""], wanted: int
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
     room, _, b, _ = state.diagonal.shape
     steps = 2 * room
-    diagonal, below = state.diagonal.reshape(steps, b, b), state.below.reshape(steps, b, b)[:-1]
-    full = jnp.zeros((steps, b, steps, b), diagonal.dtype)
     i = jnp.arange(steps)
-    full = full.at[i, :, i, :].set(diagonal)
+    # The last block is coupled to one that is not in the basis.
+    below = jnp.where((i < 2 * pairs - 1)[:, None, None], state.below.reshape(steps, b, b), 0)[:-1]
+    full = jnp.zeros((steps, b, steps, b), below.dtype)
+    full = full.at[i, :, i, :].set(state.diagonal.reshape(steps, b, b))
     full = full.at[i[:-1], :, i[1:], :].set(below)
     full = full.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
     theta, modes = jnp.linalg.eigh(full.reshape(steps * b, steps * b))
     order = jnp.argsort(-jnp.abs(theta))[:wanted]
-    return theta[order], combine_pieces(jnp.pad(modes[:, order].T, ((0, 0), (offset, 0))), state.basis)
+    return theta[order], combined(jnp.pad(modes[:, order].T, ((0, 0), (offset, 0))), state.basis)

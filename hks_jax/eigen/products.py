@@ -2,11 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
-
-_NODES = 2048
-"""Columns of a basis combined at once: its rows and what comes of them stay in the cache."""
 
 
 def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
@@ -24,25 +20,9 @@ def combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array
     return jnp.matmul(mix, basis, precision="highest")
 
 
-def combine_pieces(mix: Float[Array, "q m"], basis: tuple[Float[Array, "rows n"], ...]) -> Float[Array, "q n"]:
-    """Return many linear combinations of a basis that is kept in pieces."""
-    n = basis[0].shape[1]
-    width = min(_NODES, n)
-    mixes = jnp.split(mix, np.cumsum([len(rows) for rows in basis])[:-1], axis=1)
-
-    def some(number: Array, found: Float[Array, "q n"]) -> Float[Array, "q n"]:
-        at = jnp.minimum(number * width, n - width)  # the last may overlap the one before
-        pieces = [jax.lax.dynamic_slice_in_dim(rows, at, width, axis=1) for rows in basis]
-        sums = sum(map(combine, mixes, pieces), jnp.zeros((), mix.dtype))
-        return jax.lax.dynamic_update_slice_in_dim(found, sums, at, axis=1)
-
-    return jax.lax.fori_loop(0, -(-n // width), some, jnp.zeros((len(mix), n), mix.dtype))
-
-
-def components(basis: Float[Array, "m n"], images: Float[Array, "n c"]) -> Float[Array, "c n"]:
-    """Return what columns, whose images under the inner product are given, have in an orthonormal basis, as rows."""
-    products = jax.lax.optimization_barrier(jnp.matmul(basis, images, precision="highest"))
-    return combine(products.T, basis)
+def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
+    """Return the inner products; the barrier keeps XLA from turning them round."""
+    return jax.lax.optimization_barrier(jnp.matmul(basis, columns, precision="highest"))
 
 
 def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
