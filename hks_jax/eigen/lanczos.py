@@ -14,8 +14,8 @@ from hks_jax.fem.operators import OfColumns
 from hks_jax.fem.pencil import Pencil
 from hks_jax.traced import is_traced
 
-_STRETCH = 8
-"""Called plainly, how many pairs of steps are one computation, between which it can be interrupted."""
+_STRETCH = 16
+"""Called plainly, how many steps are one computation, between which it can be interrupted."""
 
 
 class _Blocks(NamedTuple):
@@ -39,17 +39,17 @@ class _State(NamedTuple):
 
     basis: Basis
     blocks: _Blocks
-    diagonal: Float[Array, "room 2 b b"]
-    below: Float[Array, "room 2 b b"]
+    diagonal: Float[Array, "steps b b"]
+    below: Float[Array, "steps b b"]
 
 
 def block_lanczos(
     pencil: Pencil,
     factor: Factorisation,
-    start: Float[Array, "b n_dof"],
+    start: Float[Array, "n_dof b"],
     known: Float[Array, "w n_dof"],
     room: int,
-    pairs: Int[Array, ""],
+    steps: int | Int[Array, ""],
     wanted: int,
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
@@ -62,8 +62,8 @@ def block_lanczos(
         factor: the factorisation of K − σM.
         start: the first block, any vectors.
         known: M-orthonormal eigenvectors, or zero rows; w a multiple of b.
-        room: for how many pairs of blocks there is room; static.
-        pairs: how many pairs of blocks to compute.
+        room: for how many blocks there is room; static.
+        steps: how many blocks to compute; even.
         wanted: how many Ritz pairs to return.
 
     Returns:
@@ -72,22 +72,22 @@ def block_lanczos(
     """
     state = _begin(pencil, start, known, room)
     if is_traced(factor):
-        state = _advance(pencil, factor, state, len(known), 0, pairs)
+        state = _advance(pencil, factor, state, len(known), 0, steps)
     else:
-        for first in range(0, int(pairs), _STRETCH):
-            state = _advance(pencil, factor, state, len(known), first, min(first + _STRETCH, int(pairs)))
-    return _ritz_pairs(state, len(known), pairs, wanted)
+        for first in range(0, int(steps), _STRETCH):
+            state = _advance(pencil, factor, state, len(known), first, min(first + _STRETCH, int(steps)))
+    return _ritz_pairs(state, len(known), steps, wanted)
 
 
 @partial(jax.jit, static_argnames="room")
-def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "w n_dof"], room: int) -> _State:
+def _begin(pencil: Pencil, start: Float[Array, "n_dof b"], known: Float[Array, "w n_dof"], room: int) -> _State:
     """Return the state before the first step: the first block is orthogonal to what is known."""
-    mass, block, b = pencil.mass.of_columns(), start.T, len(start)
+    mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2):
         block = block - combine(products_with_columns(known, mass(block)).T, known).T
         block, image, _ = _orthonormal(mass, block)
-    basis = begin(known, len(known) + 2 * room * b, b)
-    none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, 2, b, b), start.dtype)
+    basis = begin(known, len(known) + room * b, b)
+    none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, b, b), start.dtype)
     return _State(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix)
 
 
@@ -95,30 +95,30 @@ def _begin(pencil: Pencil, start: Float[Array, "b n_dof"], known: Float[Array, "
 def _advance(
     pencil: Pencil, factor: Factorisation, state: _State, offset: int, first: int | Array, last: int | Array
 ) -> _State:
-    """Take the pairs of steps from the first to before the last; their blocks begin at the basis' row ``offset``."""
+    """Take the steps from the first to before the last; their blocks begin at the basis' row ``offset``."""
     mass, b = pencil.mass.of_columns(), state.blocks.block.shape[1]
 
-    def two_steps(pair: Array, state: _State) -> _State:
-        # Write the last block and one more into the basis, and find the block that follows these.
-        row = offset + 2 * b * pair
+    def step(number: Array, state: _State) -> _State:
+        # Write the last block into the basis, and find the one that follows it.
         _, block, image, _ = state.blocks
         diagonal, rest = _recur(state.blocks, factor.solve_columns(image))
-        middle, image, coupling = _orthonormal(mass, rest)
-        diagonal_2, rest = _recur(_Blocks(block, middle, image, coupling), factor.solve_columns(image))
-        basis = write(state.basis, block, row)
-        parts = within(basis, jnp.concatenate([image, mass(rest)], axis=1), row + b)
-        middle, rest = middle - parts[:b].T, rest - parts[b:].T
-        rest = rest - times(middle, gram(image, rest))
-        basis = write(basis, middle, row + b)
-        following, image, coupling_2 = _orthonormal(mass, rest)
+        row = offset + b * number
+
+        def project(block: Array, rest: Array) -> tuple[Array, Array]:
+            parts = within(state.basis, jnp.concatenate([image, mass(rest)], axis=1), row)
+            block, rest = block - parts[:b].T, rest - parts[b:].T
+            return block, rest - times(block, gram(image, rest))
+
+        block, rest = jax.lax.cond(number % 2 == 1, project, lambda block, rest: (block, rest), block, rest)
+        following, image, coupling = _orthonormal(mass, rest)
         return _State(
-            basis,
-            _Blocks(middle, following, image, coupling_2),
-            state.diagonal.at[pair].set(jnp.stack([diagonal, diagonal_2])),
-            state.below.at[pair].set(jnp.stack([coupling, coupling_2])),
+            write(state.basis, block, row),
+            _Blocks(block, following, image, coupling),
+            state.diagonal.at[number].set(diagonal),
+            state.below.at[number].set(coupling),
         )
 
-    return jax.lax.fori_loop(first, last, two_steps, state)
+    return jax.lax.fori_loop(first, last, step, state)
 
 
 def _recur(blocks: _Blocks, x: Float[Array, "n_dof b"]) -> tuple[Float[Array, "b b"], Float[Array, "n_dof b"]]:
@@ -149,17 +149,15 @@ def _orthonormal(
 
 @partial(jax.jit, static_argnames=("offset", "wanted"))
 def _ritz_pairs(
-    state: _State, offset: int, pairs: Int[Array, ""], wanted: int
+    state: _State, offset: int, steps: int | Int[Array, ""], wanted: int
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
-    room, _, b, _ = state.diagonal.shape
-    steps = 2 * room
-    i = jnp.arange(steps)
+    room, b, _ = state.diagonal.shape
+    i = jnp.arange(room)
     # The last block is coupled to one that is not in the basis.
-    below = jnp.where((i < 2 * pairs - 1)[:, None, None], state.below.reshape(steps, b, b), 0)[:-1]
-    full = jnp.zeros((steps, b, steps, b), below.dtype)
-    full = full.at[i, :, i, :].set(state.diagonal.reshape(steps, b, b))
+    below = jnp.where((i < steps - 1)[:, None, None], state.below, 0)[:-1]
+    full = jnp.zeros((room, b, room, b), below.dtype).at[i, :, i, :].set(state.diagonal)
     full = full.at[i[:-1], :, i[1:], :].set(below)
     full = full.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
-    theta, modes = jnp.linalg.eigh(full.reshape(steps * b, steps * b))
+    theta, modes = jnp.linalg.eigh(full.reshape(room * b, room * b))
     order = jnp.argsort(-jnp.abs(theta))[:wanted]
     return theta[order], combined(jnp.pad(modes[:, order].T, ((0, 0), (offset, 0))), state.basis)

@@ -84,7 +84,7 @@ def _solve(factor: Factorisation, rhs: Float[Array, "n_dof b"]) -> Float[Array, 
     passed: Array | None = None
     for level, matrix in zip(factor.dissection.levels[::-1], factor.downward[::-1], strict=True):
         s = level.own.shape[1]
-        force, onward = _gather(rhs, level.own), jnp.zeros((), rhs.dtype)
+        force, onward = _anything(rhs, level.own), jnp.zeros((), rhs.dtype)
         if passed is not None:
             total = _gather(passed, level.children[0]) + _gather(passed, level.children[1])
             force, onward = force + total[:, :s], total[:, s:]
@@ -94,11 +94,11 @@ def _solve(factor: Factorisation, rhs: Float[Array, "n_dof b"]) -> Float[Array, 
     solutions: list[Array] = []
     above = jnp.zeros((0, width), rhs.dtype)
     for level, matrix in zip(factor.dissection.levels, factor.upward, strict=True):
-        boundary = _gather(above, level.boundary)
+        boundary = _anything(above, level.boundary)
         x = own.pop() - jnp.matmul(matrix, boundary, precision="highest")
         above = jnp.concatenate([x, boundary], axis=1).reshape(-1, width)
         solutions.append(x.reshape(-1, width))
-    return jnp.concatenate(solutions)[factor.dissection.order]
+    return _anything(jnp.concatenate(solutions), factor.dissection.order)
 
 
 def _coefficients(pencil: Pencil, shift: Float[Array, ""]) -> Float[Array, " entries"]:
@@ -115,7 +115,12 @@ def _coefficients(pencil: Pencil, shift: Float[Array, ""]) -> Float[Array, " ent
 
 def _gather(x: Float[Array, "n b"], index: Int[ArrayLike, "fronts m"]) -> Float[Array, "fronts m b"]:
     """Return rows of x; zero where the index is out of range."""
-    return x.at[index].get(mode="fill", fill_value=0)
+    return jnp.where((jnp.asarray(index) < len(x))[..., None], _anything(x, index), 0)
+
+
+def _anything(x: Float[Array, "n b"], index: Int[ArrayLike, "fronts m"]) -> Float[Array, "fronts m b"]:
+    """Return rows of x; whatever is there where the index is out of range, for products in which it meets zeros."""
+    return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
 def _gather_symmetric(

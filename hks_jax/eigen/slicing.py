@@ -43,14 +43,14 @@ class Plan(NamedTuple):
     max_slices: int
 
     @property
-    def pairs(self) -> int:
-        """Pairs of Lanczos blocks that a slice takes at most."""
-        return int(pairs_for(self, self.slice_size))
+    def steps(self) -> int:
+        """Lanczos blocks that a slice takes at most."""
+        return int(steps_for(self, self.slice_size))
 
     @property
     def ritz(self) -> int:
         """Ritz pairs looked at in each slice, in whole blocks."""
-        return min(2 * self.pairs, -(-self.slice_size * 6 // 5 // self.block)) * self.block
+        return min(self.steps, -(-self.slice_size * 6 // 5 // self.block)) * self.block
 
     @property
     def window(self) -> int:
@@ -67,12 +67,12 @@ class Plan(NamedTuple):
         return self.wanted + self.block + self.ritz
 
 
-def pairs_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
-    """Return how many pairs of Lanczos blocks find so many eigenvalues.
+def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
+    """Return how many Lanczos blocks, an even number, find so many eigenvalues.
 
     Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
     """
-    return -(-(21 * size + 120 * plan.block) // (20 * plan.block))
+    return 2 * -(-(21 * size + 120 * plan.block) // (20 * plan.block))
 
 
 class State(NamedTuple):
@@ -85,7 +85,7 @@ class State(NamedTuple):
         shift: where to cut next.
         front: known up to here without a gap, as far as is known.
         complete_below: every eigenvalue below it is known, by the inertia of a factorisation.
-        start: (block, n_dof) where Lanczos starts next.
+        start: (n_dof, block) where Lanczos starts next.
         slices: factorisations so far.
         moved: how often in a row the shift was moved instead of searched.
         finished: whether all is found and certified.
@@ -97,7 +97,7 @@ class State(NamedTuple):
     shift: Float[Array, ""]
     front: Float[Array, ""]
     complete_below: Float[Array, ""]
-    start: Float[Array, "block n_dof"]
+    start: Float[Array, "n_dof block"]
     slices: Int[Array, ""]
     moved: Int[Array, ""]
     finished: Bool[Array, ""]
@@ -114,7 +114,7 @@ def first_state(pencil: Pencil, plan: Plan) -> State:
         shift=shift.astype(dtype),
         front=jnp.zeros((), dtype),
         complete_below=jnp.zeros((), dtype),
-        start=jax.random.normal(jax.random.key(0), (plan.block, n), dtype),
+        start=jax.random.normal(jax.random.key(0), (n, plan.block), dtype),
         slices=jnp.zeros((), int),
         moved=jnp.zeros((), int),
         finished=jnp.zeros((), bool),
@@ -148,13 +148,15 @@ def cut(
 ) -> tuple[Factorisation, Bool[Array, ""], State]:
     """Factorise at the state's shift; return with it whether to search there, and the state if not."""
     factor = factorise(dissection, pencil, state.shift)
-    here, rest = _consider(pencil, factor.negative, factor.solve(state.start), plan, state._replace(vectors=None))
+    here, rest = _consider(
+        pencil, factor.negative, factor.solve_columns(state.start), plan, state._replace(vectors=None)
+    )
     return factor, here, rest._replace(vectors=state.vectors)
 
 
 @partial(jax.jit, static_argnames="plan")
 def _consider(
-    pencil: Pencil, negative: Int[Array, ""], solved: Float[Array, "block n_dof"], plan: Plan, state: State
+    pencil: Pencil, negative: Int[Array, ""], solved: Float[Array, "n_dof block"], plan: Plan, state: State
 ) -> tuple[Bool[Array, ""], State]:
     """Return whether to search at the state's shift, and the state if not."""
     below = jnp.sum(state.values < state.shift)
@@ -162,7 +164,8 @@ def _consider(
     finished = (missing == 0) & (below >= plan.wanted)
     too_many = missing > plan.slice_size
     # Fronts are not pivoted: where a part of the domain has an eigenvalue very near to the shift, rounding grows.
-    defect = pencil.stiffness.apply(solved) - state.shift * pencil.mass.apply(solved) - state.start
+    stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
+    defect = stiffness(solved) - state.shift * mass(solved) - state.start
     allowed = min(_GROWTH * float(jnp.finfo(defect.dtype).eps), 0.01)
     accurate = jnp.linalg.norm(defect) <= allowed * jnp.linalg.norm(state.start)
     elsewhere = too_many | ~(accurate | (state.moved >= _MOVES))
@@ -179,8 +182,8 @@ def _consider(
 
 def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State) -> State:
     """Find the eigenpairs around the shift."""
-    window, low, high, pairs = _window(plan, state)
-    theta, vectors = block_lanczos(pencil, factor, state.start, window, plan.pairs, pairs, plan.ritz)
+    window, low, high, steps = _window(plan, state)
+    theta, vectors = block_lanczos(pencil, factor, state.start, window, plan.steps, steps, plan.ritz)
     rest = state._replace(vectors=None)
     return _accept(pencil, factor.negative, plan, tolerance, theta, vectors, low, high, state.vectors, rest)
 
@@ -188,7 +191,7 @@ def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, 
 @partial(jax.jit, static_argnames="plan")
 def _window(plan: Plan, state: State) -> tuple[Float[Array, "window n_dof"], Array, Array, Int[Array, ""]]:
     """Return the known eigenvectors nearest to the shift, the interval in which nothing else is known, and how many
-    pairs of steps to take: the last slice has fewer eigenvalues to find."""
+    Lanczos steps to take: the last slice has fewer eigenvalues to find."""
     assert state.vectors is not None
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))
     window = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
@@ -197,7 +200,7 @@ def _window(plan: Plan, state: State) -> tuple[Float[Array, "window n_dof"], Arr
     high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
     size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2, plan.slice_size)
-    return window, low, high, jnp.minimum(pairs_for(plan, size), plan.pairs)
+    return window, low, high, jnp.minimum(steps_for(plan, size), plan.steps)
 
 
 @partial(jax.jit, static_argnames=("plan", "tolerance"), donate_argnames="known_vectors")
@@ -247,7 +250,7 @@ def _accept(
     following = jnp.where(complete, _next_shift(plan, all_values, known, top), again)
     leftover = jnp.argsort(jnp.where(above & ~accepted, near, jnp.inf))[: plan.block]
     noise = jax.random.normal(jax.random.key(state.slices), state.start.shape, state.start.dtype)
-    start = vectors[leftover] + 0.01 * jnp.std(vectors) * noise
+    start = vectors[leftover].T + 0.01 * jnp.std(vectors) * noise
     return State(
         all_values,
         all_vectors,

@@ -65,6 +65,7 @@ def by_elimination(matrix: Float[Array, "n n"]) -> Inverse:
     return -a[:n, :n], negative
 
 
+@jax.jit
 def _sweep_rows(matrix: Float[Array, "n n"]) -> Inverse:
     """Sweep one row at a time, always the one with the largest diagonal entry left; the pivots tell the inertia."""
     n = matrix.shape[0]
