@@ -89,10 +89,10 @@ class BlockLanczos(Eigensolver):
     def _slice(self, pencil: Pencil, plan: Plan, tolerance: float) -> State:
         dissection = jax.tree.map(jnp.asarray, dissect(_grid(pencil)))
         state = _first_state(pencil, plan)
-        while unfinished(plan, state):
+        while _unfinished(plan, state):
             factor, here, state = cut(pencil, dissection, plan, state)
             if here:
-                state = _make_room(plan, state) if crowded(plan, state) else state
+                state = _make_room(plan, state) if _crowded(plan, state) else state
                 state = search(pencil, factor, plan, tolerance, state)
             self._report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
         return state
@@ -104,6 +104,8 @@ class BlockLanczos(Eigensolver):
 
 _first_state = jax.jit(first_state, static_argnames="plan")
 _make_room = jax.jit(make_room, static_argnames="plan")
+_unfinished = jax.jit(unfinished, static_argnames="plan")
+_crowded = jax.jit(crowded, static_argnames="plan")
 
 
 def _slice_traced(pencil: Pencil, plan: Plan, tolerance: float) -> State:

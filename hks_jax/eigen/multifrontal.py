@@ -61,8 +61,8 @@ def _eliminate(
     for level in reversed(dissection.levels):
         (fronts, s), r = level.own.shape, level.boundary.shape[1]
         blocks = jnp.zeros(fronts * (s + r) * s, coefficients.dtype)
-        blocks = blocks.at[level.places].set(coefficients[level.entries], unique_indices=True)
-        blocks = blocks.at[level.padding].set(1, unique_indices=True).reshape(fronts, s + r, s)
+        blocks = _put(blocks, level.places, _anything(coefficients, level.entries))
+        blocks = _put(blocks, level.padding, jnp.ones((), blocks.dtype)).reshape(fronts, s + r, s)
         rest = jnp.zeros((fronts, r, r), coefficients.dtype)
         if schur is not None:
             first, second = _gather_symmetric(schur, jnp.asarray(level.children))
@@ -118,17 +118,21 @@ def _gather(x: Float[Array, "n b"], index: Int[ArrayLike, "fronts m"]) -> Float[
     return jnp.where((jnp.asarray(index) < len(x))[..., None], _anything(x, index), 0)
 
 
-def _anything(x: Float[Array, "n b"], index: Int[ArrayLike, "fronts m"]) -> Float[Array, "fronts m b"]:
+def _anything(x: Float[Array, "n *b"], index: Int[ArrayLike, "*m"]) -> Float[Array, "*m_and_b"]:
     """Return rows of x; whatever is there where the index is out of range, for products in which it meets zeros."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
+
+
+def _put(x: Float[Array, " n"], index: Int[ArrayLike, " m"], values: Float[Array, "*m"]) -> Float[Array, " n"]:
+    return x.at[index].set(values, unique_indices=True, wrap_negative_indices=False)
 
 
 def _gather_symmetric(
     blocks: Float[Array, "blocks r r"], index: Int[Array, "children fronts m"]
 ) -> Float[Array, "children fronts m m"]:
     """Return the entries of symmetric blocks at pairs of places (block · r + i, block · r + j); zero for padding."""
-    (n, r), (children, fronts, m) = blocks.shape[:2], index.shape
-    within = jnp.arange(children * fronts).reshape(children, fronts, 1) * r + index % r
-    # Whole rows, and once more after transposition: many times faster than entry by entry.
-    rows = jnp.swapaxes(_gather(blocks.reshape(-1, r), index), 2, 3)
-    return _gather(rows.reshape(-1, m), jnp.where(index < n * r, within, children * fronts * r))
+    n, r = blocks.shape[:2]
+    # Whole rows first, and of these the columns: faster than entry by entry.
+    rows = _gather(blocks.reshape(-1, r), index)
+    columns = jnp.take_along_axis(rows, (index % r)[:, :, None, :], axis=3, mode="clip")
+    return jnp.where((index < n * r)[:, :, None, :], columns, 0)

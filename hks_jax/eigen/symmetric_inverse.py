@@ -26,7 +26,7 @@ def by_eigenvalues(matrix: Float[Array, "n n"]) -> Inverse:
     """
     n = matrix.shape[0]
     if n <= _SMALL // 2 or _SMALL < n <= _LARGE:
-        values, vectors = jnp.linalg.eigh(matrix)
+        vectors, values = jax.lax.linalg.eigh(matrix, symmetrize_input=False)
         return jnp.matmul(vectors / values, vectors.T, precision="highest"), jnp.sum(values < 0)
     half = n // 2
     first, negative = by_eigenvalues(matrix[:half, :half])
