@@ -1,8 +1,20 @@
 """The warning class for results that are right only to a stated accuracy."""
 
+import sys
+import warnings
+
 
 class AccuracyWarning(UserWarning):
     """A result was returned, but something limits its accuracy: the message says what, and the remedy.
 
     Make it an error with ``warnings.simplefilter("error", hks_jax.AccuracyWarning)``.
     """
+
+
+def warn_of_accuracy(message: str) -> None:
+    """Warn at the line outside this package that led here."""
+    package, level = __name__.partition(".")[0], 2
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == package:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, AccuracyWarning, stacklevel=level)

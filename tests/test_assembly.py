@@ -85,6 +85,7 @@ def test_products_dense_and_scipy_forms_agree(rng, boundary, masked):
         dense = operator.to_dense()
         np.testing.assert_allclose(dense, dense.T, atol=1e-14)
         np.testing.assert_allclose(operator @ x, dense @ x, atol=1e-12)
+        np.testing.assert_allclose(operator.of_columns()(x), dense @ x, atol=1e-12)
         np.testing.assert_allclose(operator @ x[:, 0], dense @ x[:, 0], atol=1e-12)
         np.testing.assert_allclose(operator.to_scipy().toarray(), dense, atol=1e-15)
         np.testing.assert_allclose(operator.diagonal(), np.diag(dense), atol=1e-15)

@@ -12,6 +12,7 @@ import scipy.linalg
 from fields import flat, random_spd
 
 import hks_jax as hj
+from hks_jax.eigen import basis as bases
 from hks_jax.eigen.dissection import dissect
 from hks_jax.eigen.multifrontal import factorise
 from hks_jax.eigen.slicing import Plan, crowded, cut, first_state, make_room
@@ -56,6 +57,13 @@ def test_inverse_and_inertia_of_an_indefinite_matrix(rng, inverse, n):
     inverted, negative = jax.vmap(inverse)(jnp.asarray(a))
     np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-9)
     np.testing.assert_array_equal(negative, (np.linalg.eigvalsh(a) < 0).sum(axis=1))
+
+
+@pytest.mark.parametrize("n", [32, 64])
+def test_separators_halve_a_grid_so_that_batches_need_no_padding(n):
+    levels = dissect(hj.assemble(flat((n, n), (1.0, 1.0))).space).levels
+    assert levels[0].own.shape == (1, 2 * n)
+    assert all(level.padding.size == 0 for level in levels)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -137,6 +145,27 @@ def test_eigenvalues_are_counted_without_being_computed(rng, domain):
     for count in (0, 1, 5, 25):
         shift = np.concatenate([[-1e-3 * spectrum[-1]], spectrum])[count : count + 2].mean()
         assert int(hj.count_eigenvalues(pencil, shift)) == np.sum(spectrum < shift)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-9])
+@pytest.mark.parametrize(("dtype", "accuracy"), [(jnp.float64, 1e-15), (jnp.float32, 1e-6)])
+def test_components_on_a_basis_in_pieces(rng, dtype, accuracy, size):
+    write = jax.jit(bases.write)
+    n, filled = 500, 268  # two pieces, and a little of the third; the fourth is empty
+    q, _ = np.linalg.qr(rng.standard_normal((n, 400)))
+    vectors, x = jnp.asarray(q.T[:filled], dtype), jnp.asarray(q[:, 380:384], dtype)
+    basis = bases.begin(vectors[:100], 400, 4)
+    assert [len(piece.rows) for piece in basis] == [128, 128, 128, 16]
+    for row in range(100, filled, 4):
+        basis = write(basis, vectors[row : row + 4].T, jnp.asarray(row))
+    x = x + size * vectors[::20].T @ jnp.asarray(rng.standard_normal((14, 4)), dtype)
+    parts = jax.jit(bases.within)(basis, x, filled)
+    np.testing.assert_allclose(vectors @ (x - parts.T), 0, atol=3 * accuracy)
+    mix = rng.standard_normal((3, 400))
+    mix[:, filled:] = 0
+    np.testing.assert_allclose(
+        bases.combined(jnp.asarray(mix, dtype), basis), mix[:, :filled] @ q.T[:filled], atol=1e-5
+    )
 
 
 def test_eigenvalues_found_beyond_those_wanted_are_forgotten():

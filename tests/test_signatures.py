@@ -141,8 +141,11 @@ def test_resolution_bias_bounds_the_discretisation_error():
 
 def test_too_small_times_are_reported():
     pairs = hj.eigenpairs(flat((30, 31), (1.0, 1.0)), 60)
-    with pytest.warns(hj.AccuracyWarning, match=r"1 of 2 times are too small for k: an estimated .*% of the signature"):
+    with pytest.warns(
+        hj.AccuracyWarning, match=r"1 of 2 times are too small for k: an estimated .*% of the sig"
+    ) as seen:
         hj.hks(pairs, [0.004, 0.5])
+    assert [warning.filename for warning in seen] == [__file__]
     whole = hj.eigenpairs(flat((8, 9), (1.0, 1.0)), 72)
     with pytest.warns(hj.AccuracyWarning, match="too small for the grid: .* Use times from about .* or a finer grid"):
         hj.hks(whole, [0.004])

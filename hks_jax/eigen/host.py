@@ -1,6 +1,5 @@
 """Pencils as SciPy matrices: what the host computes for solvers in JAX, through callbacks where they are traced."""
 
-import warnings
 from collections.abc import Callable
 
 import jax
@@ -10,7 +9,7 @@ from jaxtyping import Array, Float
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import SuperLU, splu
 
-from hks_jax.accuracy import AccuracyWarning
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement import solve_complement
 from hks_jax.fem.operators import Pattern
 from hks_jax.fem.pencil import Pencil
@@ -35,11 +34,9 @@ def complement_on_host(
     def solve(data_k: np.ndarray, data_m: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
         values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
         if not all(np.isfinite(array).all() for array in (values, vectors, b)):
-            warnings.warn(
+            warn_of_accuracy(
                 f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
                 "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
-                AccuracyWarning,
-                stacklevel=2,
             )
             return np.full(rhs.shape, np.nan, rhs.dtype)
         K, M = matrices(data_k, data_m)
@@ -55,12 +52,10 @@ def complement_on_host(
         )
         failed = ~(errors <= 1)
         if failed.any():
-            warnings.warn(
+            warn_of_accuracy(
                 f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
                 f"converge, and their part is NaN. k may cut a cluster of eigenvalues: take another k, or set "
                 "multiplet='drop' in `eigenpairs`",
-                AccuracyWarning,
-                stacklevel=2,
             )
             x[failed] = np.nan
         report(f"derivative: error {np.max(errors, initial=0.0) * tolerance:.1e}")

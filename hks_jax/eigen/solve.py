@@ -1,12 +1,11 @@
 """The driver: assemble, choose a solver, truncate, report."""
 
-import warnings
 from collections.abc import Callable
 
 import jax
 import numpy as np
 
-from hks_jax.accuracy import AccuracyWarning
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.block_lanczos import BlockLanczos
@@ -94,7 +93,7 @@ def eigenpairs(
     known = jax.lax.stop_gradient(pairs)
     if not is_traced(known.eigenvalues):
         for message in known.messages():
-            warnings.warn(message, AccuracyWarning, stacklevel=2)
+            warn_of_accuracy(message)
     return pairs
 
 

@@ -1,6 +1,5 @@
 """From a tensor field or a surface to its stiffness and mass: one element's integrals, mapped over all elements."""
 
-import warnings
 from functools import lru_cache, partial
 from itertools import product
 from typing import Literal
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.accuracy import AccuracyWarning
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.static_array import StaticArray
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -64,11 +63,9 @@ def assemble(
     pencils = [_assemble_grid(domain, grid_space(domain.grid, problem), mass) for problem in problems]
     space = pencils[0].space
     if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
-        warnings.warn(
+        warn_of_accuracy(
             f'boundary: got {boundary!r}, but "dirichlet" acts on the sides of the grid, which the mask does not '
             "reach. The mask's own rim is natural",
-            AccuracyWarning,
-            stacklevel=2,
         )
     return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))
 

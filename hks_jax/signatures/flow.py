@@ -1,6 +1,5 @@
 """Heat flow of functions on a domain."""
 
-import warnings
 from typing import Any
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.accuracy import AccuracyWarning
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import spectral_flow
@@ -66,9 +65,7 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
     left = share * float(jnp.exp(-jnp.min(times) * pairs.next_eigenvalue))
     if left > TAIL_LIMIT:
         enough = np.log(share / TAIL_LIMIT) / float(pairs.next_eigenvalue)
-        warnings.warn(
+        warn_of_accuracy(
             f"times: the heat flow at t = {float(jnp.min(times)):.4g} lacks up to {left:.1%} of a function's norm, "
             f"which lies beyond the computed eigenpairs. Use times from about {enough:.4g}, or more eigenpairs",
-            AccuracyWarning,
-            stacklevel=3,
         )

@@ -1,7 +1,6 @@
 """What a truncated spectrum on a grid of finite spacing can resolve, time by time."""
 
 import math
-import warnings
 
 import equinox as eqx
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from jax.scipy.special import gammaincc
 from jaxtyping import Array, Float
 
-from hks_jax.accuracy import AccuracyWarning
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.operators import DiagonalOperator
 from hks_jax.signatures.filters import Heat
@@ -91,4 +90,4 @@ def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
     if is_traced((pairs.eigenvalues, pairs.pencil, times)):
         return
     for message in truncation(pairs, times).messages():
-        warnings.warn(message, AccuracyWarning, stacklevel=3)
+        warn_of_accuracy(message)

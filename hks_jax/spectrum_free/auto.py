@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.accuracy import AccuracyWarning
+from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import GridSpace
@@ -156,7 +156,7 @@ def hks_auto(
     raw = _without(pencil, times[small], tolerance, settings or "selected-inversion")
     others = _scaled(pairs, times[small], normalisation, raw)
     for message in _coarse(estimate, small):
-        warnings.warn(message, AccuracyWarning, stacklevel=2)
+        warn_of_accuracy(message)
     values = jnp.zeros((times.size, *others.shape[1:]), others.dtype).at[small].set(others)
     overlap = difference = nan
     if spectral.any():
@@ -167,12 +167,10 @@ def hks_auto(
         least = work(settings, pencil, times[small])
         difference = _difference(known_pairs, overlap[None], tolerance, _DEARER * least)
         if float(difference) > 10 * tolerance:
-            warnings.warn(
+            warn_of_accuracy(
                 f"at t = {float(overlap):.4g} the signatures with and without eigenpairs differ by "
                 f"{float(difference):.1e}, more than ten times the tolerance {tolerance:.1e}. Check the pairs' "
                 "residuals",
-                AccuracyWarning,
-                stacklevel=2,
             )
     name = "selected-inversion" if settings is None else "colouring"
     return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, name, overlap, difference)
