@@ -1,8 +1,8 @@
 """Nested dissection of a grid: in which order to eliminate its nodes, and what each elimination touches.
 
 A line of nodes or two (a plane in 3D) separates a grid into two halves that the stencil does not couple; lines separate
-the halves, and so on down to small cells. Eliminated from the cells up to the first separator, all fronts of a level are
-independent and nearly of one size: padded to the largest, a level is one batch of dense blocks.
+the halves, and so on down to small cells. Eliminated from the cells up to the first separator, all fronts of a level
+are independent and nearly of one size: padded to the largest, a level is one batch of dense blocks.
 
 A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10 (1973).
 """

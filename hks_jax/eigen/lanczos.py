@@ -63,7 +63,7 @@ def block_lanczos(
         start: the first block, any vectors.
         known: M-orthonormal eigenvectors, or zero rows; w a multiple of b.
         room: for how many blocks there is room; static.
-        steps: how many blocks to compute; even.
+        steps: how many blocks to compute, even; traced, as many as there is room for.
         wanted: how many Ritz pairs to return.
 
     Returns:
@@ -71,11 +71,10 @@ def block_lanczos(
         fewer.
     """
     state = _begin(pencil, start, known, room)
-    if is_traced(factor):
-        state = _advance(pencil, factor, state, len(known), 0, steps)
-    else:
-        for first in range(0, int(steps), _STRETCH):
-            state = _advance(pencil, factor, state, len(known), first, min(first + _STRETCH, int(steps)))
+    # Traced, all of them in one loop: were its length to differ within a batch, each turn would copy all of the state.
+    steps, stretch = (room, room) if is_traced(factor) else (int(steps), _STRETCH)
+    for first in range(0, steps, stretch):
+        state = _advance(pencil, factor, state, len(known), first, min(first + stretch, steps))
     return _ritz_pairs(state, len(known), steps, wanted)
 
 
