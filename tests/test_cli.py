@@ -425,6 +425,11 @@ def test_nothing_is_left_of_an_interrupted_or_failed_write(npz, tmp_path, capsys
     assert sorted(tmp_path.iterdir()) == before
 
 
+def heeds_ctrl_c():
+    """What a program in the background inherits is to ignore it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_ctrl_c_amid_a_computation_leaves_nothing_but_one_line(tmp_path):
     n = 36
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(3), (n, n, n, 3, 3)))
@@ -439,9 +444,10 @@ def test_ctrl_c_amid_a_computation_leaves_nothing_but_one_line(tmp_path):
         "-k",
         "150",
     ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, preexec_fn=heeds_ctrl_c, **pipes) as process:
         line = ""
-        while "eigenpairs" not in line:
+        while "eigenpairs" not in line and process.poll() is None:
             line = process.stderr.readline()
         time.sleep(2)
         process.send_signal(signal.SIGINT)
@@ -473,7 +479,8 @@ def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(tmp_path):
         run_and_exit()
     """
     program = [sys.executable, "-c", textwrap.dedent(script), "demo"]
-    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=50)
+    settings = {"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 50}
+    done = subprocess.run(program, preexec_fn=heeds_ctrl_c, **settings)
     assert done.returncode == 130
     assert (done.stdout, done.stderr) == ("", "hks-jax demo: error: interrupted\n")
 
