@@ -5,24 +5,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
+def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
     """Return the inner products.
 
-    XLA's CPU kernels for a long contraction are many times faster with the large factor on the left, and for what
-    comes after with the small one there and not transposed; the barriers keep XLA from turning either round.
+    XLA's CPU kernels for a long contraction are many times faster with the large factor on the left: the barrier keeps
+    XLA from turning the product round.
     """
-    products = jax.lax.optimization_barrier(jnp.matmul(basis, block.T, precision="highest"))
-    return jax.lax.optimization_barrier(products.T)
+    return jax.lax.optimization_barrier(jnp.matmul(basis, columns, precision="highest"))
+
+
+def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
+    """Return the inner products with rows, as what comes after takes them fastest: the small factor on the left."""
+    return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
 
 
 def combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array, "q n"]:
     """Return linear combinations of the basis."""
     return jnp.matmul(mix, basis, precision="highest")
-
-
-def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
-    """Return the inner products; the barrier keeps XLA from turning them round."""
-    return jax.lax.optimization_barrier(jnp.matmul(basis, columns, precision="highest"))
 
 
 def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
