@@ -15,7 +15,7 @@ import hks_jax as hj
 from hks_jax.eigen import basis as bases
 from hks_jax.eigen.dissection import dissect
 from hks_jax.eigen.multifrontal import factorise
-from hks_jax.eigen.slicing import Plan, crowded, cut, first_state, make_room
+from hks_jax.eigen.slicing import Plan, crowded, cut, first_state, make_room, search
 from hks_jax.eigen.symmetric_inverse import by_eigenvalues, by_elimination
 
 
@@ -160,7 +160,7 @@ def test_components_on_a_basis_in_pieces(rng, dtype, accuracy, size):
         basis = write(basis, vectors[row : row + 4].T, jnp.asarray(row))
     x = x + size * vectors[::20].T @ jnp.asarray(rng.standard_normal((14, 4)), dtype)
     parts = jax.jit(bases.within)(basis, x, filled)
-    np.testing.assert_allclose(vectors @ (x - parts.T), 0, atol=3 * accuracy)
+    np.testing.assert_allclose(vectors @ (x - parts.T), 0, atol=10 * accuracy)
     mix = rng.standard_normal((3, 400))
     mix[:, filled:] = 0
     np.testing.assert_allclose(
@@ -194,13 +194,14 @@ def test_a_shift_where_a_front_is_singular_is_moved(rng):
     singular = scipy.linalg.eigh(K, M, eigvals_only=True)[5]
     plan = hj.BlockLanczos(block=4).plan(20, pencil.space.n_dof)
     state = first_state(pencil, plan)._replace(shift=jnp.asarray(singular))
-    _, here, moved = cut(pencil, dissection, plan, state)
-    assert not here
-    assert moved.moved == 1
-    assert 0.9 * singular < moved.shift < singular
-    _, here, state = cut(pencil, dissection, plan, moved)
-    assert here
-    assert state.shift == moved.shift
+    for shift, moves in ((singular, 1), (0.97 * singular, 0)):
+        assert state.shift == pytest.approx(shift, rel=1e-12)
+        factor, here, state = cut(pencil, dissection, plan, state)
+        assert here
+        state = search(pencil, factor, plan, 1e-8, state)
+        assert state.moved == moves
+        assert (state.known > 0) == (moves == 0)
+        assert np.isfinite(state.start).all()
 
 
 def test_traced_and_batched(rng):

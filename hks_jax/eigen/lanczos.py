@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.eigen.basis import Basis, begin, combined, within, write
 from hks_jax.eigen.multifrontal import Factorisation
@@ -35,12 +35,14 @@ class _State(NamedTuple):
         blocks: the last two blocks, of which the latter is not yet in the basis.
         diagonal: the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV.
         below: the blocks below it.
+        accurate: whether the first solve was; until then it is taken for so.
     """
 
     basis: Basis
     blocks: _Blocks
     diagonal: Float[Array, "steps b b"]
     below: Float[Array, "steps b b"]
+    accurate: Bool[Array, ""]
 
 
 def block_lanczos(
@@ -51,7 +53,9 @@ def block_lanczos(
     room: int,
     steps: int | Int[Array, ""],
     wanted: int,
-) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
+    shift: Float[Array, ""],
+    allowed: Float[Array, ""],
+) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"], Bool[Array, ""]]:
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     Neighbouring blocks are kept orthogonal by the recurrence, and two at a time by one pass against the whole basis,
@@ -65,17 +69,27 @@ def block_lanczos(
         room: for how many blocks there is room; static.
         steps: how many blocks to compute, even; traced, as many as there is room for.
         wanted: how many Ritz pairs to return.
+        shift: σ.
+        allowed: up to which relative defect a solve is accurate.
 
     Returns:
-        The Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors; zero where there are
-        fewer.
+        The Ritz values θ = 1/(λ − σ), largest magnitude first; M-orthonormal Ritz vectors; zero where there are
+        fewer. And whether the first solve was accurate: where it was not, there may be no more than that step.
     """
     state = _begin(pencil, start, known, room)
-    # Traced, all of them in one loop: were its length to differ within a batch, each turn would copy all of the state.
-    steps, stretch = (room, room) if is_traced(factor) else (int(steps), _STRETCH)
-    for first in range(0, steps, stretch):
-        state = _advance(pencil, factor, state, len(known), first, min(first + stretch, steps))
-    return _ritz_pairs(state, len(known), steps, wanted)
+
+    def advance(state: _State, first: int, last: int) -> _State:
+        return _advance(pencil, factor, state, shift, allowed, len(known), first, last)
+
+    if is_traced(factor):
+        # All of them in one loop: were its length to differ within a batch, each turn would copy all of the state.
+        steps, state = room, advance(state, 0, room)
+    else:
+        state, done, steps = advance(state, 0, 1), 1, int(steps)
+        while state.accurate and done < steps:
+            state, done = advance(state, done, min(done + _STRETCH, steps)), done + _STRETCH
+    theta, vectors = _ritz_pairs(state, len(known), steps, wanted)
+    return theta, vectors, state.accurate
 
 
 @partial(jax.jit, static_argnames="room")
@@ -87,21 +101,33 @@ def _begin(pencil: Pencil, start: Float[Array, "n_dof b"], known: Float[Array, "
         block, image, _ = _orthonormal(mass, block)
     basis = begin(known, len(known) + room * b, b)
     none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, b, b), start.dtype)
-    return _State(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix)
+    return _State(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix, jnp.ones((), bool))
 
 
 @partial(jax.jit, static_argnames="offset", donate_argnames="state")
 def _advance(
-    pencil: Pencil, factor: Factorisation, state: _State, offset: int, first: int | Array, last: int | Array
+    pencil: Pencil,
+    factor: Factorisation,
+    state: _State,
+    shift: Float[Array, ""],
+    allowed: Float[Array, ""],
+    offset: int,
+    first: int | Array,
+    last: int | Array,
 ) -> _State:
     """Take the steps from the first to before the last; their blocks begin at the basis' row ``offset``."""
-    mass, b = pencil.mass.of_columns(), state.blocks.block.shape[1]
+    stiffness, mass, b = pencil.stiffness.of_columns(), pencil.mass.of_columns(), state.blocks.block.shape[1]
 
     def step(number: Array, state: _State) -> _State:
         # Write the last block into the basis, and find the one that follows it.
         _, block, image, _ = state.blocks
-        diagonal, rest = _recur(state.blocks, factor.solve_columns(image))
+        solved = factor.solve_columns(image)
+        diagonal, rest = _recur(state.blocks, solved)
         row = offset + b * number
+
+        def good() -> Bool[Array, ""]:
+            defect = stiffness(solved) - shift * mass(solved) - image
+            return jnp.linalg.norm(defect) <= allowed * jnp.linalg.norm(image)
 
         def project(block: Array, rest: Array) -> tuple[Array, Array]:
             parts = within(state.basis, jnp.concatenate([image, mass(rest)], axis=1), row)
@@ -109,12 +135,13 @@ def _advance(
             return block, rest - times(block, gram(image, rest))
 
         block, rest = jax.lax.cond(number % 2 == 1, project, lambda block, rest: (block, rest), block, rest)
-        following, image, coupling = _orthonormal(mass, rest)
+        following, its_image, coupling = _orthonormal(mass, rest)
         return _State(
             write(state.basis, block, row),
-            _Blocks(block, following, image, coupling),
+            _Blocks(block, following, its_image, coupling),
             state.diagonal.at[number].set(diagonal),
             state.below.at[number].set(coupling),
+            jax.lax.cond(number == 0, good, lambda: state.accurate),
         )
 
     return jax.lax.fori_loop(first, last, step, state)
