@@ -54,16 +54,16 @@ def dense_matrices(pencil):
 def test_inverse_and_inertia_of_an_indefinite_matrix(rng, inverse, n):
     a = rng.standard_normal((3, n, n))
     a = a + np.swapaxes(a, 1, 2)
-    inverted, negative = jax.vmap(inverse)(jnp.asarray(a))
+    inverted, pivots = jax.vmap(inverse)(jnp.asarray(a))
     np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-9)
-    np.testing.assert_array_equal(negative, (np.linalg.eigvalsh(a) < 0).sum(axis=1))
+    np.testing.assert_array_equal((pivots < 0).sum(axis=1), (np.linalg.eigvalsh(a) < 0).sum(axis=1))
 
 
 @pytest.mark.parametrize("n", [32, 64])
 def test_separators_halve_a_grid_so_that_batches_need_no_padding(n):
-    levels = dissect(hj.assemble(flat((n, n), (1.0, 1.0))).space).levels
-    assert levels[0].own.shape == (1, 2 * n)
-    assert all(level.padding.size == 0 for level in levels)
+    dissection = dissect(hj.assemble(flat((n, n), (1.0, 1.0))).space)
+    assert dissection.levels[0].own.shape == (1, 2 * n)
+    assert dissection.padding.size == 0
 
 
 @pytest.mark.parametrize("name", CASES)

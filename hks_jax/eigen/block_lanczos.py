@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen import grid_complement
 from hks_jax.eigen.dissection import dissect
 from hks_jax.eigen.multifrontal import Factorisation
@@ -59,6 +60,7 @@ class BlockLanczos(Eigensolver):
             raise ValueError("solver: block-lanczos needs a grid; use 'shift-invert' for a mesh")
         plan = self.plan(k, pencil.space.n_dof)
         state = (_slice_traced if is_traced(pencil) else self._slice)(pencil, plan, self.tolerance)
+        assert state.vectors is not None
         return (*_lowest(state.values, state.vectors, k), state.complete_below)
 
     def prepare_complement(self, pencil: Pencil, values: Float[Array, " p"], k: int) -> Factorisation:
@@ -87,7 +89,7 @@ class BlockLanczos(Eigensolver):
         return Plan(k, self.block, size, max_slices=3 * slices + 12)
 
     def _slice(self, pencil: Pencil, plan: Plan, tolerance: float) -> State:
-        dissection = jax.tree.map(jnp.asarray, dissect(_grid(pencil)))
+        dissection = jax.device_put(dissect(_grid(pencil)))
         state = _first_state(pencil, plan)
         while _unfinished(plan, state):
             factor, here, state = cut(pencil, dissection, plan, state)
@@ -102,10 +104,10 @@ class BlockLanczos(Eigensolver):
             self.progress(text)
 
 
-_first_state = jax.jit(first_state, static_argnames="plan")
-_make_room = jax.jit(make_room, static_argnames="plan")
-_unfinished = jax.jit(unfinished, static_argnames="plan")
-_crowded = jax.jit(crowded, static_argnames="plan")
+_first_state = jit_quickly(static_argnames="plan")(first_state)
+_make_room = jit_quickly(static_argnames="plan")(make_room)
+_unfinished = jit_quickly(static_argnames="plan")(unfinished)
+_crowded = jit_quickly(static_argnames="plan")(crowded)
 
 
 def _slice_traced(pencil: Pencil, plan: Plan, tolerance: float) -> State:
@@ -119,7 +121,7 @@ def _slice_traced(pencil: Pencil, plan: Plan, tolerance: float) -> State:
     return jax.lax.while_loop(partial(unfinished, plan), body, first_state(pencil, plan))
 
 
-@partial(jax.jit, static_argnames="k")
+@jit_quickly(static_argnames="k")
 def _lowest(
     values: Float[Array, " capacity"], vectors: Float[Array, "capacity n_dof"], k: int
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:

@@ -30,17 +30,17 @@ class Level(NamedTuple):
         boundary: (fronts, r) the places of the boundary nodes among the (fronts, s + r) nodes of the level above.
         children: (2, fronts, s + r) the places of the front's nodes among the (fronts, r) boundary nodes of the level
             below: those of the first child, and those of the second. Empty for cells.
-        entries: (m,) the matrix entries, as indices into the stencil's coefficients, with a column among the own nodes.
-        places: (m,) their places among the (fronts, s + r, s) blocks.
-        padding: (p,) the places of the diagonal entries that belong to no node.
     """
 
     own: Int[np.ndarray, "fronts s"]
     boundary: Int[np.ndarray, "fronts r"]
     children: Int[np.ndarray, "two fronts s_plus_r"]
-    entries: Int[np.ndarray, " m"]
-    places: Int[np.ndarray, " m"]
-    padding: Int[np.ndarray, " p"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(fronts, s + r, s): that of the blocks which hold the columns of the own nodes."""
+        fronts, s = self.own.shape
+        return fronts, s + self.boundary.shape[1], s
 
 
 class Dissection(NamedTuple):
@@ -49,10 +49,17 @@ class Dissection(NamedTuple):
     Attributes:
         levels: from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1.
         order: (n_dof,) the place of each degree of freedom among the levels' own nodes, concatenated.
+        entries: (m,) the matrix entries, as indices into the stencil's coefficients.
+        places: (m,) their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column,
+            unless its row is eliminated before.
+        padding: (p,) the places of the diagonal entries that belong to no node.
     """
 
     levels: tuple[Level, ...]
     order: Int[np.ndarray, " n_dof"]
+    entries: Int[np.ndarray, " m"]
+    places: Int[np.ndarray, " m"]
+    padding: Int[np.ndarray, " p"]
 
 
 @lru_cache(maxsize=16)
@@ -73,7 +80,7 @@ def dissect(space: GridSpace) -> Dissection:
         found = np.searchsorted(boundaries[below], at[inherited] // 2 * n + nodes[inherited])
         place[inherited] = own[below].shape[1] + ranks[below][found]
     levels = []
-    for number, (nodes, keys, rank, r) in enumerate(zip(own, boundaries, ranks, width, strict=True)):
+    for number, (nodes, rank, r) in enumerate(zip(own, ranks, width, strict=True)):
         fronts, s = nodes.shape
         boundary, children = np.zeros((fronts, r), int), np.zeros((2, fronts, 0), int)
         if number > 0:
@@ -85,57 +92,71 @@ def dissect(space: GridSpace) -> Dissection:
             at, place = placed[number + 1]
             children = np.full((2, fronts, s + r), 2 * fronts * width[number + 1])
             children[at % 2, at // 2, place] = at * width[number + 1] + ranks[number + 1]
-        # An entry belongs to the front that eliminates its column, unless its row has been eliminated before.
-        mine = np.flatnonzero((level[cols] == number) & (level[rows] <= number))
-        q, i = front[cols[mine]], rows[mine]
-        row, outside = slot[i], level[i] < number
-        row[outside] = s + rank[np.searchsorted(keys, q[outside] * n + i[outside])]
-        places = (q * (s + r) + row) * s + slot[cols[mine]]
-        q, j = np.nonzero(nodes == n)
-        fields = nodes, boundary, children, entries[mine], places, (q * (s + r) + j) * s + j
-        levels.append(Level(*(field.astype(np.int32) for field in fields)))
-    order = np.empty(n + 1, int)
+        levels.append(Level(*(field.astype(np.int32) for field in (nodes, boundary, children))))
+    order = np.empty(n + 1, np.int32)
     order[np.concatenate([nodes.ravel() for nodes in own])] = np.arange(sum(nodes.size for nodes in own))
-    return Dissection(tuple(levels), order[:n].astype(np.int32))
+
+    _, height, stride = shapes = np.array([level.shape for level in levels]).T
+    start = np.append(0, np.cumsum(np.prod(shapes, axis=0)))
+    if start[-1] > np.iinfo(np.int32).max:
+        raise ValueError(f"grid: got {n} nodes; expected fewer, whose factorisation has less than 2^31 entries")
+    mine = np.flatnonzero(level[rows] <= level[cols])
+    rows, cols = rows[mine], cols[mine]
+    place = slot[rows]
+    outside = np.flatnonzero(level[rows] < level[cols])
+    for number in range(1, depth):
+        above = outside[level[cols[outside]] == number]
+        key = front[cols[above]] * n + rows[above]
+        place[above] = stride[number] + ranks[number][np.searchsorted(boundaries[number], key)]
+    column = (start[level] + front * (height * stride)[level] + slot).astype(np.int32)
+    places = column[cols] + stride.astype(np.int32)[level[cols]] * place
+    padding = [
+        first + q * h * s + j * (s + 1)
+        for first, h, s, nodes in zip(start[:-1], height, stride, own, strict=True)
+        for q, j in [np.nonzero(nodes == n)]
+    ]
+    fields = order[:n], entries[mine], places, np.concatenate(padding)
+    return Dissection(tuple(levels), *(field.astype(np.int32) for field in fields))
 
 
 def _bisect(space: GridSpace) -> tuple[np.ndarray, np.ndarray, int]:
     """Return the level and the front of every degree of freedom, and the number of levels."""
-    where = np.flatnonzero(space.free)
-    nodes = np.stack(np.unravel_index(where, space.node_shape), axis=1)
-    n, d = nodes.shape
-    level, front, left = np.zeros(n, int), np.zeros(n, int), np.arange(n)
+    x = np.stack(np.nonzero(space.free))
+    d, n = x.shape
+    level, front, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
     depth = 0
     while True:
-        q, x, fronts = front[left], nodes[left], 1 << depth
+        fronts = 1 << depth
         counts = np.bincount(q, minlength=fronts)
         if counts.max() <= _CELL[d]:
-            level[left] = depth
+            level[left], front[left] = depth, q
             return level, front, depth + 1
         # Cut every part across its longest side, at the median.
         low, high = np.full((fronts, d), np.iinfo(int).max), np.full((fronts, d), -1)
         for axis in range(d):
-            np.minimum.at(low[:, axis], q, x[:, axis])
-            np.maximum.at(high[:, axis], q, x[:, axis])
+            np.minimum.at(low[:, axis], q, x[axis])
+            np.maximum.at(high[:, axis], q, x[axis])
         longest = np.argmax(high - low, axis=1)
-        along = x[np.arange(left.size), longest[q]]
-        ordered = along[np.lexsort((along, q))]
-        cut = ordered[np.minimum(np.cumsum(counts) - counts + counts // 2, left.size - 1)]
+        along = x[longest[q], np.arange(left.size)]
+        lowest, extent = low[np.arange(fronts), longest], int(np.max(high - low)) + 1
+        sizes = np.bincount(q * extent + along - lowest[q], minlength=fronts * extent).reshape(fronts, extent)
+        cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1)
         separates = along == cut[q]
         if d == 2:  # two lines of an even number leave equal halves, and batches without padding
             even = (high - low)[np.arange(fronts), longest] % 2 == 1
             separates |= even[q] & (along == cut[q] - 1)
         if depth == 0:  # what is cut once more here is no longer periodic
-            separates |= np.any((x == 0) & np.asarray(space.periodic), axis=1)
-        level[left[separates]] = depth
-        front[left] = np.where(separates, q, 2 * q + (along > cut[q]))
-        left = left[~separates]
+            separates |= np.any(x[list(space.periodic)] == 0, axis=0)
+        level[left[separates]], front[left[separates]] = depth, q[separates]
+        stays = ~separates
+        q = (2 * q + (along > cut[q]))[stays]
+        left, x = left[stays], x[:, stays]
         depth += 1
 
 
 def _own_nodes(level: np.ndarray, front: np.ndarray, depth: int) -> tuple[list[np.ndarray], np.ndarray]:
     """Return for each level the nodes of its fronts, (fronts, s), and the place of every node in its front."""
-    n, own, slot = level.size, [], np.zeros(level.size, int)
+    n, own, slot = level.size, [], np.zeros(level.size, np.int32)
     for number in range(depth):
         nodes = np.flatnonzero(level == number)
         nodes = nodes[np.argsort(front[nodes], kind="stable")]
@@ -159,7 +180,8 @@ def _boundaries(
     for number in reversed(range(depth)):
         inherited = keys // n // 2 * n + keys % n
         here = level[rows] == number
-        keys = np.unique(np.concatenate([inherited[level[keys % n] < number], front[rows[here]] * n + cols[here]]))
+        keys = np.sort(np.concatenate([inherited[level[keys % n] < number], front[rows[here]] * n + cols[here]]))
+        keys = keys[np.append(True, keys[1:] > keys[:-1])[: keys.size]]  # np.unique hashes, which takes far longer
         found.append(keys)
     return found[::-1]
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.basis import Basis, begin, combined, within, write
 from hks_jax.eigen.multifrontal import Factorisation
 from hks_jax.eigen.products import combine, gram, products_with_columns, times
@@ -92,7 +93,7 @@ def block_lanczos(
     return theta, vectors, state.accurate
 
 
-@partial(jax.jit, static_argnames="room")
+@jit_quickly(static_argnames="room")
 def _begin(pencil: Pencil, start: Float[Array, "n_dof b"], known: Float[Array, "w n_dof"], room: int) -> _State:
     """Return the state before the first step: the first block is orthogonal to what is known."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
@@ -173,7 +174,7 @@ def _orthonormal(
     return x, times(image, change), total
 
 
-@partial(jax.jit, static_argnames=("offset", "wanted"))
+@jit_quickly(static_argnames=("offset", "wanted"))
 def _ritz_pairs(
     state: _State, offset: int, steps: int | Int[Array, ""], wanted: int
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:

@@ -4,14 +4,18 @@ All of it is batched dense algebra, one batch for each level of the nested disse
 in 2D, O(N log N) to solve, O(log N) steps one after another; the same code on every device, under `jit` and `vmap`.
 """
 
+import math
+from itertools import accumulate
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.dissection import Dissection
-from hks_jax.eigen.symmetric_inverse import symmetric_inverse
+from hks_jax.eigen.symmetric_inverse import symmetric_inverses
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 
@@ -49,32 +53,33 @@ def factorise(dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]) -
     return Factorisation(dissection, *_eliminate(dissection, pencil, shift))
 
 
-@jax.jit
+@jit_quickly()
 def _eliminate(
     dissection: Dissection, pencil: Pencil, shift: Float[Array, ""]
 ) -> tuple[tuple[Array, ...], tuple[Array, ...], Int[Array, ""]]:
     """Return the matrices downward and upward, and the count of negative eigenvalues."""
     coefficients = _coefficients(pencil, shift)
-    downward, upward = [], []
-    negative = jnp.zeros((), int)
+    start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
+    entries = jnp.zeros(start[-1], coefficients.dtype)
+    entries = _put(entries, dissection.places, _anything(coefficients, dissection.entries))
+    entries = _put(entries, dissection.padding, jnp.ones((), entries.dtype))
+    downward, upward, pivots = [], [], []
     schur: Array | None = None
-    for level in reversed(dissection.levels):
-        (fronts, s), r = level.own.shape, level.boundary.shape[1]
-        blocks = jnp.zeros(fronts * (s + r) * s, coefficients.dtype)
-        blocks = _put(blocks, level.places, _anything(coefficients, level.entries))
-        blocks = _put(blocks, level.padding, jnp.ones((), blocks.dtype)).reshape(fronts, s + r, s)
-        rest = jnp.zeros((fronts, r, r), coefficients.dtype)
+    for number, level in reversed(list(enumerate(dissection.levels))):
+        _, _, s = level.shape
+        blocks = entries[start[number] : start[number + 1]].reshape(level.shape)
+        rest = jnp.zeros((), entries.dtype)
         if schur is not None:
             first, second = _gather_symmetric(schur, jnp.asarray(level.children))
             added = first + second
             blocks, rest = blocks + added[:, :, :s], added[:, s:, s:]
-        inverse, below = jax.vmap(symmetric_inverse)(blocks[:, :s])
+        inverse, found = symmetric_inverses(blocks[:, :s])
         coupling = jnp.matmul(blocks[:, s:], inverse, precision="highest")
         schur = rest - jnp.matmul(coupling, jnp.swapaxes(blocks[:, s:], 1, 2), precision="highest")
         downward.append(jnp.concatenate([inverse, coupling], axis=1))
         upward.append(jnp.swapaxes(coupling, 1, 2))
-        negative = negative + jnp.sum(below)
-    return tuple(downward[::-1]), tuple(upward[::-1]), negative
+        pivots.append(found.ravel())
+    return tuple(downward[::-1]), tuple(upward[::-1]), jnp.sum(jnp.concatenate(pivots) < 0)
 
 
 @jax.jit

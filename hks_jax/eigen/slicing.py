@@ -6,13 +6,13 @@ converged is known from then on. A last factorisation above the last eigenvalue 
 eigenvalues as are known lie below it. Few vectors at a time keep orthogonalisation cheap, however many are wanted.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.dissection import Dissection
 from hks_jax.eigen.lanczos import block_lanczos
 from hks_jax.eigen.multifrontal import Factorisation, factorise
@@ -156,7 +156,7 @@ def cut(
     return factor, here, rest._replace(vectors=state.vectors)
 
 
-@partial(jax.jit, static_argnames="plan")
+@jit_quickly(static_argnames="plan")
 def _consider(negative: Int[Array, ""], plan: Plan, state: State) -> tuple[Bool[Array, ""], State]:
     """Return whether to search at the state's shift, and the state if not."""
     below = jnp.sum(state.values < state.shift)
@@ -175,6 +175,7 @@ def _consider(negative: Int[Array, ""], plan: Plan, state: State) -> tuple[Bool[
 
 def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, state: State) -> State:
     """Find the eigenpairs around the shift."""
+    assert state.vectors is not None
     window, low, high, steps, allowed = _window(plan, state)
     theta, vectors, accurate = block_lanczos(
         pencil, factor, state.start, window, plan.steps, steps, plan.ritz, state.shift, allowed
@@ -183,7 +184,7 @@ def search(pencil: Pencil, factor: Factorisation, plan: Plan, tolerance: float, 
     return _accept(pencil, factor.negative, plan, tolerance, theta, vectors, accurate, low, high, state.vectors, rest)
 
 
-@partial(jax.jit, static_argnames="plan")
+@jit_quickly(static_argnames="plan")
 def _window(
     plan: Plan, state: State
 ) -> tuple[Float[Array, "window n_dof"], Array, Array, Int[Array, ""], Float[Array, ""]]:
@@ -198,12 +199,12 @@ def _window(
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
     size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2, plan.slice_size)
     # Fronts are not pivoted: where a part of the domain has an eigenvalue very near to the shift, rounding grows.
-    allowed = min(_GROWTH * float(jnp.finfo(window.dtype).eps), 0.01)
-    allowed = jnp.where(state.moved < _MOVES, allowed, jnp.inf).astype(window.dtype)
+    grown = min(_GROWTH * float(jnp.finfo(window.dtype).eps), 0.01)
+    allowed = jnp.where(state.moved < _MOVES, grown, jnp.inf).astype(window.dtype)
     return window, low, high, jnp.minimum(steps_for(plan, size), plan.steps), allowed
 
 
-@partial(jax.jit, static_argnames=("plan", "tolerance"), donate_argnames="known_vectors")
+@jit_quickly(static_argnames=("plan", "tolerance"), donate_argnames="known_vectors")
 def _accept(
     pencil: Pencil,
     negative: Int[Array, ""],

@@ -1,22 +1,22 @@
-"""The inverse of a symmetric indefinite matrix together with its inertia."""
+"""The inverses of symmetric indefinite matrices together with their inertia."""
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-Inverse = tuple[Float[Array, "n n"], Int[Array, ""]]
+Inverse = tuple[Float[Array, "n n"], Float[Array, " n"]]
 
 _BLOCK = 32
 _SMALL, _LARGE = 32, 256
 
 
-def symmetric_inverse(matrix: Float[Array, "n n"]) -> Inverse:
-    """Return the inverse, and how many eigenvalues are negative.
+def symmetric_inverses(matrices: Float[Array, "m n n"]) -> tuple[Float[Array, "m n n"], Float[Array, "m n"]]:
+    """Return the inverses, and for each matrix numbers of which as many are negative as eigenvalues.
 
-    Not finite where the matrix is singular. On CPUs by LAPACK's eigenvalues, elsewhere by elimination, which takes far
+    Not finite where a matrix is singular. On CPUs by LAPACK's eigenvalues, elsewhere by elimination, which takes far
     fewer of the operations that are slow there.
     """
-    return jax.lax.platform_dependent(matrix, cpu=by_eigenvalues, default=by_elimination)
+    return jax.lax.platform_dependent(matrices, cpu=jax.vmap(by_eigenvalues), default=jax.vmap(by_elimination))
 
 
 def by_eigenvalues(matrix: Float[Array, "n n"]) -> Inverse:
@@ -27,22 +27,22 @@ def by_eigenvalues(matrix: Float[Array, "n n"]) -> Inverse:
     n = matrix.shape[0]
     if n <= _SMALL // 2 or _SMALL < n <= _LARGE:
         vectors, values = jax.lax.linalg.eigh(matrix, symmetrize_input=False)
-        return jnp.matmul(vectors / values, vectors.T, precision="highest"), jnp.sum(values < 0)
+        return jnp.matmul(vectors / values, vectors.T, precision="highest"), values
     half = n // 2
-    first, negative = by_eigenvalues(matrix[:half, :half])
+    first, values = by_eigenvalues(matrix[:half, :half])
     coupling = jnp.matmul(matrix[half:, :half], first, precision="highest")
     schur = matrix[half:, half:] - jnp.matmul(coupling, matrix[:half, half:], precision="highest")
-    last, more = by_eigenvalues((schur + schur.T) / 2)
+    last, others = by_eigenvalues((schur + schur.T) / 2)
     beside = -jnp.matmul(last, coupling, precision="highest")
     first = first - jnp.matmul(coupling.T, beside, precision="highest")
-    return jnp.block([[first, beside.T], [beside, last]]), negative + more
+    return jnp.block([[first, beside.T], [beside, last]]), jnp.concatenate([values, others])
 
 
 def by_elimination(matrix: Float[Array, "n n"]) -> Inverse:
     """Sweep the matrix block by block.
 
     Sweeping a block P of A turns it into −P⁻¹, and the rest into the Schur complement of P; once all blocks are swept,
-    A has become −A⁻¹. By Sylvester's law of inertia the negative eigenvalues of all P add up to those of A.
+    A has become −A⁻¹. By Sylvester's law of inertia as many of the pivots are negative as eigenvalues of A.
     """
     n = matrix.shape[0]
     size = min(n, _BLOCK)
@@ -50,29 +50,30 @@ def by_elimination(matrix: Float[Array, "n n"]) -> Inverse:
     a = jnp.eye(count * size, dtype=matrix.dtype).at[:n, :n].set(matrix)
 
     def sweep(number: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        a, negative = state
+        a, pivots = state
         at = number * size
         rows = jax.lax.dynamic_slice_in_dim(a, at, size, axis=0)
-        inverse, more = _sweep_rows(jax.lax.dynamic_slice_in_dim(rows, at, size, axis=1))
+        inverse, found = _sweep_rows(jax.lax.dynamic_slice_in_dim(rows, at, size, axis=1))
         scaled = jnp.matmul(inverse, rows, precision="highest")
         a = a - jnp.matmul(rows.T, scaled, precision="highest")
         a = jax.lax.dynamic_update_slice_in_dim(a, scaled, at, axis=0)
         a = jax.lax.dynamic_update_slice_in_dim(a, scaled.T, at, axis=1)
         a = jax.lax.dynamic_update_slice(a, -inverse, (at, at))
-        return a, negative + more
+        return a, jax.lax.dynamic_update_slice_in_dim(pivots, found, at, axis=0)
 
-    a, negative = jax.lax.fori_loop(0, count, sweep, (a, jnp.zeros((), int)))
-    return -a[:n, :n], negative
+    a, pivots = jax.lax.fori_loop(0, count, sweep, (a, jnp.zeros(count * size, a.dtype)))
+    # Those of the padding are one.
+    return -a[:n, :n], pivots[:n]
 
 
 @jax.jit
 def _sweep_rows(matrix: Float[Array, "n n"]) -> Inverse:
-    """Sweep one row at a time, always the one with the largest diagonal entry left; the pivots tell the inertia."""
+    """Sweep one row at a time, always the one with the largest diagonal entry left; return with it the pivots."""
     n = matrix.shape[0]
     index = jnp.arange(n)
 
     def sweep(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        a, swept, negative = state
+        a, swept, pivots = state
         diagonal = jnp.diagonal(a)
         here = index == jnp.argmax(jnp.where(swept, -1, jnp.abs(diagonal)))
         column = jnp.sum(jnp.where(here, a, 0), axis=1)
@@ -80,8 +81,8 @@ def _sweep_rows(matrix: Float[Array, "n n"]) -> Inverse:
         row = jnp.where(here, -1, column) / pivot
         a = a - jnp.where(here, 0, column)[:, None] * row
         a = jnp.where(here[:, None], row, jnp.where(here, row[:, None], a))
-        return a, swept | here, negative + (pivot < 0)
+        return a, swept | here, jnp.where(here, pivot, pivots)
 
-    swept, negative = jnp.zeros(n, bool), jnp.zeros((), int)
-    a, _, negative = jax.lax.fori_loop(0, n, sweep, (matrix, swept, negative))
-    return -a, negative
+    state = matrix, jnp.zeros(n, bool), jnp.zeros(n, matrix.dtype)
+    a, _, pivots = jax.lax.fori_loop(0, n, sweep, state)
+    return -a, pivots

@@ -161,7 +161,7 @@ def _placed(x: Array, axis: int, before: int, after: int) -> Array:
 def stencil_pattern(space: GridSpace) -> tuple[np.ndarray, Pattern]:
     """Where in the coefficients each entry lies, and its (row, column), for the couplings between free nodes."""
     shape, d = space.node_shape, space.dimension
-    number = space.degrees_of_freedom.reshape(shape)
+    number = space.degrees_of_freedom.reshape(shape).astype(np.int32)
     for axis, wraps in enumerate(space.periodic):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
         number = np.pad(number, widths, mode="wrap") if wraps else np.pad(number, widths, constant_values=-1)
@@ -170,7 +170,7 @@ def stencil_pattern(space: GridSpace) -> tuple[np.ndarray, Pattern]:
     for o, start in enumerate(product((0, 1, 2), repeat=d)):
         neighbour = number[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))].ravel()
         both = np.flatnonzero((centre >= 0) & (neighbour >= 0))
-        where.append(o * centre.size + both)
+        where.append((o * centre.size + both).astype(np.int32 if 3**d * centre.size < 2**31 else np.int64))
         rows.append(centre[both])
         cols.append(neighbour[both])
     return np.concatenate(where), (np.concatenate(rows), np.concatenate(cols))
