@@ -54,7 +54,7 @@ def dense_matrices(pencil):
 def test_inverse_and_inertia_of_an_indefinite_matrix(rng, inverse, n):
     a = rng.standard_normal((3, n, n))
     a = a + np.swapaxes(a, 1, 2)
-    inverted, pivots = jax.vmap(inverse)(jnp.asarray(a))
+    inverted, pivots = inverse(jnp.asarray(a))
     np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-9)
     np.testing.assert_array_equal((pivots < 0).sum(axis=1), (np.linalg.eigvalsh(a) < 0).sum(axis=1))
 

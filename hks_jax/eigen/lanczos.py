@@ -1,6 +1,5 @@
 """Block Lanczos for the eigenvalues nearest to a shift."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -105,7 +104,7 @@ def _begin(pencil: Pencil, start: Float[Array, "n_dof b"], known: Float[Array, "
     return _State(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix, jnp.ones((), bool))
 
 
-@partial(jax.jit, static_argnames="offset", donate_argnames="state")
+@jit_quickly(static_argnames="offset", donate_argnames="state")
 def _advance(
     pencil: Pencil,
     factor: Factorisation,

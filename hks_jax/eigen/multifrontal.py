@@ -91,7 +91,9 @@ def _solve(factor: Factorisation, rhs: Float[Array, "n_dof b"]) -> Float[Array, 
         s = level.own.shape[1]
         force, onward = _anything(rhs, level.own), jnp.zeros((), rhs.dtype)
         if passed is not None:
-            total = _gather(passed, level.children[0]) + _gather(passed, level.children[1])
+            # What a child does not have is found in the row of zeros.
+            padded = jnp.concatenate([passed, jnp.zeros((1, width), rhs.dtype)])
+            total = _anything(padded, level.children[0]) + _anything(padded, level.children[1])
             force, onward = force + total[:, :s], total[:, s:]
         product = jnp.matmul(matrix, force, precision="highest")
         own.append(product[:, :s])
@@ -118,11 +120,6 @@ def _coefficients(pencil: Pencil, shift: Float[Array, ""]) -> Float[Array, " ent
     return coefficients.at[centre].add(-shift * lumped).reshape(-1)
 
 
-def _gather(x: Float[Array, "n b"], index: Int[ArrayLike, "fronts m"]) -> Float[Array, "fronts m b"]:
-    """Return rows of x; zero where the index is out of range."""
-    return jnp.where((jnp.asarray(index) < len(x))[..., None], _anything(x, index), 0)
-
-
 def _anything(x: Float[Array, "n *b"], index: Int[ArrayLike, "*m"]) -> Float[Array, "*m_and_b"]:
     """Return rows of x; whatever is there where the index is out of range, for products in which it meets zeros."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
@@ -138,6 +135,6 @@ def _gather_symmetric(
     """Return the entries of symmetric blocks at pairs of places (block · r + i, block · r + j); zero for padding."""
     n, r = blocks.shape[:2]
     # Whole rows first, and of these the columns: faster than entry by entry.
-    rows = _gather(blocks.reshape(-1, r), index)
+    rows = jnp.where((index < n * r)[..., None], _anything(blocks.reshape(-1, r), index), 0)
     columns = jnp.take_along_axis(rows, (index % r)[:, :, None, :], axis=3, mode="clip")
     return jnp.where((index < n * r)[:, :, None, :], columns, 0)
