@@ -28,6 +28,7 @@ RESULTS = BENCHMARKS / "results"
 HEADINGS = {
     "seconds": "seconds",
     "first_call_s": "first call, s",
+    "compilation_s": "compilation, s",
     "peak_GB": "peak memory, GB",
     "dense_s": "dense, s",
     "shift_invert_s": "shift-invert, s",

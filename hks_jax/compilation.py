@@ -1,0 +1,49 @@
+"""Compiling for CPUs in half the time."""
+
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from hks_jax.traced import is_traced
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
+"""XLA's older code generator for fused loops takes half as long, for code as fast as far as measured here."""
+
+
+def jit_quickly(**settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Return a decorator like `jax.jit` with these settings, for functions of which many are compiled.
+
+    XLA compiles a computation as a whole: within another one these functions are as that is.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        usual = jax.jit(function, **settings)
+        quick = jax.jit(function, compiler_options=_OPTIONS, **settings)
+
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+            # Nothing comes of an operation but a tracer where all operations are part of a computation to come.
+            within = is_traced((args, kwargs)) or is_traced(jnp.zeros(()))
+            return usual(*args, **kwargs) if within or not _understood() else quick(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+@cache
+def _understood() -> bool:
+    """Return whether computations run on a CPU whose compiler has these options."""
+    if jax.default_backend() != "cpu":
+        return False
+    try:
+        jax.jit(lambda: jnp.zeros(()), compiler_options=_OPTIONS).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
