@@ -121,7 +121,8 @@ def _exact_null_modes(
     """
     mass, dtype = pencil.mass, values.dtype
     n_null = min(pencil.space.n_null, values.size)
-    constants = jnp.asarray(pencil.space.null_labels == np.arange(n_null)[:, None], dtype)
+    # The barrier keeps XLA from computing with long constants while it compiles.
+    constants = jax.lax.optimization_barrier(jnp.asarray(pencil.space.null_labels == np.arange(n_null)[:, None], dtype))
     constants /= jnp.sqrt(jnp.sum(constants * mass.apply(constants), axis=1, keepdims=True))
     share = jnp.matmul(vectors, mass.apply(constants).T, precision="highest")
     vectors = vectors - jnp.matmul(share, constants, precision="highest")

@@ -1,14 +1,13 @@
 """One pencil's lowest eigenpairs, with what is known of their quality."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import lowest
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.quality import ROWS, indistinct, relative_defect
+from hks_jax.eigen.quality import indistinct, values_and_defects
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import Pencil
 
@@ -40,13 +39,13 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
     )
 
 
-@partial(jax.jit, static_argnames="tolerance")
+@jit_quickly(static_argnames="tolerance")
 def _quality(
     pencil: Pencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"], tolerance: float
 ) -> tuple[Array, Array, Array]:
     """Return residuals, whether they are small enough, and what rounding alone makes of them, each (k,)."""
     first = values[min(pencil.space.n_null, values.size - 1)]
-    defect = jax.lax.map(lambda pair: relative_defect(pencil, *pair), (values, vectors), batch_size=ROWS)
+    _, defect = values_and_defects(pencil, vectors, values)
     scale = jnp.maximum(jnp.abs(values), jnp.abs(first))
     scale = jnp.where(scale > 0, scale, 1)
     residuals = defect / scale

@@ -7,30 +7,31 @@ from jaxtyping import Array, Float
 
 from hks_jax.fem.pencil import Pencil
 
-ROWS = 8
+_ROWS = 8
 """How many vectors to look at together: what is computed from them stays in the cache."""
 
 
-def relative_defect(pencil: Pencil, value: Float[Array, ""], vector: Float[Array, " n_dof"]) -> Float[Array, ""]:
-    """Return ‖Kφ − λMφ‖ / ‖Mφ‖."""
-    image = pencil.mass.apply(vector)
-    return jnp.linalg.norm(pencil.stiffness.apply(vector) - value * image) / jnp.linalg.norm(image)
-
-
-def quotients_and_defects(
-    pencil: Pencil, vectors: Float[Array, "m n_dof"], block: int
+def values_and_defects(
+    pencil: Pencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Return λ = φᵀKφ / φᵀMφ and ‖Kφ − λMφ‖ / ‖Mφ‖ of vectors, of which there are several blocks."""
+    """Return λ, if not given the Rayleigh quotient φᵀKφ / φᵀMφ, and ‖Kφ − λMφ‖ / ‖Mφ‖ of each vector."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
+    m, size = len(vectors), min(_ROWS, len(vectors))
+    starts = np.minimum(np.arange(0, m, size), m - size)  # the last may overlap the one before
 
-    def measure(rows: Float[Array, "block n_dof"]) -> tuple[Array, Array]:
-        columns = jax.lax.optimization_barrier(rows.T)
+    def measure(start: Array) -> tuple[Array, Array]:
+        columns = jax.lax.optimization_barrier(jax.lax.dynamic_slice_in_dim(vectors, start, size).T)
         force, image = stiffness(columns), mass(columns)
-        values = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
-        return values, jnp.linalg.norm(force - values * image, axis=0) / jnp.linalg.norm(image, axis=0)
+        if values is None:
+            here = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
+        else:
+            here = jax.lax.dynamic_slice_in_dim(values, start, size)
+        return here, jnp.linalg.norm(force - here * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
-    values, defects = jax.lax.map(measure, vectors.reshape(-1, block, vectors.shape[1]))
-    return values.ravel(), defects.ravel()
+    found = jax.lax.map(measure, jnp.asarray(starts))
+    each = np.arange(m)
+    block = each // size
+    return found[0][block, each - starts[block]], found[1][block, each - starts[block]]
 
 
 def indistinct(pencil: Pencil, dtype: np.dtype) -> Float[Array, ""]:

@@ -16,7 +16,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.dissection import Dissection
 from hks_jax.eigen.lanczos import block_lanczos
 from hks_jax.eigen.multifrontal import Factorisation, factorise
-from hks_jax.eigen.quality import indistinct, quotients_and_defects
+from hks_jax.eigen.quality import indistinct, values_and_defects
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 
@@ -226,7 +226,7 @@ def _accept(
     shift, index = state.shift, jnp.arange(plan.capacity)
     near = shift + 1 / theta
 
-    values, residuals = quotients_and_defects(pencil, vectors, plan.block)
+    values, residuals = values_and_defects(pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[pencil.space.n_null]
     scale = jnp.maximum(jnp.abs(values), first_nonzero)
     rounding = jnp.minimum(indistinct(pencil, values.dtype) / scale, 0.01)
