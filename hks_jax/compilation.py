@@ -29,7 +29,7 @@ def jit_quickly(**settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
             # Nothing comes of an operation but a tracer where all operations are part of a computation to come.
-            within = is_traced((args, kwargs)) or is_traced(jnp.zeros(()))
+            within = is_traced((args, kwargs, jnp.zeros(())))
             return usual(*args, **kwargs) if within or not _understood() else quick(*args, **kwargs)
 
         return call

@@ -433,7 +433,7 @@ HEED_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_ha
 def test_ctrl_c_amid_a_computation_leaves_nothing_but_one_line(tmp_path):
     n = 36
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(3), (n, n, n, 3, 3)))
-    program = HEED_CTRL_C + "from hks_jax.cli import run_and_exit; run_and_exit()"
+    program = HEED_CTRL_C + "import runpy; runpy.run_module('hks_jax', run_name='__main__')"
     arguments = ["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "-k", "150"]
     command = [sys.executable, "-c", program, *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

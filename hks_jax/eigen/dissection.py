@@ -93,7 +93,7 @@ def dissect(space: GridSpace) -> Dissection:
             children = np.full((2, fronts, s + r), 2 * fronts * width[number + 1])
             children[at % 2, at // 2, place] = at * width[number + 1] + ranks[number + 1]
         levels.append(Level(*(field.astype(np.int32) for field in (nodes, boundary, children))))
-    order = np.empty(n + 1, np.int32)
+    order = np.empty(n + 1, int)
     order[np.concatenate([nodes.ravel() for nodes in own])] = np.arange(sum(nodes.size for nodes in own))
 
     _, height, stride = shapes = np.array([level.shape for level in levels]).T
@@ -104,8 +104,9 @@ def dissect(space: GridSpace) -> Dissection:
     rows, cols = rows[mine], cols[mine]
     place = slot[rows]
     outside = np.flatnonzero(level[rows] < level[cols])
+    eliminated = level[cols[outside]]
     for number in range(1, depth):
-        above = outside[level[cols[outside]] == number]
+        above = outside[eliminated == number]
         key = front[cols[above]] * n + rows[above]
         place[above] = stride[number] + ranks[number][np.searchsorted(boundaries[number], key)]
     column = (start[level] + front * (height * stride)[level] + slot).astype(np.int32)

@@ -134,7 +134,8 @@ def _gather_symmetric(
 ) -> Float[Array, "children fronts m m"]:
     """Return the entries of symmetric blocks at pairs of places (block · r + i, block · r + j); zero for padding."""
     n, r = blocks.shape[:2]
+    there = index < n * r
     # Whole rows first, and of these the columns: faster than entry by entry.
-    rows = jnp.where((index < n * r)[..., None], _anything(blocks.reshape(-1, r), index), 0)
+    rows = jnp.where(there[..., None], _anything(blocks.reshape(-1, r), index), 0)
     columns = jnp.take_along_axis(rows, (index % r)[:, :, None, :], axis=3, mode="clip")
-    return jnp.where((index < n * r)[:, :, None, :], columns, 0)
+    return jnp.where(there[:, :, None, :], columns, 0)

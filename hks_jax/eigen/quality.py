@@ -28,10 +28,10 @@ def values_and_defects(
             here = jax.lax.dynamic_slice_in_dim(values, start, size)
         return here, jnp.linalg.norm(force - here * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
-    found = jax.lax.map(measure, jnp.asarray(starts))
-    each = np.arange(m)
-    block = each // size
-    return found[0][block, each - starts[block]], found[1][block, each - starts[block]]
+    found_values, defects = jax.lax.map(measure, jnp.asarray(starts))
+    block = np.arange(m) // size
+    place = block, np.arange(m) - starts[block]
+    return found_values[place], defects[place]
 
 
 def indistinct(pencil: Pencil, dtype: np.dtype) -> Float[Array, ""]:

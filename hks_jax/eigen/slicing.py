@@ -88,7 +88,7 @@ class State(NamedTuple):
         start: (n_dof, block) where Lanczos starts next.
         noise: (n_dof, block) independent normal numbers.
         slices: factorisations so far.
-        moved: how often in a row the shift was moved instead of searched.
+        moved: how often in a row the shift was moved because the factorisation was inaccurate there.
         finished: whether all is found and certified.
     """
 

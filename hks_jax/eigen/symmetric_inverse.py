@@ -66,7 +66,6 @@ def by_elimination(matrices: Float[Array, "m n n"]) -> Inverses:
     return -a[:, :n, :n], pivots[:, :n]
 
 
-@jax.jit
 def _sweep_rows(matrices: Float[Array, "m n n"]) -> Inverses:
     """Sweep one row at a time, always the one with the largest diagonal entry left; return with them the pivots."""
     m, n, _ = matrices.shape

@@ -170,7 +170,7 @@ def stencil_pattern(space: GridSpace) -> tuple[np.ndarray, Pattern]:
     for o, start in enumerate(product((0, 1, 2), repeat=d)):
         neighbour = number[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))].ravel()
         both = np.flatnonzero((centre >= 0) & (neighbour >= 0))
-        where.append((o * centre.size + both).astype(np.int32 if 3**d * centre.size < 2**31 else np.int64))
+        where.append(o * centre.size + both)
         rows.append(centre[both])
         cols.append(neighbour[both])
     return np.concatenate(where), (np.concatenate(rows), np.concatenate(cols))
