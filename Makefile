@@ -3,6 +3,8 @@
 #   make demo        the heat kernel signature of a real brain slice: pictures in demo/
 #   make test        the tests
 #   make test-slow   the tests that take minutes
+#   make test-optimised   tests of the numerical core, compiled as users have it
+#   make stress      random problems against independent answers, an hour of them
 #   make lint        lint, format and type checks
 #   make notebooks   run every notebook
 #   make docs        the documentation site, in site/
@@ -19,18 +21,27 @@ BIN := $(VENV)/bin
 # A stamp is newer than pyproject.toml as long as what it names is installed: nothing is installed twice.
 STAMPS := $(VENV)/.stamps
 BRAIN := mdt==1.2.7
+# What rounding and the order of operations reach first: solvers, factorisations and derivatives.
+CORE := $(patsubst %,tests/test_%.py,eigenpairs block_lanczos derivatives float32)
 
-.PHONY: demo test test-slow lint notebooks docs clean
+.PHONY: demo test test-slow test-optimised stress lint notebooks docs clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMPS)/dti $(STAMPS)/brain
 	$(BIN)/python -m hks_jax demo -o demo
 
 test: $(STAMPS)/test
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
 
 test-slow: $(STAMPS)/test
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) -m slow
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow
+
+# The other tests are compiled with hardly an optimisation; an empty XLA_FLAGS leaves them all on.
+test-optimised: $(STAMPS)/test
+	XLA_FLAGS= $(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" $(CORE)
+
+stress: $(STAMPS)/test
+	$(ONE_THREAD) $(BIN)/python -m tests.stress --json benchmarks/results/stress.json
 
 lint: $(STAMPS)/lint
 	$(BIN)/ruff check .

@@ -24,8 +24,8 @@ from machine import RESULTS, timed, write
 
 import hks_jax as hj
 from hks_jax.devices import Slabs, chebyshev_series
-from hks_jax.eigen.coarsening import finest_level
-from hks_jax.eigen.filtering import State, improve
+from hks_jax.eigen.filter.coarsening import finest_level
+from hks_jax.eigen.filter.rounds import State, improve
 from hks_jax.fem.columns import stencil_product
 
 DEGREE, PAIRS, COLUMNS = 100, 90, 16

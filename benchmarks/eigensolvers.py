@@ -1,13 +1,16 @@
-"""The eigensolver for grids beside its peers: the same matrices, the same tolerance, the same threads, one run.
+"""The eigensolver for grids and surfaces beside its peers: the same matrices, tolerance and threads, in one run.
 
-    python benchmarks/eigensolvers.py [--cases 64/100 256/500 ...] [--solvers NAME ...] [-o FILE]
+    python benchmarks/eigensolvers.py [--cases 64/100 256/500 s65000/100 ...] [--solvers NAME ...] [-o FILE]
+
+64/100 stands for 64² nodes of a grid and 100 pairs, s65000/100 for a closed surface with 65 000 vertices.
 
 Every measurement is a process of its own, so that its peak memory is its own too. Peers that are not installed are left
 out, and named: `pip install scikit-sparse lapy`; SLEPc for Python (Debian: python3-slepc4py) may live in an interpreter
 of its own, given by --slepc-python.
 
 Timed is the eigensolver alone, from assembled matrices to eigenpairs: factorisation included, compilation apart. LaPy
-assembles its own matrices, on a flat triangulation with as many nodes. The residual is ‖Kφ − λMφ‖/‖Mφ‖/max(λ, λ₁).
+assembles its own matrices, of a grid on a flat triangulation with as many nodes. The residual is
+‖Kφ − λMφ‖/‖Mφ‖/max(λ, λ₁).
 """
 
 import argparse
@@ -28,15 +31,33 @@ TOLERANCE = 1e-8
 Pairs = tuple[np.ndarray, np.ndarray]
 
 
-def ours(n: int, k: int) -> tuple[Pairs, dict]:
+def surface(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of a closed surface with bumps, the convex hull of random points on a sphere."""
+    from scipy.spatial import ConvexHull
+
+    x = np.random.default_rng(0).standard_normal((n, 3))
+    x /= np.linalg.norm(x, axis=1)[:, None]
+    return x * (1 + 0.3 * np.sin(4 * x[:, 0]) * np.cos(3 * x[:, 1]))[:, None], ConvexHull(x).simplices
+
+
+def domain(name: str) -> "hj.TensorField | hj.SurfaceMesh":
+    """Return the grid or surface of a case."""
+    from machine import field
+
+    import hks_jax as hj
+
+    return hj.SurfaceMesh(*surface(int(name[1:]))) if name.startswith("s") else field(int(name))
+
+
+def ours(name: str, k: int) -> tuple[Pairs, dict]:
     """Block Lanczos of this package."""
     import jax
-    from machine import field, timed_from_cold
+    from machine import timed_from_cold
 
     import hks_jax as hj
 
     jax.config.update("jax_enable_x64", True)
-    pencil = hj.assemble(field(n))
+    pencil = hj.assemble(domain(name))
     compiling: list[float] = []
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, seconds, **_: compiling.append(seconds) if event.startswith("/jax/core/compile") else None
@@ -47,12 +68,12 @@ def ours(n: int, k: int) -> tuple[Pairs, dict]:
     return (np.asarray(values), np.asarray(vectors)), times | {"complete_below": float(complete_below)}
 
 
-def eigsh(n: int, k: int, cholmod: bool = False) -> tuple[Pairs, dict]:
+def eigsh(name: str, k: int, cholmod: bool = False) -> tuple[Pairs, dict]:
     """SciPy's ARPACK in shift-invert mode, with SuperLU or CHOLMOD."""
     from scipy.sparse.linalg import LinearOperator, splu
     from scipy.sparse.linalg import eigsh as arpack
 
-    K, M = matrices(n)
+    K, M = matrices(name)
     start = time.perf_counter()
     if cholmod:
         from sksparse.cholmod import cholesky
@@ -63,29 +84,35 @@ def eigsh(n: int, k: int, cholmod: bool = False) -> tuple[Pairs, dict]:
         options = {"SymmetricMode": True}
         solve = splu((K + 0.05 * M).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
     inverse = LinearOperator(K.shape, matvec=solve, dtype=float)
-    values, vectors = arpack(K, k, M, -0.05, OPinv=inverse, v0=np.random.default_rng(0).standard_normal(n * n))
+    values, vectors = arpack(
+        K, k, M, -0.05, OPinv=inverse, v0=np.random.default_rng(0).standard_normal(len(K.indptr) - 1)
+    )
     return (values, vectors.T), {"seconds": time.perf_counter() - start}
 
 
-def lapy(n: int, k: int) -> tuple[Pairs, dict]:
-    """LaPy on a flat triangulation with as many nodes."""
+def lapy(name: str, k: int) -> tuple[Pairs, dict]:
+    """LaPy on the surface, or on a flat triangulation with as many nodes as the grid."""
     from lapy import Solver, TriaMesh
 
-    x = np.linspace(0, 1, n)
-    vertices = np.stack([*map(np.ravel, np.meshgrid(x, x)), np.zeros(n * n)], axis=1)
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    faces = np.concatenate([corner[:, None] + [0, 1, n], corner[:, None] + [1, n + 1, n]])
+    flat = not name.startswith("s")
+    if flat:
+        n = int(name)
+        x = np.linspace(0, 1, n)
+        vertices = np.stack([*map(np.ravel, np.meshgrid(x, x)), np.zeros(n * n)], axis=1)
+        corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+        faces = np.concatenate([corner[:, None] + [0, 1, n], corner[:, None] + [1, n + 1, n]])
+    else:
+        vertices, faces = surface(int(name[1:]))
     solver = Solver(TriaMesh(vertices, faces))
     start = time.perf_counter()
     values, vectors = solver.eigs(k)
-    found = {"seconds": time.perf_counter() - start, "other_matrices": True}
-    return (values, vectors.T), found
+    return (values, vectors.T), {"seconds": time.perf_counter() - start, "other_matrices": flat}
 
 
-SOLVERS: dict[str, Callable[[int, int], tuple[Pairs, dict]]] = {
+SOLVERS: dict[str, Callable[[str, int], tuple[Pairs, dict]]] = {
     "hks_jax": ours,
     "eigsh, SuperLU": eigsh,
-    "eigsh, CHOLMOD": lambda n, k: eigsh(n, k, cholmod=True),
+    "eigsh, CHOLMOD": lambda name, k: eigsh(name, k, cholmod=True),
     "LaPy": lapy,
 }
 SLEPC = {
@@ -96,17 +123,17 @@ SLEPC = {
 }
 
 
-def matrices(n: int) -> tuple:
+def matrices(name: str) -> tuple:
     """Return the stiffness and mass of the benchmark's field as SciPy matrices."""
     from scipy.sparse import load_npz
 
     folder = Path(os.environ["EIGENSOLVERS_MATRICES"])
-    return load_npz(folder / f"K{n}.npz"), load_npz(folder / f"M{n}.npz")
+    return load_npz(folder / f"K{name}.npz"), load_npz(folder / f"M{name}.npz")
 
 
-def quality(n: int, pairs: Pairs) -> dict:
+def quality(name: str, pairs: Pairs) -> dict:
     """Return the worst residual and the eigenvalues."""
-    K, M = matrices(n)
+    K, M = matrices(name)
     values, vectors = pairs
     order = np.argsort(values)
     values, worst = values[order], 0.0
@@ -123,24 +150,24 @@ def peak_memory() -> float:
     return int(status.split("VmHWM:")[1].split()[0]) / 1e6
 
 
-def measure_here(name: str, n: int, k: int) -> None:
+def measure_here(solver: str, name: str, k: int) -> None:
     """Run one solver in this process and print what it took as JSON."""
-    pairs, found = SOLVERS[name](n, k)
+    pairs, found = SOLVERS[solver](name, k)
     found["peak_GB"] = peak_memory()
-    found |= {"eigenvalues": pairs[0].tolist()} if found.pop("other_matrices", False) else quality(n, pairs)
+    found |= {"eigenvalues": pairs[0].tolist()} if found.pop("other_matrices", False) else quality(name, pairs)
     print(json.dumps(found))
 
 
-def measure(name: str, n: int, k: int, reference: list[float], slepc_python: str, limit: float) -> dict | str:
+def measure(solver: str, name: str, k: int, reference: list[float], slepc_python: str, limit: float) -> dict | str:
     """Run one solver in a process of its own; return what it took, or why it did not run."""
-    if name in SLEPC:
+    if solver in SLEPC:
         if not reference:
             return "needs the interval's end, from another solver"
-        method, package = SLEPC[name]
+        method, package = SLEPC[solver]
         end = (reference[k - 1] + reference[k]) / 2
-        command = [slepc_python, str(HERE / "slepc.py"), method, package, str(n), str(k), repr(end), str(TOLERANCE)]
+        command = [slepc_python, str(HERE / "slepc.py"), method, package, name, str(k), repr(end), str(TOLERANCE)]
     else:
-        command = [sys.executable, __file__, "--here", name, str(n), str(k)]
+        command = [sys.executable, __file__, "--here", solver, name, str(k)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
     except subprocess.TimeoutExpired:
@@ -153,16 +180,16 @@ def measure(name: str, n: int, k: int, reference: list[float], slepc_python: str
 def main() -> None:
     """Measure every case, print a table, write the results and their plot."""
     if sys.argv[1:2] == ["--here"]:
-        measure_here(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+        measure_here(sys.argv[2], sys.argv[3], int(sys.argv[4]))
         return
     import jax
-    from machine import RESULTS, field, write
+    from machine import RESULTS, write
     from scipy.sparse import save_npz
 
     import hks_jax as hj
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cases", nargs="+", default=CASES, metavar="N/K", help="N² nodes, K pairs")
+    parser.add_argument("--cases", nargs="+", default=CASES, metavar="N/K", help="N² nodes (sN: N vertices), K pairs")
     parser.add_argument("--solvers", nargs="+", default=[*SOLVERS, *SLEPC], metavar="NAME")
     parser.add_argument("--slepc-python", default=sys.executable, help="an interpreter that can import slepc4py")
     parser.add_argument("--limit", type=float, default=900, help="seconds for each measurement")
@@ -173,33 +200,34 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["EIGENSOLVERS_MATRICES"] = folder
         for case in arguments.cases:
-            n, k = map(int, case.split("/"))
-            if not (Path(folder) / f"K{n}.npz").exists():
-                pencil = hj.assemble(field(n))
+            where, _, pairs = case.partition("/")
+            k, nodes = int(pairs), int(where[1:]) if where.startswith("s") else int(where) ** 2
+            if not (Path(folder) / f"K{where}.npz").exists():
+                pencil = hj.assemble(domain(where))
                 for letter, matrix in (("K", pencil.stiffness.to_scipy()), ("M", pencil.mass.to_scipy())):
-                    save_npz(Path(folder) / f"{letter}{n}.npz", matrix)
+                    save_npz(Path(folder) / f"{letter}{where}.npz", matrix)
                     matrix = matrix.tocsr()
                     arrays = {"indptr": matrix.indptr, "indices": matrix.indices, "data": matrix.data}
-                    np.savez(Path(folder) / f"{letter}{n}_csr.npz", **arrays)
+                    np.savez(Path(folder) / f"{letter}{where}_csr.npz", **arrays)
             reference: list[float] = []
-            print(f"{n}² nodes, {k} pairs", flush=True)
-            for name in arguments.solvers:
-                more = 1 if name == "hks_jax" else 0  # one more, for the end of the interval that slicing needs
-                found = measure(name, n, k + more, reference, arguments.slepc_python, arguments.limit)
+            print(f"{where}: {nodes} nodes, {k} pairs", flush=True)
+            for solver in arguments.solvers:
+                more = 1 if solver == "hks_jax" else 0  # one more, for the end of the interval that slicing needs
+                found = measure(solver, where, k + more, reference, arguments.slepc_python, arguments.limit)
                 if isinstance(found, str):
-                    print(f"  {name:38s} {found}", flush=True)
-                    rows.append({"nodes": n * n, "k": k, "solver": name, "not_run": found})
+                    print(f"  {solver:38s} {found}", flush=True)
+                    rows.append({"nodes": nodes, "k": k, "solver": solver, "not_run": found})
                     continue
                 values = found.pop("eigenvalues")
                 reference = reference or values
-                if name != "LaPy":
+                if solver != "LaPy":
                     scale = np.maximum(reference[:k], reference[1])
                     found["eigenvalue_difference"] = float(
                         np.max(np.abs(np.subtract(values[:k], reference[:k])) / scale)
                     )
-                rows.append({"nodes": n * n, "k": k, "solver": name, **found})
+                rows.append({"nodes": nodes, "k": k, "solver": solver, **found})
                 shown = " ".join(f"{key} {value:.3g}" for key, value in found.items())
-                print(f"  {name:38s} {shown}", flush=True)
+                print(f"  {solver:38s} {shown}", flush=True)
             write(arguments.output, rows, tolerance=TOLERANCE)
     draw(rows, arguments.output.with_suffix(".png"))
 

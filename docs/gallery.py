@@ -187,7 +187,7 @@ def fit() -> Figure:
     x, y = grid.nodes[..., 0], grid.nodes[..., 1]
     hidden = hj.TensorField(grid, jnp.exp(0.4 * jnp.sin(3 * x) * jnp.cos(2 * y))[..., None, None] * jnp.eye(2))
     times = jnp.geomspace(0.01, 0.1, 4)
-    target = hj.hks(hj.eigenpairs(hidden, k=64), times)
+    target = hj.hks(hj.eigenpairs(hidden, k=400), times)
     start = hj.TensorField(grid, jnp.broadcast_to(jnp.eye(2), (20, 20, 2, 2)))
     return plot.fit_panels(hj.fit_metric(target, times, start, "conformal"), target, times, max_times=2)
 
@@ -231,6 +231,24 @@ def torus() -> Figure:
     return figure
 
 
+def solid() -> Figure:
+    """Half of a ball of tetrahedra, along whose fibres, helices about its axis, diffusion is fast."""
+    ball = hj.examples.ball_mesh(11)
+    x, y, z = np.asarray(ball.vertices).T
+    along = np.stack([-y, x, 0.4 + 0 * z], axis=-1)
+    D = 0.1 * np.eye(3) + along[:, :, None] * along[:, None, :]
+    mesh = hj.TetMesh.from_tensors(ball.vertices, ball.cells, D, "inverse")
+    (values,) = hj.hks(hj.eigenpairs(mesh, 100, multiplet="drop"), [0.3])
+    behind = ball.cells[y[ball.cells].mean(axis=1) > 0]
+    numbers, cells = np.unique(behind, return_inverse=True)
+    half = hj.TetMesh(ball.vertices[numbers], cells.reshape(-1, 4))
+    figure = plot.new_figure(5.0, 3.4)
+    ax = figure.add_subplot(projection="3d", azim=-75, elev=15)
+    mappable = plot.surface(ax, half, values[numbers])
+    figure.colorbar(mappable, ax=ax, label="HKS at $t$ = 0.3", shrink=0.7)
+    return figure
+
+
 ENTRIES: dict[str, Callable[[], Figure]] = {
     "Signatures over t": panels,
     "Tensor ellipses": glyphs,
@@ -246,6 +264,7 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
     "Sensitivity": derivative,
     "Fits": fit,
     "Surfaces": torus,
+    "Solids": solid,
 }
 
 

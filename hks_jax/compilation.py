@@ -1,5 +1,6 @@
 """Compiling for CPUs in half the time."""
 
+import os
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
@@ -19,7 +20,8 @@ _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "
 def jit_quickly(**settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Return a decorator like `jax.jit` with these settings, for functions of which many are compiled.
 
-    XLA compiles a computation as a whole: within another one these functions are as that is.
+    XLA compiles a computation as a whole: within another one these functions are as that is. Where the environment
+    variable XLA_FLAGS sets one of the options, they are left as it says.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
@@ -39,8 +41,8 @@ def jit_quickly(**settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
 
 @cache
 def _understood() -> bool:
-    """Return whether computations run on a CPU whose compiler has these options."""
-    if jax.default_backend() != "cpu":
+    """Return whether computations run on a CPU whose compiler has these options, and leaves them to us."""
+    if jax.default_backend() != "cpu" or any(option in os.environ.get("XLA_FLAGS", "") for option in _OPTIONS):
         return False
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options=_OPTIONS).lower().compile()

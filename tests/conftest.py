@@ -1,26 +1,46 @@
-"""The suite runs in float64; tests/test_float32.py runs the whole path in float32."""
+"""The suite runs in float64, with shapes checked; tests/test_float32.py runs the whole path in float32."""
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import jaxlib
+import jaxtyping
 import matplotlib
 import numpy as np
 import pytest
 
-# Tests are small and many: they wait for the compiler, which without these flags takes three times as long.
-FLAGS = "--xla_backend_optimization_level=0"
+# From here on every call of a function of the package is checked against its annotations, shapes included.
+jaxtyping.install_import_hook("hks_jax", "annotations.checked")
+
+# Tests are small and many: they wait for the compiler, which without these flags takes four times as long.
+FLAGS = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
 if jaxlib.__version__.startswith("0.10."):  # an unknown flag would be fatal
-    FLAGS += " --xla_cpu_use_fusion_emitters=false"
-os.environ.setdefault("XLA_FLAGS", FLAGS)
+    FLAGS += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
 # What one test process has compiled, the others need not.
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".pytest_cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+# Where each operation came from, frame by frame, nobody reads here, and it takes a tenth of the time to write down.
+jax.config.update("jax_traceback_in_locations_limit", 0)
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # nor in the processes that tests start
+# Tracing makes many objects that live, among which the collector, at its usual pace, looks for garbage in vain.
+gc.set_threshold(50_000, 20, 50)
 matplotlib.use("Agg")
 
 
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20140101)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_what_was_compiled() -> Iterator[None]:
+    """A thousand tests compile more than fits into memory, and a file's programs hardly serve another's tests."""
+    yield
+    jax.clear_caches()
+    gc.collect()

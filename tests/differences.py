@@ -25,6 +25,6 @@ def heat_kernel_by_contour(K, M, times, last: float, following: float, nodes: in
     centre, radius = (left + right) / 2, (right - left) / 2
     turns = np.exp(2j * np.pi * (np.arange(nodes // 2) + 0.5) / nodes)  # the lower half is the conjugate
     z = centre + radius * turns
-    resolvents = jnp.linalg.inv(z[:, None, None] * M - K)
+    resolvents = jnp.linalg.inv(z[:, None, None] * M.astype(complex) - K.astype(complex))
     weights = np.exp(-np.asarray(times)[:, None] * z) * radius * turns * (2 / nodes)
     return jnp.real(jnp.einsum("tz,zij->tij", weights, resolvents))

@@ -18,3 +18,19 @@ def flat(shape: tuple[int, ...], lengths: tuple[float, ...], periodic: tuple[boo
     spacing = [a / (n if wraps else n - 1) for a, n, wraps in zip(lengths, shape, periodic, strict=False)]
     d = len(shape)
     return hj.TensorField(hj.Grid(shape, spacing), np.broadcast_to(np.eye(d), (*shape, d, d)))
+
+
+def turning(nodes: np.ndarray, ratio: float, rate: float) -> np.ndarray:
+    """Eigenvalues (ratio, 1), in 3D (ratio, 1, √ratio), turned by rate·(2x + y), in 3D after a tilt by rate·(z − x)."""
+    d = nodes.shape[-1]
+    frame = _rotation(rate * (2 * nodes[..., 0] + nodes[..., 1]), 0, 1, d)
+    if d == 3:
+        frame = frame @ _rotation(rate * (nodes[..., 2] - nodes[..., 0]), 1, 2, d)
+    return np.einsum("...ia,a,...ja->...ij", frame, [ratio, 1.0, np.sqrt(ratio)][:d], frame)
+
+
+def _rotation(angle: np.ndarray, a: int, b: int, d: int) -> np.ndarray:
+    matrix = np.broadcast_to(np.eye(d), (*angle.shape, d, d)).copy()
+    matrix[..., a, a] = matrix[..., b, b] = np.cos(angle)
+    matrix[..., a, b], matrix[..., b, a] = -np.sin(angle), np.sin(angle)
+    return matrix

@@ -16,9 +16,9 @@ def warped_hks(
     v = 2 * np.pi * np.arange(n) / n
     gap = np.subtract.outer(np.arange(n), np.arange(n))
     derivative = np.where(gap == 0, 0, 0.5 * (-1.0) ** gap / np.where(gap == 0, 1, np.sin(np.pi * gap / n)))
-    area, l = a(v) * b(v), np.arange(modes)  # noqa: E741
+    area, l = a(v) * b(v), np.arange(modes, dtype=float)  # noqa: E741
     frequency = l[:, None, None] ** 2 / a(v) ** 2 + l[:, None] ** 2 / b(v) ** 2
-    twice = np.where(l == 0, 1, 2)
+    twice = np.where(l == 0, 1.0, 2.0)
     scaled = derivative / np.sqrt(area)
     operator = scaled.T * area @ scaled + frequency[..., None] * np.eye(n)
     values, functions = np.linalg.eigh(operator)

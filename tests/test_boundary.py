@@ -31,7 +31,10 @@ def field_diagonal_on_the_sides(rng, shape) -> hj.TensorField:
     return hj.TensorField(hj.Grid(shape, 0.2), tensors)
 
 
-@pytest.mark.parametrize(("shape", "mass"), [((7, 9), "consistent"), ((7, 9), "lumped"), ((4, 5, 4), "consistent")])
+IN_3D = pytest.param((3, 4, 3), "consistent", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("shape", "mass"), [((7, 9), "lumped"), ((7, 9), "consistent"), IN_3D])
 def test_mirror_is_the_really_doubled_torus(rng, shape, mass):
     field = field_diagonal_on_the_sides(rng, shape)
     doubled = mirrored_torus(field)
@@ -46,15 +49,16 @@ def test_mirror_is_the_really_doubled_torus(rng, shape, mass):
     assert mirror.pencil.volume == pytest.approx(float(torus.pencil.volume))
 
 
-def test_mirror_is_the_mean_of_the_mixed_problems(rng):
+@pytest.mark.parametrize("mass", [pytest.param("consistent", marks=pytest.mark.slow), "lumped"])
+def test_mirror_is_the_mean_of_the_mixed_problems(rng, mass):
     field = hj.TensorField(hj.Grid((6, 7), 0.3), random_spd(rng, (6, 7)))
     n, d = ("neumann", "neumann"), ("dirichlet", "dirichlet")
     mixed = [
-        hj.hks(hj.eigenpairs(field, hj.assemble(field, b).space.n_dof, b), TIMES)
+        hj.hks(hj.eigenpairs(field, hj.assemble(field, b).space.n_dof, b, mass=mass), TIMES)
         for b in [(n, n), (n, d), (d, n), (d, d)]
     ]
     total = 42 + 30 + 28 + 20
-    mirror = hj.eigenpairs(field, total, "mirror")
+    mirror = hj.eigenpairs(field, total, "mirror", mass=mass)
     np.testing.assert_allclose(hj.hks(mirror, TIMES), np.mean(mixed, axis=0), rtol=1e-11)
 
 

@@ -10,8 +10,8 @@ import scipy.linalg
 from fields import flat, random_spd
 
 import hks_jax as hj
-from hks_jax.eigen.chebyshev import Band, correction, degree_for, upper_end
-from hks_jax.eigen.coarsening import coarsen, finest_level, interpolate
+from hks_jax.eigen.filter.coarsening import coarsen, finest_level, interpolate
+from hks_jax.eigen.filter.damping import MOST_DEGREE, Band, correction, degree_for, upper_end
 from hks_jax.fem.columns import stencil_product, to_columns, to_rows
 
 
@@ -23,10 +23,10 @@ def masked(shape):
 
 
 CASES = {
-    "neumann": ((14, 13, 12), "neumann", "consistent"),
-    "torus, lumped": ((12, 13, 11), "periodic", "lumped"),
-    "mixed, mask": ((13, 15, 12), ("neumann", ("dirichlet", "neumann"), "periodic"), "consistent"),
-    "2d": ((40, 37), ("periodic", "neumann"), "consistent"),
+    "neumann": ((10, 9, 11), "neumann", "consistent"),
+    "torus, lumped": ((9, 10, 8), "periodic", "lumped"),
+    "mixed, mask": ((11, 12, 9), ("neumann", ("dirichlet", "neumann"), "periodic"), "consistent"),
+    "2d": ((30, 27), ("periodic", "neumann"), "consistent"),
 }
 
 
@@ -56,11 +56,11 @@ def test_products_in_columns_equal_the_operators(rng, name):
     np.testing.assert_allclose(again, pencil.stiffness.apply(jnp.asarray(x)), atol=1e-13)
 
 
-@pytest.mark.parametrize("boundary", ["neumann", "periodic"])
+@pytest.mark.parametrize("boundary", ["neumann", pytest.param("periodic", marks=pytest.mark.slow)])
 def test_a_metric_that_the_grid_hardly_resolves(boundary):
     # On the hill, modes of a node's length have lumped quotients below the wanted eigenvalues: without further terms
     # for the inverse of the mass they would take the place of the wanted ones.
-    n, k = 12, 44
+    n, k = 10, 44
     grid = hj.Grid((n,) * 3, 2 / n, origin=(-1.0,) * 3)
 
     def metric(u):
@@ -75,8 +75,16 @@ def test_a_metric_that_the_grid_hardly_resolves(boundary):
     np.testing.assert_allclose(pairs.eigenvalues, expected, atol=1e-9 * expected[-1])
 
 
-@pytest.mark.parametrize("shape", [(6, 9), (7, 8), (13, 10)])
-@pytest.mark.parametrize("boundary", ["neumann", "periodic", (("dirichlet", "neumann"), "periodic")])
+@pytest.mark.parametrize(
+    ("shape", "boundary"),
+    [
+        ((6, 9), "neumann"),
+        ((7, 8), "periodic"),
+        pytest.param((13, 10), "periodic", marks=pytest.mark.slow),
+        ((6, 9), (("dirichlet", "neumann"), "periodic")),
+        ((7, 8), (("dirichlet", "neumann"), "periodic")),
+    ],
+)
 def test_a_coarse_pencil_is_the_fine_one_between_interpolated_functions(rng, shape, boundary):
     mask = np.ones(shape, bool)
     mask[2:4, 3] = False
@@ -84,17 +92,19 @@ def test_a_coarse_pencil_is_the_fine_one_between_interpolated_functions(rng, sha
     pencil = hj.assemble(hj.TensorField(grid, random_spd(rng, shape)), boundary)
     periodic = pencil.space.periodic
     fine = finest_level(pencil)
-    coarse = coarsen(fine, periodic)
+    coarse = jax.jit(coarsen, static_argnums=1)(fine, periodic)
     n = coarse.free.size
-    basis = interpolate(jnp.eye(n).reshape(*coarse.shape, n), fine, periodic)
+    raise_to = jax.jit(interpolate, static_argnums=2)
+    basis = raise_to(np.eye(n).reshape(*coarse.shape, n), fine, periodic)
+    product = jax.jit(stencil_product, static_argnums=2)
     for of_fine, of_coarse in ((fine.stiffness, coarse.stiffness), (fine.mass, coarse.mass)):
-        image = stencil_product(of_fine, basis, periodic)
-        expected = basis.reshape(-1, n).T @ image.reshape(-1, n)
-        found = stencil_product(of_coarse, jnp.eye(n).reshape(*coarse.shape, n), periodic).reshape(n, n)
+        image = product(of_fine, basis, periodic)
+        expected = np.reshape(basis, (-1, n)).T @ np.reshape(image, (-1, n))
+        found = product(of_coarse, np.eye(n).reshape(*coarse.shape, n), periodic).reshape(n, n)
         np.testing.assert_allclose(found, expected, atol=1e-12)
     # Constants, where nothing is eliminated, stay constants.
     if boundary == "neumann":
-        constant = interpolate(jnp.ones((*coarse.shape, 1)), fine, periodic)[..., 0]
+        constant = raise_to(np.ones((*coarse.shape, 1)), fine, periodic)[..., 0]
         reached = np.asarray(constant)[np.asarray(fine.free)]
         assert np.isin(np.round(reached, 12), [0, 1]).all()
         assert (reached == 1).mean() > 0.9
@@ -123,7 +133,7 @@ def test_the_correction_is_the_polynomial_it_is_derived_from(rng):
     assert gain == pytest.approx(degree)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param("neumann", marks=pytest.mark.slow), *list(CASES)[1:]])
 def test_pairs_equal_the_dense_ones(name):
     pencil = problem(name)
     k = 24
@@ -151,7 +161,7 @@ def test_multiplicities_of_a_cube_are_complete():
 
 def test_traced_batched_and_in_single_precision():
     pencil = problem("2d")
-    k, solver = 12, hj.ChebyshevFilter(block=4)
+    k, solver = 24, hj.ChebyshevFilter(block=8)
     plain = hj.eigenpairs(pencil, k, solver=solver).eigenvalues
     scaled = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), pencil)
     batch = jax.jit(jax.vmap(lambda p: hj.eigenpairs(p, k, solver=solver).eigenvalues))(scaled)
@@ -162,6 +172,7 @@ def test_traced_batched_and_in_single_precision():
     np.testing.assert_allclose(single.eigenvalues, plain, rtol=2e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradient_equals_the_dense_one(rng):
     shape, k, times = (9, 8, 10), 8, jnp.array([0.15, 0.4])
     tensors = jnp.asarray(random_spd(rng, shape, 0.3))
@@ -190,3 +201,27 @@ def test_too_few_rounds_are_reported():
     with pytest.warns(hj.AccuracyWarning, match="did not converge"):
         pairs = hj.eigenpairs(problem("neumann"), 24, solver=hj.ChebyshevFilter(block=8, max_rounds=1))
     assert not pairs.converged.all()
+
+
+def test_derivatives_on_a_coarse_grid_of_many_modes(rng):
+    """The consistent mass takes modes far above the lumped band, which must not make the preconditioner indefinite."""
+    grid, weights = hj.Grid((8, 8, 8), 1.0), jnp.asarray(rng.standard_normal((8, 8, 8)))
+    boundary = (("neumann", "dirichlet"), "neumann", "neumann")
+
+    def loss(tensors, solver):
+        pairs = hj.eigenpairs(hj.TensorField(grid, tensors), 39, boundary, solver, multiplet="drop")
+        return jnp.sum(weights * hj.hks(pairs, [4.0]))
+
+    tensors = jnp.broadcast_to(jnp.eye(3), (8, 8, 8, 3, 3))
+    expected = jax.grad(loss)(tensors, "dense")
+    found = jax.jit(jax.grad(loss), static_argnums=1)(tensors, hj.ChebyshevFilter(block=8))
+    assert jnp.linalg.norm(found - expected) < 1e-9 * jnp.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("low", [0.0, 1e-12, 1e-3])
+def test_degrees_are_bounded_however_wide_the_band(dtype, low):
+    """Without a bound a band that begins at rounding, as on a long thin domain, is filtered for hours."""
+    degree = degree_for(Band(jnp.asarray(low, dtype), jnp.asarray(1.0, dtype)), jnp.zeros((), dtype), 1e5)
+    exact = np.arccosh(1e5) / np.arccosh(1 + 2 * low / (1 - low)) if low else np.inf
+    assert degree == pytest.approx(min(exact, MOST_DEGREE), rel=1e-4)

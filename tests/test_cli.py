@@ -23,6 +23,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.inverse.fit import OPTIMISERS
 from hks_jax.inverse.metric_fit import RESULTS
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
+from hks_jax.inverse.problem import pairs_for
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12)
@@ -106,6 +107,7 @@ def test_report_says_what_was_done(npz, tmp_path, capsys):
     assert printed == report
     assert report["settings"] == {
         "metric": "tensor",
+        "interpolation": "linear",
         "k": 25,
         "boundary": "neumann",
         "times": "explicit",
@@ -122,6 +124,13 @@ def test_report_says_what_was_done(npz, tmp_path, capsys):
     assert 0 < pairs["worst_residual"] < 1e-8
     assert [entry["t"] for entry in report["times"]] == [0.01, 2]
     assert report["times"][0]["truncation"] > 0.1 > report["times"][1]["truncation"]
+    # What is left out of the signature, relative to what is not.
+    mean, worst = (
+        np.array([each[name] for each in report["times"]]) for name in ("truncation", "truncation_worst_node")
+    )
+    assert (worst < 1).all()
+    assert (worst / (1 - worst) > 1.2 * mean / (1 - mean)).all()
+    assert all(each["lasting_bias"] <= each["resolution_bias"] for each in report["times"])
     assert any("too small for k" in warning for warning in report["warnings"])
     assert {"python", "jax", "numpy", "scipy", "hks-jax", "device"} <= set(report["versions"])
     assert {"reading", "assembly", "eigenpairs", "signature"} <= set(report["seconds"])
@@ -213,7 +222,7 @@ def test_bad_voxels_are_refused_before_anything_is_computed(nifti, tmp_path, cap
     [
         ["--boundary", "dirichlet:neumann,neumann", "--solver", "dense"],
         ["--solver", "shift-invert", "--normalisation", "heat-trace"],
-        ["--metric", "adjugate", "--erode", "1"],
+        ["--metric", "adjugate", "--erode", "1", "--interpolation", "log-euclidean"],
         ["--dtype", "float32", "--times", "auto:3"],
     ],
 )
@@ -239,6 +248,11 @@ def test_options_reach_the_computation(npz, tmp_path, extra):
             assert settings[option.lstrip("-")] == value
         if option == "--solver":
             assert pairs["solver"] == value
+        if option == "--interpolation":
+            with np.load(npz) as read:
+                grid = hj.Grid(SHAPE, read["spacing"].tolist(), mask=hj.io.erode(read["mask"], 1))
+                field = hj.TensorField.from_diffusion(grid, read["tensors"], "adjugate", interpolation=value)
+            assert pairs["last"] == pytest.approx(float(hj.eigenpairs(field, 10).eigenvalues[-1]), rel=1e-9)
         if option == "--dtype":
             assert dtype == np.float32
 
@@ -538,7 +552,7 @@ def test_help_does_not_wait_for_the_optimisers():
 
 FIT_GRID = hj.Grid((14, 13), 1 / 13)
 FIT_TIMES = np.array([0.02, 0.05, 0.1])
-FIT_ARGUMENTS = ["--parametrisation", "conformal", "-k", "40", "--h1", "1e-8"]  # the same ones compile once
+FIT_ARGUMENTS = ["--parametrisation", "conformal", "--h1", "1e-8"]  # the same ones compile once
 
 
 @pytest.fixture(scope="module")
@@ -546,7 +560,7 @@ def conformal():
     """A smooth conformal metric and its signature."""
     x, y = np.moveaxis(FIT_GRID.nodes, -1, 0)
     field = hj.TensorField(FIT_GRID, np.exp(0.4 * np.sin(2 * x) * np.cos(3 * y))[..., None, None] * np.eye(2))
-    return np.asarray(field.tensors), np.asarray(hj.hks(hj.eigenpairs(field, 40, multiplet="complete"), FIT_TIMES))
+    return np.asarray(field.tensors), np.asarray(hj.hks(hj.eigenpairs(field, FIT_GRID.size), FIT_TIMES))
 
 
 def write_target(path, values, **changes):
@@ -575,7 +589,9 @@ def test_fit_end_to_end_recovers_the_metric(conformal, tmp_path, capsys):
     assert report["explanation"] == RESULTS["steps exhausted"]
     assert report["misfit"] < report["loss"] == pytest.approx(losses.min())
     assert losses[-1] < 1e-3 * losses[0]
-    assert (report["k"], report["parametrisation"], report["settings"]["max_steps"]) == (40, "conformal", 4)
+    assert (report["parametrisation"], report["settings"]["max_steps"]) == ("conformal", 4)
+    assert 60 < report["k"] < FIT_GRID.size
+    assert report["truncation_misfit"] < 1e-11
     assert report["settings"]["h1"] == 1e-8
     assert report["target"] == {
         "source": str(target),
@@ -604,7 +620,10 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Progress, "update", interrupt)
-    arguments = ["--init", str(tmp_path / "init.npz"), "--metric", "inverse", "-q", *FIT_ARGUMENTS]
+    # With as many eigenpairs as the fit above chooses, nothing is compiled that it has not compiled.
+    flat = hj.TensorField(FIT_GRID, np.broadcast_to(np.eye(2), (*FIT_GRID.shape, 2, 2)))
+    k = pairs_for(FIT_TIMES, hj.assemble(flat), flat)
+    arguments = ["--init", str(tmp_path / "init.npz"), "--metric", "inverse", "-k", str(k), "-q", *FIT_ARGUMENTS]
     assert main(["fit", str(target), "-o", str(out), *arguments]) == 0
     report = json.loads((out / "report.json").read_text())
     assert report["result"] == "interrupted"

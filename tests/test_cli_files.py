@@ -155,7 +155,63 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
     assert "mesh            4 vertices, 2 triangles" in text
     assert "area            1" in text
     assert "boundary        4 vertices" in text
+    ball = hj.examples.ball_mesh(3)
+    meshio.Mesh(np.asarray(ball.vertices), [("tetra", ball.cells)]).write(tmp_path / "b.vtu")
+    assert main(["info", str(tmp_path / "b.vtu")]) == 0
+    text = capsys.readouterr().out
+    assert "mesh            147 vertices, 540 tetrahedra" in text
+    assert "boundary        92 vertices" in text
+    assert f"volume          {float(hj.assemble(ball).volume):.5g}" in text
     assert "absent.nii: no such file" in error_of(capsys, ["info", str(tmp_path / "absent.nii")])
+
+
+# ------------------------------------------------------------------------------------------------------ meshes
+
+
+def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
+    meshio = pytest.importorskip("meshio")
+    ball = hj.examples.ball_mesh(3)
+    x = np.asarray(ball.vertices)
+    tensors = np.eye(3) * (1.5 + x[:, 0])[:, None, None]
+    meshio.Mesh(x, [("tetra", ball.cells)], point_data={"D": tensors.reshape(-1, 9)}).write(tmp_path / "b.vtu")
+    command = [
+        "hks",
+        str(tmp_path / "b.vtu"),
+        "-o",
+        str(tmp_path / "out"),
+        "-k",
+        "30",
+        "--times",
+        "0.3",
+        "0.6",
+        "--quiet",
+    ]
+    expected = {}
+    for name, more in (("of space", []), ("inverse", ["--array", "D", "--metric", "inverse"])):
+        assert main([*command, *more]) == 0
+        mesh = hj.TetMesh.from_tensors(x, ball.cells, tensors, "inverse") if more else ball
+        expected[name] = hj.hks(hj.eigenpairs(mesh, 30), [0.3, 0.6])
+        with np.load(tmp_path / "out" / "hks.npz") as found:
+            np.testing.assert_allclose(found["hks"], expected[name], rtol=1e-8)
+            np.testing.assert_array_equal(found["cells"], ball.cells)
+    read = hj.io.read_mesh_arrays(tmp_path / "out" / "hks.vtu")
+    np.testing.assert_allclose(list(read.values()), expected["inverse"], rtol=1e-8)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["input"]["tetrahedra"] == 540
+    assert report["input"]["boundary_vertices"] == 92
+    assert (tmp_path / "out" / "hks.png").stat().st_size > 5000
+
+    def refused(message, *more):
+        assert main([*command, *more]) == 2
+        assert message in capsys.readouterr().err
+
+    refused("--metric: a mesh has the metric of space unless --array names tensors", "--metric", "tensor")
+    refused("--interpolation: a mesh has the metric of space", "--interpolation", "log-euclidean")
+    refused("--metric: choose what the tensors at the vertices stand for", "--array", "D")
+    refused("--array: got 'E'; the arrays at the vertices are D", "--array", "E", "--metric", "tensor")
+    refused("--slice: it is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
+    refused("--boundary: got 'mirror'; a mesh takes neumann or dirichlet", "--boundary", "mirror")
+    refused("--array: 'D' has 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
 
 
 # ---------------------------------------------------------------------------------------------------- convert

@@ -45,6 +45,14 @@ def test_where_the_compiler_does_not_know_the_options_it_does_without(monkeypatc
         compilation._understood.cache_clear()
 
 
+def test_options_that_the_environment_sets_are_left_alone(monkeypatch):
+    for flags, ours in [("--xla_backend_optimization_level=0", False), ("--xla_unrelated=1", True), ("", True)]:
+        monkeypatch.setenv("XLA_FLAGS", flags)
+        compilation._understood.cache_clear()
+        assert compilation._understood() == ours
+    compilation._understood.cache_clear()
+
+
 def test_the_function_keeps_its_name_and_words():
     power = make_power()
     assert (power.__name__, power.__doc__) == ("power", "Return a power.")

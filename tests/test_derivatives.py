@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from annotations import unchecked
 from differences import directional, heat_kernel_by_contour
 from fields import random_spd
 
@@ -46,17 +47,15 @@ FIELDS = {
 
 def check(f, x, direction, rtol=1e-7, adjoint=1e-12, step=4e-3):
     """Forward and reverse mode of f (any output, NaN where it likes) along one direction, against differences."""
-    value, slope = jax.jvp(f, (x,), (direction,))
-    probe = jnp.asarray(np.random.default_rng(1).standard_normal(value.shape))
-
-    def scalar(x):
-        return jnp.nansum(probe * f(x))
-
-    forward = jnp.nansum(probe * slope)
-    reverse = jnp.vdot(jax.grad(scalar)(x), direction)
-    size = float(jnp.nansum(jnp.abs(probe * slope)))
-    assert float(forward) == pytest.approx(float(reverse), abs=adjoint * size)
-    assert float(reverse) == pytest.approx(float(directional(scalar, x, direction, step)), rel=rtol)
+    # On the host, but for f: of every operation on a new shape a program would be compiled.
+    value, slope = map(np.asarray, jax.jvp(f, (x,), (direction,)))
+    probe = np.random.default_rng(1).standard_normal(value.shape)
+    x, direction = np.asarray(x), np.asarray(direction)
+    forward = np.nansum(probe * slope)
+    _, pullback = jax.vjp(f, x)
+    reverse = np.vdot(pullback(np.where(np.isnan(value), 0, probe))[0], direction)
+    assert forward == pytest.approx(reverse, abs=adjoint * np.nansum(np.abs(probe * slope)))
+    assert reverse == pytest.approx(directional(lambda x: np.nansum(probe * f(x)), x, direction, step), rel=rtol)
 
 
 def hks_of(tensors, k=20, solver="dense", boundary="neumann", mass="consistent", grid=GRID, times=TIMES):
@@ -65,7 +64,7 @@ def hks_of(tensors, k=20, solver="dense", boundary="neumann", mass="consistent",
 
 
 # 60 cuts a multiple eigenvalue of the square.
-TRUNCATIONS = [("generic", 30), ("generic", 60), ("identity", 30), ("identity", 58)]
+TRUNCATIONS = [("generic", 60), ("identity", 58)]
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -122,11 +121,11 @@ def test_full_spectrum_against_the_matrix_exponential(rng, name):
 @pytest.mark.parametrize(
     ("boundary", "mass", "solver"),
     [
-        ("dirichlet", "consistent", "shift-invert"),
+        pytest.param("dirichlet", "consistent", "shift-invert", marks=pytest.mark.slow),
         ("dirichlet", "lumped", "dense"),
         (("periodic", ("neumann", "dirichlet")), "consistent", "dense"),
-        (("mirror", "neumann"), "lumped", "dense"),
-        (("mirror", "periodic"), "consistent", "shift-invert"),
+        pytest.param(("mirror", "neumann"), "lumped", "dense", marks=pytest.mark.slow),
+        pytest.param(("mirror", "periodic"), "consistent", "shift-invert", marks=pytest.mark.slow),
     ],
 )
 def test_every_boundary_and_mask(rng, boundary, mass, solver):
@@ -146,6 +145,47 @@ def test_the_cube(rng, boundary):
     check(f, identity(grid.shape), 0.1 * symmetric(rng, grid.shape))
 
 
+@pytest.mark.parametrize(
+    ("solver", "dtype"),
+    [
+        ("block-lanczos", jnp.float64),
+        ("chebyshev-filter", jnp.float32),
+        pytest.param("block-lanczos", jnp.float32, marks=pytest.mark.slow),
+        pytest.param("chebyshev-filter", jnp.float64, marks=pytest.mark.slow),
+        pytest.param("shift-invert", jnp.float32, marks=pytest.mark.slow),
+        ("shift-invert", jnp.float64),
+    ],
+)
+def test_along_the_tensors_themselves(solver, dtype):
+    """HKS(t; cT) = HKS(t/c; T)/c in the plane, by any solver: projected, the right-hand sides are rounding alone."""
+    nodes = jnp.asarray(hj.Grid((24, 24), 1 / 23).nodes)
+    tensors = (1 + jnp.sin(3 * nodes[..., 0] + nodes[..., 1]) / 2)[..., None, None] * jnp.eye(2)
+    tensors, grid, times = tensors.astype(dtype), hj.Grid((24, 24), 1 / 23), jnp.array([0.05, 0.5], dtype)
+
+    def f(tensors):
+        return hks_of(tensors, 10, solver, grid=grid, times=times)
+
+    value, along = jax.jvp(f, (tensors,), (tensors,))
+    rate = jax.jvp(lambda t: hks_of(tensors, 10, "dense", grid=grid, times=t), (times,), (times,))[1]
+    rounding = float(jnp.finfo(dtype).eps)
+    # `hks_of` is √t HKS(t).
+    np.testing.assert_allclose(along, -(value + (rate - value / 2)), atol=3e3 * rounding * float(value.max()))
+
+
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float64, marks=pytest.mark.slow), jnp.float32])
+def test_gradients_by_symmetric_weights_on_a_torus(dtype):
+    """Reverse mode: cotangents of eigenvectors that are multiples of Mφ, which projections turn into rounding."""
+    grid, solver = hj.Grid((22, 22), 1 / 22), hj.ChebyshevFilter(block=8)
+
+    def total(tensors, solver):
+        return jnp.sum(hks_of(tensors, 5, solver, "periodic", "lumped", grid, jnp.array([0.05], dtype)))
+
+    tensors = identity((22, 22)).astype(dtype)
+    expected = jax.grad(total)(tensors, "dense")
+    found = jax.grad(total)(tensors, solver)
+    assert jnp.linalg.norm(found - expected) < max(1e3 * jnp.finfo(dtype).eps, 1e-9) * jnp.linalg.norm(expected)
+
+
 def octahedron_sphere(levels=2):
     vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
@@ -161,10 +201,13 @@ def octahedron_sphere(levels=2):
     return vertices, faces
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_mesh_by_vertices_and_by_face_metrics(rng, solver):
+SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in (("dense", 2), (hj.BlockLanczos(block=4), 3))]
+
+
+@pytest.mark.parametrize(("solver", "levels"), [*SLOW, ("shift-invert", 2)])
+def test_mesh_by_vertices_and_by_face_metrics(rng, solver, levels):
     """A sphere with the octahedron's symmetry: nearly every eigenvalue is multiple."""
-    vertices, faces = octahedron_sphere()
+    vertices, faces = octahedron_sphere(levels)
     times = jnp.array([0.1, 1.0])
 
     def by_vertices(vertices):
@@ -191,6 +234,7 @@ SIGNATURES = {
     "wks by default": lambda p: hj.wks(p)[::20],
     "scale-invariant": lambda p: hj.scale_invariant_hks(p, 4, 32),
     "diffusion distance": lambda p: hj.diffusion_distance(p, TIMES, (2, 3)),
+    "Varadhan's distance": lambda p: hj.varadhan_distance(p, TIMES, (2, 3)),
     "biharmonic distance": lambda p: hj.biharmonic_distance(p, [(2, 3), (0, 0)]),
     "shape DNA": lambda p: hj.shape_dna(p)[1:3].sum(),
     "default times": lambda p: hj.hks(p, hj.default_times(p, 3)),
@@ -211,10 +255,10 @@ def test_every_signature_against_differences(rng, name, at):
     signature = SIGNATURES[name]
 
     def f(tensors):
-        return signature(hj.eigenpairs(hj.TensorField(GRID, tensors), 24, solver="dense"))
+        return signature(hj.eigenpairs(hj.TensorField(GRID, tensors), 20, solver="dense"))
 
     tensors = FIELDS[at](rng)
-    assert hj.eigenpairs(hj.TensorField(GRID, tensors), 24, solver="dense").cut_multiplet == 0
+    assert hj.eigenpairs(hj.TensorField(GRID, tensors), 20, solver="dense").cut_multiplet == 0
     # Default times and energies follow λ₁, which has a kink where it is multiple: there the mean of the one-sided
     # derivatives is meant, and extrapolation gains nothing.
     kink = at == "rotational" and name == "scale-invariant"
@@ -229,7 +273,7 @@ def test_masked_signatures_in_reverse_mode(rng, name):
     grid = hj.Grid((8, 9), 0.15, mask=mask)
 
     def f(tensors):
-        return SIGNATURES[name](hj.eigenpairs(hj.TensorField(grid, tensors), 14, "dirichlet", "dense"))
+        return SIGNATURES[name](hj.eigenpairs(hj.TensorField(grid, tensors), 14, "dirichlet", "dense", "lumped"))
 
     check(f, jnp.asarray(random_spd(rng, (8, 9), 0.5)), 0.1 * symmetric(rng, (8, 9)), step=2e-3)
 
@@ -246,7 +290,7 @@ def test_filters_with_sharp_transitions_or_no_derivative_at_zero(rng, name):
     function, parameter = SHARP[name]
 
     def f(tensors):
-        return hj.spectral_signature(hj.eigenpairs(hj.TensorField(GRID, tensors), 9), function, jnp.array([parameter]))
+        return hj.spectral_signature(hj.eigenpairs(hj.TensorField(GRID, tensors), 20), function, jnp.array([parameter]))
 
     check(f, FIELDS["generic"](rng), 0.1 * symmetric(rng, SHAPE), step=1e-3)
 
@@ -307,11 +351,11 @@ def test_batched_equals_looped_and_jitted_equals_eager(rng, solver):
 
 
 def test_sparse_derivatives_are_as_good_as_dense_ones(rng):
-    """64² nodes, k = 100, every solver setting at its default."""
-    grid, k = hj.Grid((64, 64), 1 / 63), 100
-    tensors, direction = jnp.asarray(random_spd(rng, (64, 64), 0.5)), 0.1 * symmetric(rng, (64, 64))
-    times = jnp.array([0.01, 0.1])
-    probe = jnp.asarray(rng.standard_normal((2, 64, 64)))
+    """48² nodes, k = 60, every solver setting at its default."""
+    grid, k = hj.Grid((48, 48), 1 / 47), 60
+    tensors, direction = jnp.asarray(random_spd(rng, (48, 48), 0.5)), 0.1 * symmetric(rng, (48, 48))
+    times = jnp.array([0.02, 0.1])
+    probe = jnp.asarray(rng.standard_normal((2, 48, 48)))
 
     def loss(T):
         return jnp.sum(probe * hj.hks(hj.eigenpairs(hj.TensorField(grid, T), k, solver="shift-invert"), times))
@@ -325,7 +369,7 @@ def test_eigenvalues_and_simple_eigenvectors(rng):
     for solver in SOLVERS:
 
         def f(tensors, solver=solver):
-            pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 8, solver=solver)
+            pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 20, solver=solver)
             fixed = pairs.vectors * jnp.sign(pairs.vectors[:, :1])
             return jnp.concatenate([pairs.eigenvalues[:, None], fixed], axis=1)
 
@@ -336,7 +380,7 @@ def test_eigenvalues_within_a_cluster_are_finite_and_right_in_sum(rng):
     direction = 0.1 * symmetric(rng, SHAPE)
 
     def pairs_at(T):
-        return hj.eigenpairs(hj.TensorField(GRID, T), 3)
+        return hj.eigenpairs(hj.TensorField(GRID, T), 20)
 
     def total(T):
         return jnp.sum(pairs_at(T).eigenvalues)
@@ -351,7 +395,7 @@ def test_eigenvalues_within_a_cluster_are_finite_and_right_in_sum(rng):
     np.testing.assert_allclose(gram[1], 0, atol=1e-12)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", ["dense", pytest.param("shift-invert", marks=pytest.mark.slow)])
 def test_a_cut_cluster_is_completed_or_dropped(rng, solver):
     tensors, direction = identity(SHAPE), 0.1 * symmetric(rng, SHAPE)
 
@@ -371,7 +415,10 @@ def test_a_cut_cluster_is_completed_or_dropped(rng, solver):
             got = mode(partial(signature, k=5, multiplet=multiplet), (tensors,), (direction,))[1]
             truth = jax.jvp(partial(signature, k=k, multiplet="report"), (tensors,), (direction,))[1]
             np.testing.assert_allclose(got, truth, rtol=1e-8, atol=1e-8)
-    with pytest.raises(ValueError, match='multiplet: got \'keep\'; expected "report", "drop" or "complete"'):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match='multiplet: got \'keep\'; expected "report", "drop" or "complete"'),
+    ):
         hj.eigenpairs(hj.TensorField(GRID, tensors), 5, multiplet="keep")
 
 
@@ -400,12 +447,12 @@ def test_progress_and_settings_of_the_solves(rng):
     solver = hj.ShiftInvert(progress=told.append)
     jax.grad(lambda T: jnp.sum(hks_of(T, solver=solver)))(FIELDS["generic"](rng))
     assert any(text.startswith("derivative: error") for text in told)
-    with pytest.raises(ValueError, match="derivative_tolerance: got 0; expected between 0 and 1"):
+    with pytest.raises(ValueError, match="derivative_tolerance: got 0; expected a finite number above 0 and below 1"):
         hj.ShiftInvert(derivative_tolerance=0)
 
 
 def test_moving_the_pairs_themselves_is_plain_differentiation(rng):
-    pairs = hj.eigenpairs(hj.TensorField(GRID, FIELDS["generic"](rng)), 5)
+    pairs = hj.eigenpairs(hj.TensorField(GRID, FIELDS["generic"](rng)), 20)
 
     def shifted(x):
         import equinox as eqx
@@ -424,7 +471,12 @@ def test_no_array_is_larger_than_the_eigenvectors_or_the_divided_differences(rng
         pairs = hj.eigenpairs(hj.TensorField(grid, T), k, solver="shift-invert")
         return jnp.sum(hj.hks(pairs, jnp.linspace(0.1, 1, n_times)) ** 2)
 
+    seen = set()
+
     def sizes(jaxpr):
+        if id(jaxpr) in seen:
+            return
+        seen.add(id(jaxpr))
         for equation in jaxpr.eqns:
             yield from (v.aval.size for v in equation.outvars if hasattr(v.aval, "size"))
             for inner in jax.tree.leaves(equation.params, is_leaf=lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr")):

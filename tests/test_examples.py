@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.domain import examples
@@ -15,6 +16,33 @@ def test_bumpy_torus_mesh_and_field_are_one_surface():
     assert not mesh.triangulation.boundary_vertices.any()
     position = jax.vmap(examples.bumpy_torus)(jnp.asarray(field.grid.nodes).reshape(-1, 2))
     np.testing.assert_allclose(mesh.vertices, position)
+
+
+def test_the_sphere_and_the_ball_are_round_closed_and_have_good_cells():
+    sphere, ball = examples.sphere_mesh(6), examples.ball_mesh(6)
+    assert (len(sphere.vertices), len(sphere.faces)) == (362, 720)
+    assert (len(ball.vertices), len(ball.cells)) == (1 + 910 + 12, 20 * 6**3)
+    np.testing.assert_allclose(np.linalg.norm(sphere.vertices, axis=1), 1)
+    assert not sphere.triangulation.boundary_vertices.any()
+    corners = np.asarray(sphere.vertices)[sphere.faces]
+    assert (np.linalg.det(corners) > 0).all()
+    surface, numbers = ball.boundary()
+    layers = np.linalg.norm(ball.vertices, axis=1) * 6
+    np.testing.assert_allclose(np.bincount(np.rint(layers).astype(int)), [1] + [10 * j * j + 2 for j in range(1, 7)])
+    np.testing.assert_allclose(layers, np.rint(layers), atol=1e-12)
+    np.testing.assert_allclose(layers[numbers], 6)
+    assert len(surface.faces) == len(sphere.faces)
+    # Volume over the cube of the root mean square edge, 1 for regular cells (Knupp's mean ratio is its 2/3rd power).
+    for mesh, regular in ((sphere, np.sqrt(3) / 2), (ball, np.sqrt(0.5))):
+        c = np.asarray(mesh.vertices)[mesh.triangulation.cells]
+        d = c.shape[1] - 1
+        pairs = [(i, j) for i in range(d + 1) for j in range(i)]
+        edges = np.sqrt(np.mean([np.sum((c[:, i] - c[:, j]) ** 2, axis=1) for i, j in pairs], axis=0))
+        steps = c[:, 1:] - c[:, :1]
+        content = np.sqrt(np.linalg.det(steps @ np.swapaxes(steps, 1, 2)))
+        assert (content / edges**d / regular).min() > 0.5
+    with unchecked(), pytest.raises(ValueError, match="n: got 0"):
+        examples.ball_mesh(0)
 
 
 def test_pullback_is_the_first_fundamental_form():

@@ -48,9 +48,8 @@ def extrapolated(case: str) -> tuple[np.ndarray, list[np.ndarray], hj.TensorFiel
 
 
 @pytest.mark.filterwarnings("ignore:k =")  # the torus and the sphere have multiple eigenvalues wherever k cuts
-@pytest.mark.parametrize(
-    "case", ["sphere", pytest.param("torus", marks=pytest.mark.slow), pytest.param("wavy", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["sphere", "torus", "wavy"])
 def test_error_falls_at_the_order_of_the_first_missing_term(case):
     signature, expansions, field = extrapolated(case)
     errors = np.array([np.abs(signature - expansion).max(axis=1) for expansion in expansions])

@@ -1,6 +1,7 @@
 import jax
 import numpy as np
 import pytest
+from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.domain.components import label_nodes
@@ -86,5 +87,5 @@ def test_neighbouring_nodes_without_a_common_element_are_not_connected():
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         hj.Grid(**arguments)

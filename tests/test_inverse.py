@@ -5,21 +5,25 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from annotations import unchecked
 from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.domain import spd
 from hks_jax.inverse import H1, LogDeterminant, Prior, TotalVariation, identifiability
+from hks_jax.inverse.observation import observe
 from hks_jax.inverse.optimise import loss_of
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
+from hks_jax.inverse.problem import Problem, pairs_for
+from hks_jax.inverse.truncated import more_pairs, truncation_misfit, truncation_shows
 from hks_jax.inverse.unknowns import Nodal, nodes_of
 
-N = 14
+N = 10
 GRID = hj.Grid((N, N), 1 / (N - 1))
 X, Y = GRID.nodes[..., 0], GRID.nodes[..., 1]
 FLAT = hj.TensorField(GRID, np.broadcast_to(np.eye(2), (N, N, 2, 2)))
-TIMES = np.geomspace(0.012, 0.15, 4)
-K = 45
+TIMES = np.geomspace(0.025, 0.3, 4)
+K = N * N  # all of them: nothing is truncated
 LOG_FACTOR = 0.4 * np.sin(2 * X) * np.cos(3 * Y)
 CONFORMAL = hj.TensorField(GRID, np.exp(LOG_FACTOR)[..., None, None] * np.eye(2))
 
@@ -31,6 +35,14 @@ def smooth_field():
 
 def signature(field, k=K, times=TIMES):
     return np.asarray(hj.hks(hj.eigenpairs(field, k, multiplet="complete"), times))
+
+
+def problem_of(target, times, init, k, weights=None):
+    """The problem of a fit of conformal factors, without the fit."""
+    space = hj.assemble(init).space
+    unknowns = Nodal(PARAMETRISATIONS["conformal"](), init, nodes_of(space.domain))
+    observation = observe(target, times, weights, "hks", "log", None, space, np.float64)
+    return Problem(unknowns, observation, (), k, "neumann", "dense")
 
 
 def error(fit, truth):
@@ -81,6 +93,7 @@ def test_a_conformal_factor_is_recovered_from_a_flat_start():
     assert "converged" in repr(fit)
 
 
+@pytest.mark.slow
 def test_a_full_tensor_field_is_recovered():
     truth = smooth_field()
     fit = hj.fit_metric(signature(truth), TIMES, FLAT, k=K, max_steps=7)
@@ -88,9 +101,85 @@ def test_a_full_tensor_field_is_recovered():
     assert fit.loss < 1e-7 * fit.history[0].loss
 
 
+@pytest.mark.slow
+def test_by_default_k_is_enough_for_a_target_of_all_pairs():
+    """Of 480 pairs 120 leave 0.15 % at the smallest time: a fit with so many has an error of 4e-3 or more."""
+    grid = hj.Grid((24, 20), (1 / 23, 1 / 19))
+    x, y = grid.nodes[..., 0], grid.nodes[..., 1]
+    factor = np.exp(0.4 * np.sin(2 * x) * np.cos(3 * y))[..., None, None]
+    truth, times = hj.TensorField(grid, factor * np.eye(2)), np.geomspace(0.004, 0.2, 5)
+    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (24, 20, 2, 2)))
+    target = signature(truth, 480, times)
+    fit = hj.fit_metric(target, times, flat, "conformal")
+    assert fit.converged
+    assert error(fit, truth) < 1e-5
+    assert hj.truncation(fit.problem.pairs(fit.values), times).tail.max() < 2e-6
+    assert fit.problem.k < 480
+    with pytest.warns(hj.AccuracyWarning, match=r"k: 120 eigenpairs leave out .* Use k=None, or k=3\d\d or more"):
+        poor = hj.fit_metric(target, times, flat, "conformal", k=120, max_steps=4)
+    assert error(poor, truth) > 3e-3
+
+
+def test_by_default_the_truth_explains_a_target_of_all_pairs():
+    """With fewer pairs it does not, and a fit from it goes away from it, to match its own truncation."""
+    grid, times = hj.Grid((16, 14), (1 / 15, 1 / 13)), np.geomspace(0.02, 0.2, 4)
+    log_factor = 0.4 * np.sin(2 * grid.nodes[..., 0]) * np.cos(3 * grid.nodes[..., 1])
+    truth = hj.TensorField(grid, np.exp(log_factor)[..., None, None] * np.eye(2))
+    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (16, 14, 2, 2)))
+    target, exact = signature(truth, 224, times), jnp.asarray(log_factor.reshape(-1, 1))
+    chosen = pairs_for(times, hj.assemble(flat), flat)
+    enough, few = (problem_of(target, times, flat, k) for k in (chosen, 35))
+    assert chosen < 150
+    # The residuals of a fit that stops at a relative change of 1e-4 in the unknowns.
+    assert float(loss_of(enough, exact)[0]) < 0.01 * (1e-4) ** 2 / 2
+    of_the_truth = float(loss_of(few, exact)[0])
+    assert of_the_truth > (1e-4) ** 2 / 2
+    assert 0.1 < float(truncation_misfit(few, exact)) / of_the_truth < 10
+    with pytest.warns(hj.AccuracyWarning, match="k: 35 eigenpairs leave out .* fitted its own truncation"):
+        fit = hj.fit_metric(target, times, truth, "conformal", k=35, max_steps=2)
+    assert fit.loss < 0.7 * of_the_truth
+
+
+def test_more_pairs_are_asked_for_where_the_volume_has_grown():
+    """Three times the area of the start: the pairs that were enough there are not."""
+    large = hj.TensorField(GRID, 3 * np.asarray(CONFORMAL.tensors))
+    times = 3 * TIMES
+    problem = problem_of(signature(large, times=times), times, FLAT, pairs_for(times, hj.assemble(FLAT), FLAT))
+    values = jnp.asarray((LOG_FACTOR + np.log(3)).reshape(-1, 1))
+    assert truncation_shows(float(loss_of(problem, values)[1]), float(truncation_misfit(problem, values)))
+    assert more_pairs(problem, values) > 1.5 * problem.k
+
+
+@pytest.mark.slow
+def test_k_grows_with_the_volume_that_a_fit_comes_to():
+    """Three times the area of the start: the pairs that were enough there are not."""
+    large = hj.TensorField(GRID, 3 * np.asarray(CONFORMAL.tensors))
+    times = 3 * TIMES
+    fit = hj.fit_metric(signature(large, times=times), times, FLAT, "conformal", max_steps=12)
+    first = pairs_for(times, hj.assemble(FLAT), FLAT)
+    assert fit.history[0].stage == 0
+    assert fit.history[-1].stage == 1
+    assert fit.problem.k > 1.5 * first
+    assert fit.converged
+    assert error(fit, large) < 1e-5
+
+
+@pytest.mark.slow
+def test_converged_means_the_unknowns():
+    """A full field, whose weak directions short linear solves do not find: steps become small long before the end."""
+    truth = smooth_field()
+    fit = hj.fit_metric(signature(truth), TIMES, FLAT, tolerance=1e-3, max_steps=20)
+    exact = fit.problem.unknowns.parametrisation.start(truth.tensors.reshape(-1, 2, 2))
+    deviation = float(jnp.sqrt(jnp.mean((fit.values - exact) ** 2)))
+    assert fit.converged
+    assert deviation < 3e-3
+
+
+@pytest.mark.slow
 def test_noise_stops_the_fit_where_it_explains_the_misfit(rng):
     target = signature(CONFORMAL) * np.exp(0.01 * rng.standard_normal((4, N, N)))
-    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, noise=0.01)
+    # 45 pairs leave out 0.1 %, which does not show beside the noise: no warning.
+    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=45, noise=0.01)
     assert fit.result == "noise level reached"
     assert 0.5 * 0.01**2 * 0.3 < fit.misfit <= 0.5 * 0.01**2
     assert error(fit, CONFORMAL) < 0.03
@@ -119,21 +208,35 @@ def test_eigenvalues_alone():
     np.testing.assert_allclose(fit.hks, target, rtol=1e-3, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_wave_kernel_signature():
-    pairs = hj.eigenpairs(CONFORMAL, K)
+    pairs = hj.eigenpairs(CONFORMAL, 30)
     energies, sigma = hj.default_energies(pairs, 30)
     target = hj.wks(pairs, energies, sigma)
-    fit = hj.fit_metric(target, energies, FLAT, "conformal", signature="wks", sigma=sigma, k=K, max_steps=8)
+    fit = hj.fit_metric(target, energies, FLAT, "conformal", signature="wks", sigma=sigma, k=30, max_steps=8)
     assert fit.loss < 1e-3 * fit.history[0].loss
-    with pytest.raises(ValueError, match=r"times: got energies up to 9, which take about \d+ eigenpairs; with 196"):
+    with pytest.raises(ValueError, match=r"times: got energies up to 9, which take about \d+ eigenpairs; with 100"):
         hj.fit_metric(target, np.linspace(3, 9, 30), FLAT, "conformal", signature="wks", sigma=sigma)
 
 
+def test_unobserved_entries_have_no_influence(rng):
+    weights = (rng.uniform(size=(N, N)) > 0.3).astype(float)
+    target, values = signature(CONFORMAL), jnp.asarray(rng.normal(0, 0.1, (N * N, 1)))
+    unknown = np.where(weights == 0, np.nan, target)
+    problem = problem_of(unknown, TIMES, FLAT, K, weights)
+    value, slope = jax.jit(jax.value_and_grad(lambda v: loss_of(problem, v)[0]))(values)
+    observed = np.log(signature(hj.TensorField(GRID, np.exp(values.reshape(N, N, 1, 1)) * np.eye(2))) / target)
+    mean = np.sum(weights * observed**2) / (4 * np.sum(weights))
+    assert value == pytest.approx(mean / 2, rel=1e-9)
+    assert jnp.isfinite(slope).all()
+
+
+@pytest.mark.slow
 def test_unobserved_entries_may_be_nan_and_do_not_count(rng):
     target = signature(CONFORMAL).copy()
     weights = (rng.uniform(size=(N, N)) > 0.3).astype(float)
     target[:, weights == 0] = np.nan
-    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, weights=weights)
+    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, weights=weights, max_steps=6)
     assert error(fit, CONFORMAL) < 1e-2
 
 
@@ -145,6 +248,7 @@ def test_gauss_newton_needs_fewer_signatures_than_lbfgs():
     assert all(np.isfinite(step.gradient) for step in (*newton.history, *lbfgs.history))
 
 
+@pytest.mark.slow
 def test_a_function_of_a_few_parameters():
     def bump(parameters):
         height = parameters["height"] * jnp.exp(-((X - parameters["x"]) ** 2 + (Y - 0.5) ** 2) / 0.1)
@@ -181,6 +285,7 @@ def test_penalties_are_means_over_the_domain():
     assert all(penalty(each) == 0 for each in (Prior(1.0, field), LogDeterminant(1.0, field)))
 
 
+@pytest.mark.slow
 def test_a_regulariser_smooths_what_noise_roughens(rng):
     target = signature(CONFORMAL) * np.exp(0.05 * rng.standard_normal((4, N, N)))
 
@@ -212,7 +317,7 @@ def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
     with pytest.raises(ValueError, match=r"checkpoint: .* is of another fit"):
         hj.fit_metric(2 * target, TIMES, FLAT, "conformal", k=K, checkpoint=file)
     (tmp_path / "notes.txt").write_text("no checkpoint")
-    with pytest.raises(ValueError, match=r"checkpoint: .*notes.txt is not one of a fit"):
+    with pytest.raises(ValueError, match=r"checkpoint: .*notes.txt: not a readable npz archive"):
         hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, checkpoint=tmp_path / "notes.txt")
 
 
@@ -227,8 +332,32 @@ def test_continuation_and_several_starts():
 
 
 @pytest.mark.slow
+def test_deviation_bounds_that_of_the_exact_posterior():
+    """Under the white prior the posterior's covariance is (JᵀJ/σ² + 1/τ²)⁻¹."""
+    grid = hj.Grid((7, 6), 0.2)
+    tensors = np.exp(0.3 * np.sin(3 * grid.nodes[..., 0]))[..., None, None] * np.eye(2)
+    target = hj.hks(hj.eigenpairs(hj.TensorField(grid, tensors), 42), [0.15, 0.4])
+    init = hj.TensorField(grid, np.broadcast_to(np.eye(2), (7, 6, 2, 2)))
+    problem = problem_of(target, [0.15, 0.4], init, 42)
+    values = jnp.asarray(0.2 * np.sin(3 * grid.nodes[..., 0]).reshape(-1, 1))
+    jacobian = jax.jit(jax.jacfwd(lambda v: problem.observation.residuals(problem.pairs(v))))(values)[..., 0]
+    variance = 0.02**2 / target.size
+    exact = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian / variance + np.eye(42) / 0.5**2)))
+    few, many = (identifiability(problem, values, n=n, n_weak=1, noise=0.02, prior=0.5, iterations=20) for n in (6, 42))
+    assert (few.deviation >= exact * (1 - 1e-6)).all()
+    np.testing.assert_allclose(many.deviation, exact, rtol=1e-5)
+    assert (few.deviation > 1.1 * exact).mean() > 0.5
+    assert (few.deviation < 0.5).all()
+
+
+@pytest.mark.slow
 def test_identifiability_is_the_spectrum_of_the_information(rng):
-    fit = hj.fit_metric(signature(CONFORMAL), TIMES, FLAT, "conformal", k=K, max_steps=2)
+    # On the smaller grid the weakest direction takes more iterations than these.
+    grid, times, k = hj.Grid((14, 14), 1 / 13), np.geomspace(0.012, 0.15, 4), 196
+    factor = np.exp(0.4 * np.sin(2 * grid.nodes[..., 0]) * np.cos(3 * grid.nodes[..., 1]))[..., None, None]
+    target = signature(hj.TensorField(grid, factor * np.eye(2)), k, times)
+    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (14, 14, 2, 2)))
+    fit = hj.fit_metric(target, times, flat, "conformal", k=k, max_steps=2)
     problem = fit.problem
     report = identifiability(fit, n=12, n_weak=2, iterations=6)
     jacobian = jax.jacfwd(lambda v: problem.observation.residuals(problem.pairs(v)))(fit.values)
@@ -240,7 +369,7 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
     assert 0 < report.effective <= 12
     assert (report.deviation <= 1).all()
     # Fewer times, less information.
-    fewer = hj.fit_metric(signature(CONFORMAL)[2:], TIMES[2:], FLAT, "conformal", k=K, max_steps=1)
+    fewer = hj.fit_metric(target[2:], times[2:], flat, "conformal", k=k, max_steps=1)
     poorer = identifiability(fewer.problem, fit.values, n=12, n_weak=1, iterations=6)
     assert poorer.strengths[11] < report.strengths[11]
 
@@ -248,9 +377,9 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"target": lambda t: t[:, 1:]}, r"target: got shape \(4, 13, 14\); expected .* \(4, 14, 14\)"),
-        ({"target": lambda t: np.where(t == t[0, 0, 0], np.nan, t)}, r"target: 1 of 784 observed values are NaN"),
-        ({"target": lambda t: t - 100}, r"target: \d+ of 784 observed values are not positive \(the first at \(0, 0, "),
+        ({"target": lambda t: t[:, 1:]}, r"target: got shape \(4, 9, 10\); expected .* \(4, 10, 10\)"),
+        ({"target": lambda t: np.where(t == t[0, 0, 0], np.nan, t)}, r"target: 1 of 400 observed values are NaN"),
+        ({"target": lambda t: t - 100}, r"target: \d+ of 400 observed values are not positive \(the first at \(0, 0, "),
         ({"times": [0.1, -1.0, 1.0, 2.0]}, "times: got -1.0; expected positive"),
         ({"times": np.array([1e-5, 0.1, 0.2, 0.3])}, "times: got 1e-05, which takes about .* Use times from about"),
         ({"parametrisation": "spherical"}, "parametrisation: got 'spherical'; expected 'log-euclidean'"),
@@ -259,9 +388,9 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
         ({"optimiser": "sgd"}, "optimiser: got 'sgd'; expected 'gauss-newton'"),
         ({"weights": np.zeros((N, N))}, "weights: all are zero"),
         ({"weights": np.ones(3)}, r"weights: got shape \(3,\); expected one that broadcasts"),
-        ({"noise": -1}, "noise: got -1; expected a positive"),
+        ({"noise": -1}, "noise: got -1; expected a finite number above 0"),
         ({"max_steps": 0}, "max_steps: got 0; expected an integer from 1"),
-        ({"smoothness": -1.0}, "smoothness: got -1.0; expected a length"),
+        ({"smoothness": -1.0}, "smoothness: got -1.0; expected a finite number from 0"),
         ({"signature": "wks"}, "sigma: got None"),
         ({"signature": lambda pairs: pairs.eigenvalues, "target": lambda t: t[0, 0]}, "k: got None"),
     ],
@@ -270,7 +399,7 @@ def test_bad_arguments_are_named(changes, message):
     target = np.linspace(1, 2, 4 * N * N).reshape(4, N, N)
     target = changes.pop("target", lambda t: t)(target)
     arguments = {"times": TIMES, "init": FLAT} | changes
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         hj.fit_metric(target, **arguments)
 
 

@@ -65,7 +65,7 @@ def triangulated(n):
 
 
 @pytest.mark.filterwarnings("ignore:k =", "ignore:2 of 2|1 of 2")
-@pytest.mark.parametrize("other", [reparametrised, triangulated])
+@pytest.mark.parametrize("other", [pytest.param(reparametrised, marks=pytest.mark.slow), triangulated])
 def test_same_surface_same_signature_to_discretisation_order(other):
     coarse, fine = differences(other)
     assert 1.6 < np.log2(coarse / fine) < 2.6

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hks_jax as hj
-from hks_jax.io import read_mesh, save
+from hks_jax.io import read_mesh, read_mesh_arrays, save
 
 meshio = pytest.importorskip("meshio")
 
@@ -66,6 +66,7 @@ def test_polygonal_data_through_vtk(tmp_path):
         assert (len(mesh.vertices), len(mesh.faces)) == (source.GetOutput().GetNumberOfPoints(), 24 * 18 * 2)
         np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.5, rtol=1e-5)
         assert not mesh.triangulation.boundary_vertices.any()
+        np.testing.assert_allclose(read_mesh_arrays(tmp_path / name)["Normals"], 2 * mesh.vertices, atol=1e-6)
 
 
 def test_seams_are_closed_if_asked(tmp_path):
@@ -74,7 +75,9 @@ def test_seams_are_closed_if_asked(tmp_path):
     split = np.arange(24).reshape(8, 3)
     split = np.concatenate([split, [[0, 0, 1]]])  # a triangle without area, and a vertex without a triangle
     meshio.Mesh(np.concatenate([corners, [[9.0, 9, 9]]]), [("triangle", split)]).write(tmp_path / "m.obj")
-    with pytest.raises(ValueError, match=r"belong to no face; remove them\. clean=True merges"):
+    with pytest.raises(
+        ValueError, match=r"belong to no face \(the first is vertex 24\); remove them\. clean=True merges"
+    ):
         read_mesh(tmp_path / "m.obj")
     mesh = read_mesh(tmp_path / "m.obj", clean=True)
     assert mesh.vertices.shape == (6, 3)
@@ -107,12 +110,117 @@ def test_signatures_in_npz(tmp_path):
         np.testing.assert_array_equal(read["faces"], mesh.faces)
 
 
+SOLID = hj.examples.ball_mesh(2)
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "msh"])
+def test_tetrahedra_and_arrays_there_and_back(tmp_path, suffix, rng):
+    values = rng.random((2, len(SOLID.vertices)))
+    path = save(tmp_path / f"b.{suffix}", values, SOLID, name="hks", extra={"times": [1.0, 2.5]})
+    theirs = meshio.read(path)
+    np.testing.assert_array_equal(theirs.points, SOLID.vertices)
+    np.testing.assert_array_equal(theirs.get_cells_type("tetra"), SOLID.cells)
+    mesh, arrays = read_mesh(path), read_mesh_arrays(path)
+    assert isinstance(mesh, hj.TetMesh)
+    np.testing.assert_array_equal(mesh.vertices, SOLID.vertices)
+    np.testing.assert_array_equal(mesh.cells, SOLID.cells)
+    assert list(arrays) == ["hks_0_t1", "hks_1_t2.5"]
+    np.testing.assert_array_equal(list(arrays.values()), values)
+    with np.load(save(tmp_path / "b.npz", values[0], SOLID)) as read:
+        np.testing.assert_array_equal(read["cells"], SOLID.cells)
+    with pytest.raises(ValueError, match=r"tetrahedra are written as \.vtu, \.vtk, \.msh or \.npz"):
+        save(tmp_path / "b.ply", values[0], SOLID)
+
+
+def test_cleaned_tetrahedra_and_their_arrays(tmp_path, rng):
+    """Split into corners, some in the other order, with a flat one and a vertex without any: as at first."""
+    corners, cells = np.asarray(SOLID.vertices)[SOLID.cells].reshape(-1, 3), np.arange(640).reshape(-1, 4)
+    cells[::3] = cells[::3][:, [1, 0, 2, 3]]
+    points = np.concatenate([[[9.0, 9, 9]], corners])
+    cells = np.concatenate([1 + cells, [[1, 1, 2, 3]]])
+    tensors = rng.random((641, 9))
+    tensors[1:] = corners @ rng.random((3, 9))
+    meshio.Mesh(points, [("tetra", cells)], point_data={"D": tensors}).write(tmp_path / "m.vtu")
+    with pytest.raises(ValueError, match=r"belong to no cell \(the first is vertex 0\).* clean=True merges"):
+        read_mesh(tmp_path / "m.vtu")
+    mesh = read_mesh(tmp_path / "m.vtu", clean=True)
+    assert mesh.vertices.shape == (55, 3)
+    assert float(hj.assemble(mesh).volume) == pytest.approx(float(hj.assemble(SOLID).volume))
+    D = read_mesh_arrays(tmp_path / "m.vtu", clean=True)["D"]
+    first = [int(np.flatnonzero((points == v).all(axis=1))[0]) for v in np.asarray(mesh.vertices)]
+    np.testing.assert_array_equal(D, tensors[first])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("version", ["2.2", "4.1"])
+@pytest.mark.parametrize("binary", [True, False])
+def test_gmsh(tmp_path, version, binary):
+    vertices, faces = octahedron()
+    for kind, cells, name in (("triangle", faces, "faces"), ("tetra", SOLID.cells, "cells")):
+        points = vertices if kind == "triangle" else np.asarray(SOLID.vertices)
+        path = tmp_path / f"{kind}.msh"
+        meshio.gmsh.write(path, meshio.Mesh(points, [(kind, cells)]), version, binary)
+        mesh = read_mesh(path)
+        np.testing.assert_array_equal(mesh.vertices, points)
+        np.testing.assert_array_equal(getattr(mesh, name), cells)
+    content = path.read_bytes()
+    damages = [(b"$EndNodes", b"$EndNode"), (b"$MeshFormat\n" + version.encode(), b"$MeshFormat\n3.0")]
+    if not binary:
+        declared = b"$Nodes\n55" if version == "2.2" else b"$Nodes\n1 55"
+        damages += [(declared, declared[:-2] + b"54"), (declared, declared[:-2] + b"99999999999")]
+        elements = b"$Elements\n160" if version == "2.2" else b"$Elements\n1 160"
+        damages += [(elements, elements[:-3] + b"159")]
+        tag = b"\n55 " if version == "2.2" else b"\n55\n"
+        damages += [(tag, tag.replace(b"55", b"99999999999"))]
+    for old, new in damages:
+        assert old in content
+        path.write_bytes(content.replace(old, new, 1))
+        with pytest.raises(ValueError, match=r"tetra\.msh: not a mesh that meshio can read"):
+            read_mesh(path)
+
+
+def test_tetrahedra_with_the_cells_of_their_boundary(tmp_path):
+    """As Gmsh writes them: the boundary's triangles, lines and points come before the tetrahedra."""
+    points, cells = np.asarray(SOLID.vertices), SOLID.cells
+    blocks = [("vertex", cells[:1, :1]), ("line", cells[:2, :2]), ("triangle", cells[:5, :3]), ("tetra", cells)]
+    meshio.Mesh(points, blocks).write(tmp_path / "m.vtu")
+    np.testing.assert_array_equal(read_mesh(tmp_path / "m.vtu").cells, cells)
+
+
+def test_surfaces_of_neuroimaging(tmp_path):
+    """Written by nibabel: GIFTI, also compressed, and FreeSurfer's."""
+    nibabel = pytest.importorskip("nibabel")
+    vertices, faces = octahedron()
+    intents = ("NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE")
+    arrays = [
+        nibabel.gifti.GiftiDataArray(values, intent)
+        for values, intent in zip((vertices.astype(np.float32), faces.astype(np.int32)), intents, strict=True)
+    ]
+    for name in ("lh.surf.gii", "lh.surf.gii.gz"):
+        nibabel.save(nibabel.gifti.GiftiImage(darrays=arrays), tmp_path / name)
+    nibabel.freesurfer.write_geometry(tmp_path / "lh.white", vertices, faces)
+    for name in ("lh.surf.gii", "lh.surf.gii.gz", "lh.white"):
+        mesh = read_mesh(tmp_path / name)
+        np.testing.assert_array_equal(mesh.vertices, vertices)
+        np.testing.assert_array_equal(mesh.faces, faces)
+        assert read_mesh_arrays(tmp_path / name) == {}
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content[:-13])
+        with pytest.raises(ValueError, match=f"{name}: not a readable"):
+            read_mesh(tmp_path / name)
+    nibabel.save(nibabel.gifti.GiftiImage(darrays=arrays[:1]), tmp_path / "p.gii")
+    with pytest.raises(ValueError, match="it has 1 and 0 arrays of points and of triangles; expected one of each"):
+        read_mesh(tmp_path / "p.gii")
+    (tmp_path / "lh.inflated").write_bytes(b"something else")
+    with pytest.raises(ValueError, match=r"unknown kind of mesh; expected .*, or a surface of FreeSurfer's"):
+        read_mesh(tmp_path / "lh.inflated")
+
+
 def test_bad_meshes(tmp_path, capsys):
     vertices, faces = octahedron()
-    tetrahedra = meshio.Mesh(vertices, [("tetra", np.array([[0, 2, 4, 5]]))])
-    tetrahedra.write(tmp_path / "t.vtu")
-    with pytest.raises(ValueError, match="has tetra cells; expected triangles"):
-        read_mesh(tmp_path / "t.vtu")
+    meshio.Mesh(vertices, [("wedge", np.array([[0, 2, 4, 5, 1, 3]]))]).write(tmp_path / "w.vtu")
+    with pytest.raises(ValueError, match="has wedge cells; expected triangles"):
+        read_mesh(tmp_path / "w.vtu")
     meshio.Mesh(vertices, [("line", faces[:, :2])]).write(tmp_path / "l.vtu")
     with pytest.raises(ValueError, match="has no triangles"):
         read_mesh(tmp_path / "l.vtu")
@@ -126,7 +234,7 @@ def test_bad_meshes(tmp_path, capsys):
     with pytest.raises(ValueError, match="unknown kind of mesh"):
         read_mesh(tmp_path / "m.gts")
     mesh = hj.SurfaceMesh(vertices, faces)
-    with pytest.raises(ValueError, match=r"written as \.vtu, \.vtk, \.ply or \.npz"):
+    with pytest.raises(ValueError, match=r"written as \.vtu, \.vtk, \.msh, \.ply or \.npz"):
         save(tmp_path / "v.stl", np.zeros(6), mesh)
     with pytest.raises(ValueError, match=r"expected \(6,\), or n_times before it"):
         save(tmp_path / "v.ply", np.zeros(7), mesh)

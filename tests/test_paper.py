@@ -9,9 +9,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 
 from hks_jax import Grid, SurfaceMesh, TensorField, plot
-from hks_jax.domain.examples import bumpy_torus_mesh, figure4_fields
-from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, run, table1
-from hks_jax.paper.signature import continued_signature, enough_pairs, signature
+from hks_jax.domain.examples import bumpy_torus_field, bumpy_torus_mesh, figure3_fields, figure4_fields
+from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, run, table1, triangles
+from hks_jax.paper.signature import continued_signature, enough_pairs, flat_signature, signature
 
 # What an independent implementation of the same method gives.
 INDEPENDENT = {50: 0.0580, 100: 0.0223, 200: 0.0056, 400: 0.00085}
@@ -25,7 +25,7 @@ def agrees(row: table1.Row) -> bool:
 # --- Table 1 ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n", [50, 100])
+@pytest.mark.parametrize("n", [50, pytest.param(100, marks=pytest.mark.slow)])
 def test_table_1_coarse_rows(n):
     row = table1.row(n, table1.QUICK_PAIRS, table1.stored_reference())
     assert agrees(row)
@@ -89,7 +89,34 @@ def test_table_files_state_their_conventions(tmp_path, monkeypatch):
     text = paths[0].read_text(encoding="utf-8")
     for phrase in ("| 100² | 200 | 0.07600 | 0.02230 |", "√(Σ (h − r)² / Σ r²)", "√|T|", "read from the package"):
         assert phrase in text
-    assert lines[-1].startswith("table1: ")
+    assert [line.split(": ")[0] for line in lines] == ["[1/1] table1"] * 4
+
+
+# --- triangles --------------------------------------------------------------------------------------------------------
+
+
+def test_which_triangles_violate_the_inequality():
+    """None on smooth fields at the figures' sizes; some, by every rule, where a grid is coarse for its field."""
+    counts = {(n, rule): triangles.count(figure3_fields(n)["T³"], rule) for n in (11, 51) for rule in triangles.LENGTHS}
+    for rule in triangles.LENGTHS:
+        assert counts[51, rule][:3] == (5000, 0, 2601)
+        assert counts[11, rule][:3] == (200, 6, 121)
+    torus = triangles.count(bumpy_torus_field(100), "integrated", periodic=True)
+    assert torus[:3] == (20000, 0, 10000)
+    assert torus.no_area > 0
+
+
+def test_counts_of_triangles_on_known_lengths():
+    """An isotropic metric with one heavy node, by hand."""
+    tensors = np.broadcast_to(np.eye(2), (2, 2, 2, 2)).copy()
+    grid = Grid((2, 2))
+    assert triangles.count(TensorField(grid, tensors), "midpoint") == (2, 0, 4, 0)
+    # Scaled by s² at the end of the diagonal, which has √2 (1 + s)/2; the sides are 1 and (1 + s)/2.
+    for s, wrong in ((3.0, 0), (6.0, 2)):
+        tensors[1, 1] = s**2 * np.eye(2)
+        assert triangles.count(TensorField(grid, tensors), "mean of the ends").violating == wrong
+    integrated = triangles.LENGTHS["integrated"](np.eye(2)[None], 4 * np.eye(2)[None], np.array([[3.0, 4.0]]))
+    np.testing.assert_allclose(integrated, 5 * 14 / 9, rtol=1e-6)  # ∫√(1 + 3s) ds = 14/9
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -124,8 +151,10 @@ def cheap(monkeypatch):
             values = np.where(domain.grid.inside, 2 + np.sin(domain.grid.nodes).sum(axis=-1), np.nan)
         return np.stack([values / t for t in times])
 
-    for module in (figure1, figure2, figure3, figure6):
+    for module in (figure1, figure6):
         monkeypatch.setattr(module, "signature", cheap_signature)
+    for module in (figure2, figure3):
+        monkeypatch.setattr(module, "flat_signature", lambda f, t, b="neumann": cheap_signature(f, [t], 1)[0])
     for module in (figure4, figure5):
         monkeypatch.setattr(module, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
     monkeypatch.setattr(figure2, "hks_expansion", lambda f, t: cheap_signature(f, t, 1))
@@ -169,10 +198,21 @@ def test_figure_1_shows_a_surface_and_its_chart(tmp_path, drawn, monkeypatch):
 @pytest.mark.usefixtures("cheap")
 def test_figure_2_has_three_boundaries_and_profiles_for_two_metrics(tmp_path, drawn, monkeypatch):
     fig = draw(figure2, tmp_path, drawn, monkeypatch, QUICK=41)
-    assert [len(ax.images) for ax in fig.axes] == [1, 1, 1, 0] * 2
-    assert [line.get_label() for line in fig.axes[3].lines] == ["natural", "strip", "mirror", "expansion"]
-    # The reflected strip is cropped to the same nodes.
-    np.testing.assert_allclose(fig.axes[1].images[0].get_array(), fig.axes[0].images[0].get_array())
+    assert [len(ax.images) for ax in fig.axes] == [1, 1, 1, 1, 0] * 2
+    assert [line.get_label() for line in fig.axes[4].lines] == ["natural", "strip", "mirror", "expansion"]
+    natural, before, strip = (fig.axes[i].images[0].get_array() for i in range(3))
+    # The reflected strip, 12 nodes wide, is cropped to the same nodes; the dashed square shows which.
+    assert before.shape == (65, 65)
+    np.testing.assert_allclose(before[12:-12, 12:-12], strip)
+    np.testing.assert_allclose(strip, natural)
+    assert fig.axes[1].patches[0].get_bbox().bounds == (0, 0, 1, 1)
+
+
+def one_colour_range(images):
+    """All images of a figure have the same colours for the same values, and these span all values."""
+    arrays = [image.get_array() for image in images]
+    ends = min(array.min() for array in arrays), max(array.max() for array in arrays)
+    assert [image.get_clim() for image in images] == [ends] * len(images)
 
 
 @pytest.mark.usefixtures("cheap")
@@ -180,6 +220,7 @@ def test_figure_3_has_ellipses_over_images(tmp_path, drawn, monkeypatch):
     fig = draw(figure3, tmp_path, drawn, monkeypatch)
     assert [len(ax.collections) for ax in fig.axes] == [1] * 4 + [0] * 4
     assert [len(ax.images) for ax in fig.axes] == [0] * 4 + [1] * 4
+    one_colour_range([ax.images[0] for ax in fig.axes[4:]])
 
 
 @pytest.mark.usefixtures("cheap")
@@ -195,9 +236,12 @@ def test_figure_4_has_lines_over_every_field(tmp_path, drawn, monkeypatch):
 @pytest.mark.usefixtures("cheap")
 def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
     fig = draw(figure5, tmp_path, drawn, monkeypatch, QUICK=31)
-    titles = [ax.get_title() for ax in fig.axes]
+    *panels, bar = fig.axes
+    titles = [ax.get_title() for ax in panels]
     assert titles == [f"index {i}" for i in ("−2", "−3/2", "−1", "−1/2", "1/2", "1", "3/2", "2", "5/2", "3")]
-    assert all(len(ax.collections[0].get_segments()) > 10 for ax in fig.axes)
+    assert all(len(ax.collections[0].get_segments()) > 10 for ax in panels)
+    assert "HKS" in bar.get_ylabel()
+    one_colour_range([ax.images[0] for ax in panels])
 
 
 @pytest.mark.usefixtures("cheap")
@@ -211,16 +255,19 @@ def test_figure_6_draws_a_phantom_where_there_is_no_brain(tmp_path, drawn, monke
         assert 0.3 < image.count() / image.size < 0.95  # nothing outside the mask
 
 
-def test_signature_and_enough_pairs():
+def test_signature_and_enough_pairs(monkeypatch):
     """Enough pairs are enough, and a continued metric has no boundary: the flat square is flat up to its sides."""
     metric = jnp.array([[2.0, 0.5], [0.5, 1.0]])
     field = TensorField.from_function(lambda x: metric, Grid.from_bounds(0, 1, (21, 21)))
     values = continued_signature(field, 0.02, 0.4)
     assert values.shape == (21, 21)
-    np.testing.assert_allclose(4 * np.pi * 0.02 * values, 1.0, rtol=0.02)
-    (wide,) = signature(field, [0.02], enough_pairs(field, 0.02, exponent=12.0))
-    (same,) = signature(field, [0.02], enough_pairs(field, 0.02))
-    np.testing.assert_allclose(same, wide, rtol=5e-3)
+    np.testing.assert_allclose(values, 1.0, rtol=0.02)
+    whole = flat_signature(field, 0.02)
+    (pairs,) = signature(field, [0.02], enough_pairs(field, 0.02), normalisation="flat")
+    np.testing.assert_allclose(pairs, whole, rtol=5e-3)
+    # A large grid takes that many eigenpairs.
+    monkeypatch.setattr("hks_jax.paper.signature.SMALL", 400)
+    np.testing.assert_allclose(flat_signature(field, 0.02), pairs, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -234,12 +281,14 @@ def test_figure_1_shows_the_same_hks_on_surface_and_chart(tmp_path, drawn, monke
 @pytest.mark.slow
 def test_figure_2_shows_the_boundary_and_its_removal(tmp_path, drawn, monkeypatch):
     fig = draw(figure2, tmp_path, drawn, monkeypatch, QUICK=31)
-    natural, strip, mirror = (fig.axes[i].images[0].get_array() for i in range(3))
+    natural, before, strip, mirror = (fig.axes[i].images[0].get_array() for i in range(4))
+    assert before.max() == pytest.approx(4, rel=0.05)
+    np.testing.assert_allclose(before[9:-9, 9:-9], strip)
     assert natural.max() == pytest.approx(4, rel=0.05)  # a corner
     assert natural[0, 15] == pytest.approx(2, rel=0.05)  # a side
     np.testing.assert_allclose(mirror, 1.0, rtol=0.02)
     np.testing.assert_allclose(strip, mirror, rtol=0.01)
-    curved_strip, curved_mirror = (fig.axes[i].images[0].get_array() for i in (5, 6))
+    curved_strip, curved_mirror = (fig.axes[i].images[0].get_array() for i in (7, 8))
     np.testing.assert_allclose(curved_strip, curved_mirror, rtol=0.01)
     assert np.ptp(curved_mirror) > 0.05
 
@@ -258,7 +307,7 @@ def test_figures_3_and_4_see_which_fields_are_flat(tmp_path, drawn, monkeypatch)
 @pytest.mark.slow
 def test_figure_5_has_the_symmetries_of_its_fields(tmp_path, drawn, monkeypatch):
     fig = draw(figure5, tmp_path, drawn, monkeypatch, QUICK=31)
-    images = {ax.get_title(): ax.images[0].get_array().T for ax in fig.axes}
+    images = {ax.get_title(): ax.images[0].get_array().T for ax in fig.axes if ax.images}
     # The field of index i is the same after a turn by 2π/|2i − 2|; those of a quarter turn are nodes again.
     for index in ("−1", "3"):
         image = images[f"index {index}"]

@@ -5,9 +5,11 @@ import sys
 
 import numpy as np
 import pytest
+from annotations import unchecked
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hks_jax import Grid, SurfaceMesh, TensorField
+from hks_jax.domain.examples import ball_mesh
 from hks_jax.plot import (
     ellipses,
     evenly_spaced_lines,
@@ -123,9 +125,9 @@ def test_image_errors():
         scalar_image(ax, np.zeros((5, 6)), grid)
     with pytest.raises(ValueError, match="no finite value"):
         scalar_image(ax, np.full((6, 5), np.nan), grid)
-    with pytest.raises(ValueError, match=r"3 dimensions.*Draw a slice"):
+    with unchecked(), pytest.raises(ValueError, match=r"3 dimensions.*Draw a slice"):
         scalar_image(ax, np.zeros((3, 3, 3)), Grid((3, 3, 3)))
-    with pytest.raises(ValueError, match=r"values: got shape \(6, 5\)"):
+    with unchecked(), pytest.raises(ValueError, match=r"values: got shape \(6, 5\)"):
         hks_panels(np.zeros((6, 5)), [1.0], grid)
     with pytest.raises(ValueError, match=r"titles: got 1; expected 2"):
         hks_panels(np.zeros((2, 6, 5)), [1.0, 2.0], grid, titles=["one"])
@@ -225,9 +227,9 @@ def test_ellipses_respect_the_mask_and_colour():
 def test_ellipse_errors():
     field = rotating_field(1, n=9)
     ax = new_figure(2, 2).subplots()
-    with pytest.raises(ValueError, match=r'kind: got "?\'?glyph'):
+    with unchecked(), pytest.raises(ValueError, match=r'kind: got "?\'?glyph'):
         ellipses(ax, field, kind="glyph")
-    with pytest.raises(ValueError, match="sizes: got 'big'"):
+    with unchecked(), pytest.raises(ValueError, match="sizes: got 'big'"):
         ellipses(ax, field, sizes="big")
     with pytest.raises(ValueError, match=r"fill: got 1.5"):
         ellipses(ax, field, fill=1.5)
@@ -319,11 +321,11 @@ def test_integral_lines_draws_on_the_axes_it_is_given():
     assert list(ax.collections) == [sparse, dense, seeded]
     assert len(dense.get_segments()) > 1.5 * len(sparse.get_segments()) > 0
     assert len(seeded.get_segments()) == 1
-    with pytest.raises(ValueError, match='which: got \'medium\'; expected "major" or "minor"'):
+    with unchecked(), pytest.raises(ValueError, match='which: got \'medium\'; expected "major" or "minor"'):
         integral_lines(ax, field, "medium")
     with pytest.raises(ValueError, match=r"density: got 0"):
         integral_lines(ax, field, density=0)
-    with pytest.raises(ValueError, match=r"seeds: got shape \(3,\)"):
+    with unchecked(), pytest.raises(ValueError, match=r"seeds: got shape \(3,\)"):
         trace(field, np.zeros(3))
     with pytest.raises(ValueError, match=r"separation: got -1"):
         evenly_spaced_lines(field, separation=-1)
@@ -355,9 +357,12 @@ def test_hks_curves_errors():
         hks_curves(ax, np.zeros((2, 5, 4)), [1.0], grid, [[0, 0]])
     with pytest.raises(ValueError, match=r"points: \(9.0, 0.0\) lies outside"):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[9, 0]])
-    with pytest.raises(ValueError, match=r"expansion: got shape \(2, 5, 4\); expected that of values, \(1, 5, 4\)"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match=r"expansion: got shape \(2, 5, 4\); expected that of values, \(1, 5, 4\)"),
+    ):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[0, 0]], expansion=np.ones((2, 5, 4)))
-    with pytest.raises(ValueError, match=r"points: got shape \(2,\)"):
+    with unchecked(), pytest.raises(ValueError, match=r"points: got shape \(2,\)"):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [0, 0])
 
 
@@ -374,6 +379,19 @@ def test_surface_colours_triangles_by_their_vertices():
     assert mappable.get_clim() == (0.0, 3.0)
     with pytest.raises(ValueError, match=r"values: got shape \(3,\); expected \(4,\)"):
         surface(ax, SurfaceMesh(vertices, faces), values[:3])
+
+
+def test_a_solid_is_drawn_by_its_boundary():
+    ball = ball_mesh(2)
+    values = np.asarray(ball.vertices)[:, 0] + 5.0 * (np.linalg.norm(ball.vertices, axis=1) < 0.9)
+    boundary, numbers = ball.boundary()
+    axes = [new_figure(3, 3).add_subplot(projection="3d") for _ in range(2)]
+    of_solid, of_surface = surface(axes[0], ball, values), surface(axes[1], boundary, values[numbers])
+    assert of_solid.get_clim() == of_surface.get_clim() == (-1.0, 1.0)
+    assert len(axes[0].collections[0].get_facecolor()) == 80
+    np.testing.assert_array_equal(*(np.sort(ax.collections[0].get_facecolor(), axis=0) for ax in axes))
+    with pytest.raises(ValueError, match=r"values: got shape \(42,\); expected \(55,\)"):
+        surface(axes[0], ball, values[numbers])
 
 
 # --- sensitivity --------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from annotations import unchecked
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hks_jax import Grid
@@ -76,9 +77,9 @@ def test_limits_are_those_given_and_bars_show_what_lies_beyond():
 
 
 def test_errors():
-    with pytest.raises(ValueError, match=r"grid: got shape .* three dimensions"):
+    with unchecked(), pytest.raises(ValueError, match=r"grid: got shape .* three dimensions"):
         volume_panels(np.zeros((1, 3, 3)), [1.0], Grid((3, 3)))
-    with pytest.raises(ValueError, match=r"values: got shape .* expected \(n_times, \*grid.shape\)"):
+    with unchecked(), pytest.raises(ValueError, match=r"values: got shape .* expected \(n_times, \*grid.shape\)"):
         volume_panels(ramp(), [1.0], GRID)
     with pytest.raises(ValueError, match="limits: got 2; expected 1"):
         volume_panels(ramp()[None], [1.0], GRID, limits=[(0, 1)] * 2)

@@ -1,11 +1,16 @@
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fields import flat, random_spd
+import scipy.special
+from annotations import unchecked
+from fields import flat, random_spd, turning
 from scipy.linalg import expm
 
 import hks_jax as hj
+from hks_jax.signatures.tail import beyond_by_weyl
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +62,11 @@ def test_normalisations_by_name(pairs):
     np.testing.assert_allclose(hj.hks(pairs, TIMES, "heat-trace"), raw / trace)
     late = hj.hks(pairs, [1e5], "volume")
     np.testing.assert_allclose(late[0, pairs.space.domain], 1, rtol=1e-9)
-    with pytest.raises(
-        ValueError, match='normalisation: got \'area\'; expected "raw", "heat-trace", "volume" or "flat"'
+    with (
+        unchecked(),
+        pytest.raises(
+            ValueError, match='normalisation: got \'area\'; expected "raw", "heat-trace", "volume" or "flat"'
+        ),
     ):
         hj.hks(pairs, TIMES, "area")
 
@@ -128,6 +136,56 @@ def test_tail_estimate_is_of_the_right_size():
     assert not alone.messages()
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_tail_by_weyl_in_closed_form(d):
+    x = np.geomspace(1e-3, 60, 40)
+    a = d / 2  # N(Λ) Γ(a + 1) (Λt)^(−a) Q(a, Λt), by SciPy
+    general = 7 * scipy.special.gamma(a + 1) * x**-a * scipy.special.gammaincc(a, x)
+    np.testing.assert_allclose(beyond_by_weyl(jnp.asarray(7.0), d, jnp.asarray(x)), general, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("shape", "boundary", "spread"),
+    [
+        pytest.param((24, 22), "neumann", 0.0, marks=pytest.mark.slow),
+        ((24, 22), ("dirichlet", "neumann"), 1.2),
+        pytest.param((22, 18), "dirichlet", 0.4, marks=pytest.mark.slow),
+        ((16, 18), "mirror", 1.2),
+        ((8, 9, 7), (("neumann", "dirichlet"), "periodic", "neumann"), 0.4),
+    ],
+    ids=str,
+)
+def test_truncation_map_finds_the_worst_node(rng, shape, boundary, spread):
+    mask = np.ones(shape, bool)
+    mask[: shape[0] // 3, : shape[1] // 4] = boundary == "mirror"
+    field = hj.TensorField(hj.Grid(shape, 0.1, mask=mask), random_spd(rng, shape, spread))
+    pencil = hj.assemble(field, boundary)
+    unknowns = sum(part.space.n_dof for part in pencil.parts)
+    few, every = (hj.eigenpairs(pencil, k, solver="dense") for k in (unknowns // 8, unknowns))
+    times = np.array([2.0, 4.6, 7.0, 14.0]) / few.next_eigenvalue
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hj.AccuracyWarning)
+        kept, whole = hj.hks(few, times), hj.hks(every, times)
+    free = np.asarray(whole[0] > 0)
+    missing = np.asarray(1 - kept / whole)[:, free]
+    found = hj.truncation_map(few, times)
+    assert found.shape == (4, *shape)
+    np.testing.assert_array_equal(np.isnan(found), np.broadcast_to(~mask, found.shape))
+    assert (np.asarray(found)[:, mask & ~free] == 0).all()
+    ratio = missing.max(axis=1) / np.nanmax(found, axis=(*range(1, found.ndim),))
+    assert (ratio > 0.25).all()
+    assert (ratio[:3] < 2).all()
+    assert ratio[3] < 3
+    # The mean, which decides about the warning, is several times less: most of all beside Dirichlet sides.
+    mean = np.asarray(hj.truncation(few, times).tail)
+    assert missing[1].max() > (4 if "dirichlet" in str(boundary) else 1.2) * mean[1]
+    # At half of the nodes the map is right within a factor of two.
+    inner = missing[1] / np.asarray(found)[1][free]
+    assert (np.quantile(inner, [0.25, 0.75]) > 0.5).all()
+    assert (np.quantile(inner, [0.25, 0.75]) < 2).all()
+    assert (np.nan_to_num(hj.truncation_map(every, times)) == 0).all()
+
+
 def test_resolution_bias_bounds_the_discretisation_error():
     # The exact HKS of a flat torus is 1/4πt times a theta function which is 1 to 1e-10 here.
     for mass in ("consistent", "lumped"):
@@ -139,10 +197,71 @@ def test_resolution_bias_bounds_the_discretisation_error():
         assert not report.messages()
 
 
+@pytest.mark.parametrize("way", ["linear", "log-euclidean"])
+@pytest.mark.parametrize(
+    ("d", "n", "ratio", "rate"),
+    [
+        (2, 21, 3, 1.0),
+        (2, 21, 10, 1.0),
+        pytest.param(2, 15, 10, 0.4, marks=pytest.mark.slow),
+        (3, 7, 3, 1.0),
+    ],
+)
+def test_resolution_bias_of_turning_tensors_is_within_a_factor_of_three(d, n, ratio, rate, way):
+    times = np.array([0.4, 1.0, 3.0])
+    found = []
+    for nodes in (n, 2 * n - 1):
+        grid = hj.Grid.from_bounds(-1, 1, (nodes,) * d)
+        pairs = hj.eigenpairs(hj.TensorField(grid, turning(grid.nodes, ratio, rate), way), 50, solver="shift-invert")
+        found.append((np.asarray(hj.hks(pairs, times)), hj.truncation(pairs, times)))
+    (coarse, report), (fine, _) = found
+    assert report.tail.max() < 0.01
+    # Of second order: the finer grid has a quarter of the error.
+    error = 4 / 3 * (coarse / fine[(slice(None), *[slice(None, None, 2)] * d)] - 1)
+    median = np.median(np.abs(error), axis=tuple(range(1, d + 1)))
+    clear = median > 5e-4
+    assert clear.sum() >= 2
+    ratios = np.asarray(report.resolution_bias)[clear] / median[clear]
+    assert (ratios > 1 / 3).all(), ratios
+    assert (ratios < 3).all(), ratios
+
+
+def test_tensors_that_do_not_turn_have_no_lasting_bias(rng):
+    mask = np.ones((9, 8), dtype=bool)
+    mask[:3, 4:] = False
+    grid = hj.Grid((9, 8), 0.1, mask=mask)
+    constant = np.where(mask[..., None, None], np.array([[4.0, 1.0], [1.0, 2.0]]), np.eye(2))
+    # A conformal factor does not stretch the flux of a plane, and log-Euclidean interpolation of exp(x + 2y) is exact.
+    conformal = np.exp(grid.nodes @ [1.0, 2.0])[..., None, None] * np.eye(2)
+    for field in (hj.TensorField(grid, constant), hj.TensorField(grid, conformal, "log-euclidean")):
+        resolution = hj.assemble(field).resolution
+        np.testing.assert_allclose(resolution.turning, 0, atol=1e-14)
+        np.testing.assert_allclose(resolution.swelling, 0, atol=1e-14)
+    periodic = hj.assemble(flat((6, 5), (1.0, 2.0), (True, True)), "periodic").resolution
+    # h²/48 on each axis, in the units of the metric.
+    np.testing.assert_allclose(periodic.dispersion, ((1 / 6) ** 2 + (2 / 5) ** 2) / 48, rtol=1e-12)
+    turned = hj.TensorField(hj.Grid((21, 21), 0.1), turning(hj.Grid((21, 21), 0.1).nodes, 10.0, 1.0))
+    exact = hj.assemble(hj.TensorField(turned.grid, turned.tensors, "log-euclidean"))
+    swollen = hj.assemble(turned)
+    assert exact.volume == pytest.approx(4 * np.sqrt(10))
+    assert exact.resolution.swelling < 1e-12
+    assert swollen.resolution.swelling == pytest.approx(float(swollen.volume / exact.volume - 1), rel=0.1)
+
+
+def test_a_bias_that_lasts_is_reported_with_its_remedy():
+    grid = hj.Grid.from_bounds(-1, 1, (11, 11))
+    pairs = hj.eigenpairs(hj.TensorField(grid, turning(grid.nodes, 20.0, 1.0)), 121)
+    (message,) = hj.truncation(pairs, [3.0, 10.0]).messages()
+    assert "2 of 2 times" in message
+    assert 'does not fall as t grows. Use a finer grid; interpolation="log-euclidean"' in message
+    assert "Use times from" not in message
+
+
 def test_too_small_times_are_reported():
     pairs = hj.eigenpairs(flat((30, 31), (1.0, 1.0)), 60)
     with pytest.warns(
-        hj.AccuracyWarning, match=r"1 of 2 times are too small for k: an estimated .*% of the sig"
+        hj.AccuracyWarning,
+        match=r"1 of 2 times are too small for k: an estimated .*% of the signature .*, in the mean.*truncation_map",
     ) as seen:
         hj.hks(pairs, [0.004, 0.5])
     assert [warning.filename for warning in seen] == [__file__]
@@ -164,8 +283,8 @@ def test_too_small_times_are_reported():
     ],
 )
 def test_bad_times(pairs, times, message):
-    for function in (hj.hks, hj.heat_trace, hj.truncation):
-        with pytest.raises(ValueError, match=message):
+    for function in (hj.hks, hj.heat_trace, hj.truncation, hj.truncation_map):
+        with unchecked(), pytest.raises(ValueError, match=message):
             function(pairs, times)
 
 
@@ -210,10 +329,10 @@ def test_other_bad_arguments(pairs):
 
 def test_batches_and_other_objects_are_refused(field, pairs):
     batch = jax.vmap(lambda T: hj.eigenpairs(hj.TensorField(field.grid, T), 5))(jnp.stack([field.tensors] * 3))
-    for function in (hj.hks, hj.heat_trace, hj.truncation):
+    for function in (hj.hks, hj.heat_trace, hj.truncation, hj.truncation_map):
         with pytest.raises(ValueError, match=r"pairs: got a batch, eigenvalues of shape \(3, 5\).*jax.vmap"):
             function(batch, [1.0, 2.0, 3.0])
-        with pytest.raises(TypeError, match="pairs: got TensorField; expected what `eigenpairs` returns"):
+        with unchecked(), pytest.raises(TypeError, match="pairs: got TensorField; expected what `eigenpairs` returns"):
             function(field, [1.0])
     each = jax.vmap(lambda p: hj.heat_trace(p, jnp.array([1.0, 2.0])))(batch)
     np.testing.assert_allclose(each[0], hj.heat_trace(hj.eigenpairs(field, 5), [1.0, 2.0]), rtol=1e-10)
@@ -227,7 +346,7 @@ def test_everything_runs_under_jit(field):
             hj.hks(pairs, times), hj.wks(pairs), hj.scale_invariant_hks(pairs), hj.heat_trace(pairs, times),
             hj.heat_kernel(pairs, times, (4, 4)), hj.diffusion_distance(pairs, times, (4, 4)),
             hj.biharmonic_distance(pairs, (4, 4)), hj.default_times(pairs), hj.truncation(pairs, times).tail,
-            hj.shape_dna(pairs), hj.global_point_signature(pairs),
+            hj.shape_dna(pairs), hj.global_point_signature(pairs), hj.truncation_map(pairs, times),
         )  # fmt: skip
 
     times = jnp.array([1.0, 2.0])
@@ -235,4 +354,4 @@ def test_everything_runs_under_jit(field):
     traced = everything(field, times)
     np.testing.assert_allclose(traced[0], hj.hks(pairs, times), rtol=1e-10)
     np.testing.assert_allclose(traced[6], hj.biharmonic_distance(pairs, (4, 4)), rtol=1e-8, atol=1e-7)
-    assert [np.isfinite(leaf).any() for leaf in traced] == [True] * 11
+    assert [np.isfinite(leaf).any() for leaf in traced] == [True] * 12

@@ -1,13 +1,14 @@
 """Signatures without eigenpairs against all eigenpairs, their bounds, derivatives, and the choice between methods."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from annotations import unchecked
 from differences import directional
 from fields import flat, random_spd
 from scipy.special import ive
@@ -15,8 +16,9 @@ from scipy.special import ive
 import hks_jax as hj
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.fem.space import GridSpace
-from hks_jax.spectrum_free.chebyshev import heat_coefficients
-from hks_jax.spectrum_free.colours import coefficient_sizes
+from hks_jax.linear.dissection import dissect
+from hks_jax.linear.heat_series import coefficient_sizes, heat_coefficients
+from hks_jax.spectrum_free.choice import choose_method, work
 from hks_jax.spectrum_free.poles import exponential_poles
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
 
@@ -50,10 +52,10 @@ def flat_scale(times, d):
 @pytest.mark.parametrize(
     ("shape", "boundary", "mass", "times"),
     [
-        ((26, 23), "neumann", "lumped", [0.005, 0.01]),
-        ((26, 23), MIXED, "consistent", [0.005, 0.01]),
+        pytest.param((26, 23), "neumann", "lumped", [0.005, 0.01], marks=pytest.mark.slow),
+        pytest.param((26, 23), MIXED, "consistent", [0.005, 0.01], marks=pytest.mark.slow),
         ((14, 12), "mirror", "lumped", [0.01]),
-        ((6, 7, 5), "neumann", "consistent", [0.005]),
+        pytest.param((6, 7, 5), "neumann", "consistent", [0.005], marks=pytest.mark.slow),
         ((9, 10, 8), ("periodic", "dirichlet", "neumann"), "lumped", [0.005, 0.02]),
     ],
     ids=str,
@@ -68,6 +70,53 @@ def test_colouring_keeps_its_bound(shape, boundary, mass, times):
     error = np.nanmax(np.abs(values - expected) / flat_scale(times, len(shape)), axis=tuple(range(1, len(shape) + 1)))
     assert (error <= np.array(settings.error) + 1e-12).all()
     assert max(settings.error) <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("mass", "sigma", "seed"),
+    [
+        ("lumped", 2.5, 1),
+        ("consistent", 6.0, 2),
+        pytest.param("lumped", 6.0, 2, marks=pytest.mark.slow),
+        pytest.param("consistent", 2.5, 1, marks=pytest.mark.slow),
+    ],
+)
+def test_the_bound_holds_on_rough_fields_and_in_single_precision(mass, sigma, seed):
+    """Log-determinants that jump by σ from node to node, against all pairs."""
+    shape = (16, 14)
+    rng = np.random.default_rng(seed)
+    tensors = np.exp(sigma / 2 * rng.standard_normal(shape))[..., None, None] * random_spd(rng, shape, 0.4)
+    field = hj.TensorField(hj.Grid(shape, 0.1), tensors)
+    pencil, times = hj.assemble(field, "neumann", mass), [1e-5, 1e-4, 0.002]
+    exact = by_all_pairs(pencil, times)
+    scale = np.minimum(flat_scale(times, 2), 1 / float(jnp.max(jnp.sum(pencil.mass.to_dense(), axis=1))))
+    for dtype, tolerance in ((jnp.float64, 1e-2), (jnp.float64, 1e-6), (jnp.float32, 0.05)):
+        some = hj.assemble(hj.TensorField(field.grid, jnp.asarray(tensors, dtype)), "neumann", mass)
+        settings = hj.colouring(some, times, tolerance=tolerance)
+        error = np.abs(np.asarray(hj.hks_spectrum_free(some, times, method=settings)) - exact) / scale
+        # 1e-10: a dense eigendecomposition has its own rounding, relative to values 10⁴ times the scale.
+        assert (error.max(axis=(1, 2)) <= np.array(settings.error) + 1e-10).all()
+        assert max(settings.error) <= tolerance
+
+
+def test_tolerances_below_rounding_are_refused():
+    field = random_field((16, 15))
+    single = hj.TensorField(field.grid, jnp.asarray(field.tensors, jnp.float32))
+    for mass in ("lumped", "consistent"):
+        with pytest.raises(
+            ValueError, match=r"tolerance: got 1e-07; in float32 rounding .* Use a tolerance from"
+        ) as told:
+            hj.colouring(single, [0.005], mass=mass, tolerance=1e-7)
+        least = float(str(told.value).split("tolerance from ")[1].split(",")[0])
+        settings = hj.colouring(single, [0.005], mass=mass, tolerance=1.01 * least)
+        pencil = hj.assemble(field, "neumann", mass)
+        error = np.abs(
+            np.asarray(hj.hks_spectrum_free(single, [0.005], mass=mass, method=settings))
+            - by_all_pairs(pencil, [0.005])
+        )
+        assert 0.01 * least < error.max() / flat_scale([0.005], 2).max() <= settings.error[0] <= 1.01 * least
+    # The other method has no such tolerance.
+    assert np.isfinite(hj.hks_spectrum_free(single, [0.005], tolerance=1e-7)).all()
 
 
 def test_few_vectors_serve_a_large_grid_and_the_bound_is_not_absurd():
@@ -89,10 +138,11 @@ def test_few_vectors_serve_a_large_grid_and_the_bound_is_not_absurd():
     ("shape", "boundary", "mass"),
     [
         ((13, 12), "neumann", "consistent"),
-        ((9, 8), ("periodic", "periodic"), "consistent"),
+        pytest.param((9, 8), ("periodic", "periodic"), "consistent", marks=pytest.mark.slow),
         ((8, 9), ("periodic", "periodic"), "lumped"),
         ((8, 11), ("periodic", ("dirichlet", "neumann")), "consistent"),
         ((8, 7), "mirror", "lumped"),
+        ((6, 5, 7), ("neumann", "periodic", ("dirichlet", "neumann")), "consistent"),
     ],
     ids=str,
 )
@@ -118,7 +168,12 @@ def derivatives_by_all_pairs(mass):
 
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 @pytest.mark.parametrize(
-    ("method", "mass"), [("colouring", "lumped"), ("colouring", "consistent"), ("selected-inversion", "consistent")]
+    ("method", "mass"),
+    [
+        ("colouring", "lumped"),
+        pytest.param("colouring", "consistent", marks=pytest.mark.slow),
+        ("selected-inversion", "consistent"),
+    ],
 )
 def test_derivatives(method, mass):
     field, times, probe, of_tensors, of_times = derivatives_by_all_pairs(mass)
@@ -218,7 +273,7 @@ def test_coefficients_and_poles():
 
 def test_sources_of_a_colour_are_apart_also_around_a_periodic_axis():
     space = GridSpace(hj.Grid((23, 17)), normalise_boundary(("periodic", "neumann"), 2))
-    colours = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0,)).colours(space).value
+    colours = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0, 0.0), (0.0,)).colours(space).value
     assert set(np.unique(colours)) == set(range(colours.max() + 1))
     for colour in range(colours.max() + 1):
         i, j = np.nonzero(colours == colour)
@@ -249,6 +304,34 @@ def test_auto_takes_each_time_from_the_method_that_reaches_it():
         hj.hks(pairs, times, "heat-trace", method="spectrum-free")
 
 
+@pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
+@pytest.mark.slow
+def test_auto_on_a_mesh_and_in_a_volume():
+    for domain, k in ((hj.examples.bumpy_torus_mesh(12), 30), (random_field((6, 7, 8)), 40)):
+        pairs = hj.eigenpairs(domain, k, solver="dense")
+        times = jnp.array([0.2, 20.0]) / float(pairs.next_eigenvalue)
+        found = hj.hks_auto(pairs, times)
+        np.testing.assert_array_equal(found.spectral, [False, True])
+        np.testing.assert_allclose(found.values, by_all_pairs(pairs.pencil, times), rtol=1e-4)
+        assert found.method == "selected-inversion"
+        assert float(found.overlap_difference) < 1e-4
+
+
+def test_a_volume_too_large_for_selected_inversion_is_left_to_colouring(monkeypatch):
+    """Decided by the number of nodes alone: to dissect them would take long."""
+    pencil, times = hj.assemble(flat((9, 10, 11), (1.0, 1.0, 1.0)), mass="lumped"), jnp.array([0.01])
+    assert np.isfinite(work(None, pencil, times))
+    monkeypatch.setattr("hks_jax.spectrum_free.choice._MEMORY", 1e6)
+    dissected = dissect.cache_info().misses
+    assert work(None, pencil, times) == np.inf
+    assert choose_method(pencil, times, "auto", 1e-3).degree > 1
+    assert dissect.cache_info().misses == dissected
+    with pytest.raises(ValueError, match="traced"):
+        jax.jit(lambda t: hj.hks_spectrum_free(pencil, t))(times)
+    with pytest.raises(ValueError, match=r"a mesh of 1600 free vertices, .* more than 0\.001 GB\. Use eigenpairs"):
+        hj.hks_spectrum_free(hj.examples.bumpy_torus_mesh(40), times)
+
+
 def test_errors_say_what_to_do():
     field = flat((70, 70), (1.0, 1.0))
     with pytest.raises(ValueError, match=r"eigenpairs, smaller times"):
@@ -257,11 +340,13 @@ def test_errors_say_what_to_do():
         hj.hks_spectrum_free(field, [0.0])
     with pytest.raises(ValueError, match="tolerance: got 2"):
         hj.hks_spectrum_free(field, [0.1], method="colouring", tolerance=2)
-    with pytest.raises(ValueError, match="method: got 'magic'"):
+    with unchecked(), pytest.raises(ValueError, match="method: got 'magic'"):
         hj.hks_spectrum_free(field, [0.1], method="magic")
-    with pytest.raises(ValueError, match="for 2D grids"):
-        hj.hks_spectrum_free(flat((5, 5, 5), (1.0, 1.0, 1.0)), [0.1], method="selected-inversion")
-    with pytest.raises(TypeError, match="SurfaceMesh"):
-        hj.hks_spectrum_free(hj.examples.bumpy_torus_mesh(8), [0.1])
-    with pytest.raises(ValueError, match="method: got 'none'"):
+    mesh = hj.examples.bumpy_torus_mesh(8)
+    for call in (hj.colouring, partial(hj.hks_spectrum_free, method="colouring")):
+        with unchecked(), pytest.raises(TypeError, match=r"colouring is for grids\. .*selected-inversion"):
+            call(mesh, [0.1])
+    with unchecked(), pytest.raises(TypeError, match="domain: got int"):
+        hj.hks_spectrum_free(3, [0.1])
+    with unchecked(), pytest.raises(ValueError, match="method: got 'none'"):
         hj.hks(hj.eigenpairs(flat((5, 6), (1.0, 1.0)), 20), [0.1], method="none")

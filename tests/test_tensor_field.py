@@ -1,7 +1,10 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from annotations import unchecked
 from fields import random_spd
 
 import hks_jax as hj
@@ -92,7 +95,7 @@ def test_bad_tensors_are_counted_and_located(rng, value, message):
 def test_wrong_shapes_and_types_are_named(rng):
     with pytest.raises(ValueError, match=r"tensors: got shape \(5, 4, 2, 2\); expected .* = \(4, 5, 2, 2\)"):
         hj.TensorField(hj.Grid((4, 5)), random_spd(rng, (5, 4)))
-    with pytest.raises(TypeError, match=r"grid: got tuple; expected hks_jax\.Grid"):
+    with unchecked(), pytest.raises(TypeError, match=r"grid: got tuple; expected hks_jax\.Grid"):
         hj.TensorField((4, 5), random_spd(rng, (4, 5)))
     with pytest.raises(ValueError, match="fn: 12 of 12 tensors are not positive definite"):
         hj.TensorField.from_function(lambda x: -jnp.eye(2), hj.Grid((3, 4)))
@@ -121,3 +124,30 @@ def test_a_function_singular_outside_the_mask_spoils_no_gradient():
 
 def test_integer_tensors_become_floating(rng):
     assert hj.TensorField(hj.Grid((2, 2)), np.broadcast_to(np.eye(2, dtype=int), (2, 2, 2, 2))).tensors.dtype == float
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_traced_tensors_that_are_not_positive_definite_give_nan(d):
+    """Among them −I, whose determinant is positive in the plane, and whose adjugate is I in space."""
+    mask = np.ones((9,) * d, dtype=bool)
+    mask[0] = False
+    grid, node = hj.Grid(mask.shape, 0.3, mask=mask), (4,) * d
+    identity = jnp.broadcast_to(jnp.eye(d), (*grid.shape, d, d))
+    bad = [-np.eye(d), np.diag([1.0] * (d - 1) + [-0.01]), np.diag([0.0] + [1.0] * (d - 1)), np.ones((d, d))]
+    bad = jnp.stack([identity, *(identity.at[node].set(t) for t in bad), identity.at[(0,) * d].set(-jnp.eye(d))])
+
+    @jax.jit
+    @jax.vmap
+    @partial(jax.value_and_grad, has_aux=True)
+    def traced(tensors):
+        field = hj.TensorField(grid, tensors)
+        pencil = hj.assemble(field)
+        inverse = hj.assemble(hj.TensorField.from_diffusion(grid, tensors, "adjugate")).volume
+        curvature = hj.gaussian_curvature(field) if d == 2 else hj.scalar_curvature(field)
+        return pencil.volume + pencil.stiffness.coefficients.sum(), (inverse, curvature[node])
+
+    (values, others), gradients = traced(bad)
+    good = np.array([True, False, False, False, False, True])
+    for found in (values, *others, *jnp.moveaxis(gradients[(slice(None), *node)].reshape(6, -1), 1, 0)):
+        np.testing.assert_array_equal(np.isfinite(found), good)
+    np.testing.assert_allclose(gradients[0], gradients[-1], atol=1e-15)

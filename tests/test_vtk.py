@@ -131,10 +131,10 @@ def test_damaged_files(tmp_path, tensors):
     for name, binary in (("a.vti", False), ("b.vti", True), ("a.vtk", False), ("b.vtk", True)):
         path = write(tmp_path / name, data, binary)
         path.write_bytes(path.read_bytes()[:-500])
-        with pytest.raises(ValueError, match="incomplete"):
+        with pytest.raises(ValueError, match=r"not readable VTK image data|incomplete; it ends"):
             read_tensors(path)
         path.write_bytes(b"not what the name says")
-        with pytest.raises(ValueError, match="not readable as VTK image data"):
+        with pytest.raises(ValueError, match="not readable VTK image data"):
             read_tensors(path)
     writer = vtkPolyDataWriter()
     from vtkmodules.vtkCommonDataModel import vtkPolyData
@@ -217,3 +217,80 @@ def test_results_with_their_times(tmp_path, volume):
     assert (record["k"], record["software"]) == (7, f"hks-jax {hj.__version__}")
     with pytest.raises(ValueError, match=r"written as \.vti"):
         save(tmp_path / "v.vtk", values, volume)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b'"0 3 0 4 0 5"', b'"0 3999 0 4999 0 99999"', "array 'tensors' takes"),  # VTK would abort for want of memory
+        (b'WholeExtent="0 3', b'WholeExtent="0 99999999', "expected the whole extent"),
+        (b'WholeExtent="0 3', b'WholeExtent="-1 3', "expected the whole extent"),
+        (b"Direction", b"Direktion", "ImageData has Direktion"),
+        (b'Direction="', b'Direction="7', "expected columns of length one"),
+        (b'NumberOfTuples="1"', b'NumberOfTuples="99999999999"', "array 'provenance' takes 99999999999"),
+        (b'NumberOfComponents="9"', b'NumberOfComponents="6"', "array 'tensors' takes"),
+        (b'type="Float64"', b'type="Float32"', "array 'tensors' takes"),
+        (b'"vtkZLibDataCompressor"', b'"vtkNoDataCompressor"', "compressor"),
+        (b"_AQAAAACAAAB", b"_////////AAB", "the data of an array end early"),
+    ],
+)
+def test_a_vti_that_declares_what_it_does_not_hold(tmp_path, tensors, old, new, message):
+    path = save_tensors(tmp_path / "t.vti", TensorVolume(tensors, tuple(SPACING), (0.0,) * 3))
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new))
+    with pytest.raises(ValueError, match=rf"t\.vti: not readable VTK image data.*{message}"):
+        read_tensors(path)
+
+
+def test_flipped_bits_in_compressed_vti_change_nothing_silently(tmp_path, tensors):
+    rng = np.random.default_rng(5)
+    path = save_tensors(tmp_path / "t.vti", TensorVolume(tensors, tuple(SPACING), (0.0,) * 3))
+    whole = path.read_bytes()
+    start, stop = whole.index(b"<AppendedData"), whole.index(b"</AppendedData>")
+    before, refused = read_tensors(path), 0
+    for place in rng.integers(start, stop, 80):
+        content = bytearray(whole)
+        content[place] ^= 1 << rng.integers(8)
+        path.write_bytes(content)
+        try:
+            np.testing.assert_array_equal(read_tensors(path).tensors, before.tensors)
+        except ValueError:
+            refused += 1
+    assert refused > 70
+
+
+def legacy_surface(path, version, binary):
+    from vtkmodules.vtkFiltersSources import vtkSphereSource
+
+    sphere = vtkSphereSource()
+    sphere.Update()
+    writer = vtkPolyDataWriter()
+    writer.SetFileVersion(version)
+    writer.SetFileTypeToBinary() if binary else writer.SetFileTypeToASCII()
+    writer.SetFileName(str(path))
+    writer.SetInputData(sphere.GetOutput())
+    assert writer.Write()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("version", "binary", "old", "new"),
+    [
+        (51, True, b"POLYGONS 97", b"POLYGONS -1"),  # all of these VTK follows into memory that is not its own
+        (51, False, b"POLYGONS 97", b"POLYGONS 9999999999"),
+        (51, True, b"Version 5.1", b"Version(5.1"),
+        (51, False, b"0 3 6", b"0 99 6"),
+        (42, True, b"\x00\x00\x00\x03", b"\x00\x00\x70\x03"),
+        (42, False, b"\n3 2 8", b"\n9 2 8"),
+        (51, False, b"\n2 8 0", b"\n2 8888 0"),
+    ],
+)
+def test_polygons_that_lead_astray(tmp_path, version, binary, old, new):
+    path = tmp_path / "s.vtk"
+    content = legacy_surface(path, version, binary)
+    assert len(hj.io.read_mesh(path).faces) == 96
+    assert old in content
+    path.write_bytes(content.replace(old, new, 1))
+    with pytest.raises(ValueError, match=r"s\.vtk: not readable polygonal data"):
+        hj.io.read_mesh(path)

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.arguments import parse_boundary
-from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.inputs import add_interpolation_argument, add_json_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, read_tensors, save, save_tensors
 from hks_jax.io.masks import as_mask
-from hks_jax.io.npz import load_npz
 from hks_jax.io.provenance import digest
+from hks_jax.npz import load_npz
 
 if TYPE_CHECKING:
     from hks_jax.domain.grid import Grid
@@ -77,6 +77,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "must be chosen but for NumPy's files, which hold the metric itself unless you choose",
     )
     add("--order", choices=tuple(ORDERS), help="order of the components of --init, where the file does not declare it")
+    add_interpolation_argument(parser)
     add(
         "--parametrisation",
         choices=PARAMETRISATIONS,
@@ -91,7 +92,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         metavar="B",
         help="the target's, written as for 'hks-jax hks' (default neumann)",
     )
-    add("-k", type=int, help="number of eigenpairs (default: as many as the smallest time needs)")
+    add(
+        "-k",
+        type=int,
+        help="number of eigenpairs (default: so many that 1e-6 of the heat trace at the smallest time is left out)",
+    )
     add(
         "--noise",
         type=float,
@@ -234,7 +239,7 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
     from hks_jax.domain.tensor_field import TensorField
 
     if args.init is None:
-        return TensorField(grid, target.volume.tensors.astype(args.dtype))
+        return TensorField(grid, target.volume.tensors.astype(args.dtype), args.interpolation)
     volume = read_tensors(args.init, args.order)
     if volume.dimension > grid.dimension:
         raise ValueError(
@@ -253,7 +258,10 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
             f"--init: got a mask without {int((grid.inside & ~volume.mask).sum())} of the target's "
             f"{int(grid.inside.sum())} nodes; expected tensors at all of them. Cut the target's mask to it"
         )
-    return TensorField.from_diffusion(grid, volume.tensors.astype(args.dtype), args.metric or "tensor", name="--init")
+    tensors = volume.tensors.astype(args.dtype)
+    return TensorField.from_diffusion(
+        grid, tensors, args.metric or "tensor", interpolation=args.interpolation, name="--init"
+    )
 
 
 def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress: Progress) -> list[Path]:
@@ -283,9 +291,11 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
 
 def _report(args: argparse.Namespace, fit: "MetricFit", target: Target) -> dict[str, Any]:
     from hks_jax.inverse.metric_fit import RESULTS
+    from hks_jax.inverse.truncated import truncation_misfit
 
-    chosen = ("init", "metric", "boundary", "noise", "smoothness", "h1", "tv", "max_steps", "continuation", "starts")
-    settings = {name: getattr(args, name) for name in (*chosen, "seed", "optimiser", "checkpoint", "dtype")}
+    chosen = ("init", "metric", "interpolation", "boundary", "noise", "smoothness", "h1", "tv", "max_steps")
+    more = ("continuation", "starts", "seed", "optimiser", "checkpoint", "dtype")
+    settings = {name: getattr(args, name) for name in (*chosen, *more)}
     return {
         "target": {
             "source": target.volume.source,
@@ -301,6 +311,7 @@ def _report(args: argparse.Namespace, fit: "MetricFit", target: Target) -> dict[
         "steps": fit.steps,
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
+        "truncation_misfit": float(truncation_misfit(fit.problem, fit.values)),
         "parametrisation": args.parametrisation,
         "settings": {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()},
     }

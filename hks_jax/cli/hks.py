@@ -2,6 +2,9 @@
 
 import argparse
 import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,7 @@ from hks_jax.cli.inputs import (
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume
+from hks_jax.io.mesh import is_mesh
 
 DESCRIPTION = """\
 Compute the heat kernel signature of a field of diffusion tensors. FILE holds tensors: NIfTI, NRRD, VTK image data, npz
@@ -25,13 +29,18 @@ images, with --bval and --bvec.
 
 A volume is computed whole, in three dimensions, unless --slice cuts it.
 
-Writes to the folder OUT: hks.npz, hks.nii.gz (or .nrrd, .vti, as FILE is; times along the fourth axis), hks.png (of a
-volume, three orthogonal slices for each time) and report.json.
+FILE may also be a mesh of triangles or tetrahedra (see hks-jax info), with the metric of space, or with that of the
+tensors at its vertices that --array names.
+
+Writes to the folder OUT: hks.npz, hks.nii.gz (or .nrrd, .vti, as FILE is; times along the fourth axis; of a mesh .vtu,
+.vtk, .msh or .ply), hks.png (of a volume, three orthogonal slices for each time; of a mesh, its surface) and
+report.json.
 """
 
 EPILOG = """\
 examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 100 --times auto:8
+  hks-jax hks heart.vtu -o out --array D --metric inverse -k 50
   hks-jax hks dwi.nii.gz --bval dwi.bval --bvec dwi.bvec -o out --slice z=10 --metric inverse --components largest
 """
 
@@ -80,38 +89,47 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     times = parse_times(args.times)
-    require_metric(args)
-    from hks_jax.cli.job import Settings, compute
+    on_mesh = is_mesh(args.file)
+    if not on_mesh:
+        require_metric(args)
+    from hks_jax.cli import mesh as meshes
+    from hks_jax.cli.job import Settings, compute, compute_on_mesh
     from hks_jax.cli.outputs import check_folder, show_files, write_outputs
     from hks_jax.cli.picture import draw, draw_volume
 
+    if on_mesh:
+        meshes.check_options(args)
     check_folder(args.output)
+    settings = Settings(
+        metric=args.metric if on_mesh else args.metric or "tensor",
+        interpolation=args.interpolation,
+        k=args.k,
+        boundary=args.boundary,
+        times=times,
+        components=args.components,
+        solver=args.solver,
+        normalisation=args.normalisation,
+        method=args.method,
+        dtype=args.dtype,
+    )
     progress = Progress(args.quiet)
     with progress.catching_warnings():
-        with progress.stage("reading", str(args.file)):
-            volume = read_volume(args, progress)
-            if args.through is not None:
-                _check_voxel(args.through, volume)
-        settings = Settings(
-            metric=args.metric or "tensor",
-            k=args.k,
-            boundary=args.boundary,
-            times=times,
-            components=args.components,
-            solver=args.solver,
-            normalisation=args.normalisation,
-            method=args.method,
-            dtype=args.dtype,
-        )
-        result = compute(volume, settings, progress)
-        files = write_outputs(
-            args.output,
-            result,
-            progress,
-            draw=lambda path: draw(result, path) if volume.dimension == 2 else draw_volume(result, path, args.through),
-            image=image_suffix(args.file),
-            command=sys.argv,
-        )
+        draw_to: Callable[[Path], None]
+        if on_mesh:
+            with progress.stage("reading", str(args.file)):
+                mesh = meshes.read_domain(args)
+            result = compute_on_mesh(mesh, meshes.describe_mesh(args.file, mesh), settings, progress)
+            image, draw_to = meshes.mesh_suffix(args.file, mesh), partial(meshes.draw, result)
+        else:
+            with progress.stage("reading", str(args.file)):
+                volume = read_volume(args, progress)
+                if args.through is not None:
+                    _check_voxel(args.through, volume)
+            result = compute(volume, settings, progress)
+            image = image_suffix(args.file)
+            flat = volume.dimension == 2
+            draw_to = partial(draw, result) if flat else partial(draw_volume, result, through=args.through)
+        files = write_outputs(args.output, result, progress, draw=draw_to, image=image, command=sys.argv)
     show_files(files, args.quiet, args.json)
 
 

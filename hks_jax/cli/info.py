@@ -2,6 +2,8 @@
 
 import argparse
 import json
+import math
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +13,18 @@ from jaxtyping import Float
 from hks_jax.cli.arguments import DEFAULT_K, RESOLVED
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
+from hks_jax.domain.simplices import WORDS, signed_measure
+from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
+from hks_jax.io.mesh import is_mesh
 from hks_jax.io.provenance import digest
 from hks_jax.io.repair import find_unsymmetric
-from hks_jax.io.vtk_image import holds_dataset
 
 DESCRIPTION = f"""\
 Say what is in a file of tensors: shape, order of components and how it was determined, frame, mask and its pieces,
-eigenvalues, tensors that are not positive definite, and the k and t that would suit. Of a mesh
-({", ".join(MESHES)}): size, boundary, pieces, and the same.
+eigenvalues, tensors that are not positive definite, and the k and t that would suit. Of a mesh of triangles or
+tetrahedra ({", ".join(MESHES)}, or a surface of FreeSurfer's): size, boundary, pieces, and the same.
 """
 
 EPILOG = """\
@@ -51,7 +55,7 @@ def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     progress = Progress(quiet=True)
     with progress.catching_warnings():
-        found = describe_mesh(args.file) if _is_mesh(args.file) else describe(args.file, read(args, progress))
+        found = describe_mesh(args.file) if is_mesh(args.file) else describe(args.file, read(args, progress))
     if args.json:
         print(json.dumps(found, indent=2, ensure_ascii=False))
     else:
@@ -100,22 +104,23 @@ def describe(path: Path, volume: TensorVolume) -> dict[str, Any]:
 def describe_mesh(path: Path) -> dict[str, Any]:
     """Return what there is to say of a mesh."""
     mesh = read_mesh(path)
-    vertices, faces = np.asarray(mesh.vertices, np.float64), mesh.faces
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    edges = np.linalg.norm(np.concatenate([b - a, c - b, a - c]), axis=1)
+    vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
+    words = WORDS[d]
+    measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
+    sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
+    edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     return {
         "file": str(path),
         "sha256": digest(path),
         "format": path.suffix,
         "vertices": len(vertices),
-        "triangles": len(faces),
+        words.simplices: len(cells),
         "boundary_vertices": int(mesh.triangulation.boundary_vertices.sum()),
         "components": mesh.triangulation.labels[1],
-        "area": area,
-        "median_edge": float(np.median(edges)),
-        "suits": {"surface": _times(2, area, float(np.median(edges)) ** 2, size, len(vertices))},
+        words.measure: measure,
+        "median_edge": edge,
+        "suits": {{2: "surface", 3: "solid"}[d]: _times(d, measure, edge**2, size, len(vertices))},
     }
 
 
@@ -132,21 +137,15 @@ def _suits(
 
 def _times(d: int, volume: float, width2: float, size: float, nodes: int) -> dict[str, float]:
     """Return the least time that the spacing allows, what k it takes, what the default k allows, and the largest."""
-    weyl = volume / (4 * np.pi if d == 2 else 6 * np.pi**2)  # N(λ) = weyl · λ^(d/2)
     least = COARSE * width2
     k = max(1, min(DEFAULT_K[d], nodes // 4))
     return {
         "least_time": least,
-        "k_for_least_time": int(np.ceil(weyl * (RESOLVED[d] / least) ** (d / 2))),
+        "k_for_least_time": math.ceil(weyl_number(RESOLVED[d] / least, volume, d)),
         "k": k,
-        "least_time_of_k": RESOLVED[d] * (weyl / k) ** (2 / d),
+        "least_time_of_k": RESOLVED[d] / weyl(k, volume, d),
         "largest_time": 4 * np.log(10) * (size / np.pi) ** 2,  # 4 ln 10 / λ₁ of an interval of this length
     }
-
-
-def _is_mesh(path: Path) -> bool:
-    suffix = path.suffix.lower()
-    return suffix in MESHES and (suffix != ".vtk" or (path.is_file() and not holds_dataset(path, "STRUCTURED_POINTS")))
 
 
 def _lines(found: dict[str, Any]) -> list[str]:
@@ -156,12 +155,13 @@ def _lines(found: dict[str, Any]) -> list[str]:
         return " × ".join(f"{v:.5g}" for v in values)
 
     lines = [f"{found['file']}: {found['format']}, SHA-256 {found['sha256'][:16]}…"]
-    if "triangles" in found:
+    words = next((words for words in WORDS.values() if words.simplices in found), None)
+    if words is not None:
         lines += [
-            f"mesh            {found['vertices']} vertices, {found['triangles']} triangles",
+            f"mesh            {found['vertices']} vertices, {found[words.simplices]} {words.simplices}",
             f"boundary        {found['boundary_vertices']} vertices",
             f"components      {found['components']}",
-            f"area            {found['area']:.5g}",
+            f"{words.measure:<16}{found[words.measure]:.5g}",
             f"median edge     {found['median_edge']:.5g}",
         ]
     else:

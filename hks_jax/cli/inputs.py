@@ -32,8 +32,20 @@ def add_tensor_arguments(parser: argparse.ArgumentParser) -> None:
     add("--dtype", choices=("float32", "float64"), default="float64", help="precision (default float64)")
 
 
+def add_interpolation_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that says what lies between the nodes."""
+    parser.add_argument(
+        "--interpolation",
+        choices=("linear", "log-euclidean"),
+        default="linear",
+        help="of the metric between the nodes: its components (default), or those of its logarithm, which keeps the "
+        "volume where tensors turn",
+    )
+
+
 def add_eigenpair_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say which eigenpairs are computed."""
+    add_interpolation_argument(parser)
     add = parser.add_argument
     add(
         "--boundary",

@@ -1,4 +1,4 @@
-"""The main job: from a tensor volume to its heat kernel signature, and what is known about it."""
+"""The main job: from a tensor volume or a mesh to its heat kernel signature, and what is known about it."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -11,11 +11,13 @@ import numpy as np
 from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, Times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.tensor_field import MetricChoice, TensorField
-from hks_jax.eigen.block_lanczos import BlockLanczos
-from hks_jax.eigen.chebyshev_filter import ChebyshevFilter
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.shift_invert import ShiftInvert
+from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
+from hks_jax.eigen.host.shift_invert import ShiftInvert
+from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.solve import choose_solver, eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
@@ -23,6 +25,7 @@ from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.heat import Normalisation
+from hks_jax.signatures.tail import truncation_map
 from hks_jax.signatures.times import default_times
 from hks_jax.signatures.truncation import truncation
 from hks_jax.spectrum_free.auto import HKSMethod, hks, hks_auto
@@ -34,9 +37,10 @@ class ComputationError(RuntimeError):
 
 @dataclass(frozen=True)
 class Settings:
-    """What to compute; see ``hks-jax hks --help``."""
+    """What to compute; see ``hks-jax hks --help``. Only on meshes, which have one of their own, is there no metric."""
 
-    metric: MetricChoice
+    metric: MetricChoice | None
+    interpolation: Interpolation = "linear"
     k: int | None = None
     boundary: BoundarySpec = "neumann"
     times: Times = DEFAULT_TIMES
@@ -49,9 +53,9 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The signature on the volume whose mask is the domain, and what the report says of it."""
+    """The signature on the volume whose mask is the domain, or on a mesh, and what the report says of it."""
 
-    volume: TensorVolume
+    volume: TensorVolume | SimplicialMesh
     times: np.ndarray
     values: np.ndarray
     eigenvalues: np.ndarray
@@ -74,27 +78,49 @@ def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Res
         ComputationError: eigenpairs that did not converge.
     """
     field, pairs = compute_pairs(volume, settings, progress)
+    mask = field.grid.mask
+    return _result(volume.with_mask(mask), describe_input(volume, mask), pairs, settings, progress)
+
+
+def compute_on_mesh(mesh: SimplicialMesh, described: dict[str, Any], settings: Settings, progress: Progress) -> Result:
+    """Compute the signature on a mesh, whose metric it has already; `described` is what the report says of it.
+
+    Raises:
+        ValueError: settings that cannot be computed with.
+        ComputationError: eigenpairs that did not converge.
+    """
+    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
+        pencil = assemble(mesh, settings.boundary)
+    pairs = _solve(pencil, settings, progress)
+    return _result(mesh, described, pairs, settings, progress)
+
+
+def _result(
+    place: TensorVolume | SimplicialMesh,
+    described: dict[str, Any],
+    pairs: Eigenpairs,
+    settings: Settings,
+    progress: Progress,
+) -> Result:
+    """Return the signature, and its report."""
     with progress.stage("signature"):
         times = settings.times.explicit or tuple(default_times(pairs, settings.times.automatic).tolist())
         values, origin = _signature(pairs, times, settings)
-    mask = field.grid.mask
-    return Result(
-        volume.with_mask(mask),
-        np.asarray(times),
-        values,
-        np.asarray(pairs.eigenvalues),
-        _report(volume, mask, settings, pairs, times) | origin,
-    )
+    report = {"input": described, **_report(settings, pairs, times), **origin}
+    return Result(place, np.asarray(times), values, np.asarray(pairs.eigenvalues), report)
 
 
-def field_of(volume: TensorVolume, grid: Grid, metric: MetricChoice, dtype: str) -> TensorField:
+def field_of(
+    volume: TensorVolume, grid: Grid, metric: MetricChoice, dtype: str, interpolation: Interpolation = "linear"
+) -> TensorField:
     """Return the metric of a volume or slice on its grid, in the precision asked for.
 
     Raises:
         ValueError: tensors that make no metric.
     """
     use_dtype(dtype)
-    return TensorField.from_diffusion(grid, volume.tensors.astype(dtype), metric, name="tensors")
+    tensors = volume.tensors.astype(dtype)
+    return TensorField.from_diffusion(grid, tensors, metric, interpolation=interpolation, name="tensors")
 
 
 def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) -> tuple[TensorField, Eigenpairs]:
@@ -105,20 +131,26 @@ def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) 
         ComputationError: eigenpairs that did not converge.
     """
     grid = volume.grid(settings.components)
+    assert settings.metric is not None
     with progress.stage("assembly", f"{int(grid.inside.sum())} of {grid.size} nodes"):
         for message in unreached_sides(grid.inside, settings.boundary):
             progress.warn(message)
-        field = field_of(volume, grid, settings.metric, settings.dtype)
+        field = field_of(volume, grid, settings.metric, settings.dtype, settings.interpolation)
         pencil = assemble(field, settings.boundary)
+    return field, _solve(pencil, settings, progress)
+
+
+def _solve(pencil: Pencil | MirrorPencil, settings: Settings, progress: Progress) -> Eigenpairs:
+    """Compute eigenpairs; raise ComputationError unless all of them converged."""
     unknowns = sum(part.space.n_dof for part in pencil.parts)
-    k = min(DEFAULT_K[volume.dimension], max(1, unknowns // 4)) if settings.k is None else settings.k
+    k = min(DEFAULT_K[pencil.space.dimension], max(1, unknowns // 4)) if settings.k is None else settings.k
     solver = _reporting(settings.solver, pencil, k, progress.update)
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
         pairs = eigenpairs(pencil, k, solver=solver)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])
-    return field, pairs
+    return pairs
 
 
 def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
@@ -159,21 +191,28 @@ def _reporting(solver: str, pencil: Pencil | MirrorPencil, k: int, callback: Cal
     return chosen
 
 
-def _report(
-    volume: TensorVolume, mask: np.ndarray | None, settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]
-) -> dict[str, Any]:
+def _report(settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]) -> dict[str, Any]:
     estimate = truncation(pairs, jnp.asarray(times))
+    by_node = np.asarray(truncation_map(pairs, jnp.asarray(times))).reshape(len(times), -1)
     chosen = replace(settings, times=Times(times, settings.times.automatic), k=pairs.k)
     return {
-        "input": describe_input(volume, mask),
         "settings": {**asdict(chosen), "times": "automatic" if settings.times.automatic else "explicit"},
         "eigenpairs": describe_pairs(pairs),
         "times": [
-            {"t": float(t), "truncation": float(tail), "resolution_bias": float(bias), "coarse_fraction": float(coarse)}
-            for t, tail, bias, coarse in zip(
+            {
+                "t": float(t),
+                "truncation": float(tail),
+                "truncation_worst_node": float(worst),
+                "resolution_bias": float(bias),
+                "lasting_bias": float(lasting),
+                "coarse_fraction": float(coarse),
+            }
+            for t, tail, worst, bias, lasting, coarse in zip(
                 times,
                 np.asarray(estimate.tail),
+                np.nanmax(by_node, axis=1),
                 np.asarray(estimate.resolution_bias),
+                np.asarray(estimate.lasting_bias),
                 np.asarray(estimate.coarse_fraction),
                 strict=True,
             )

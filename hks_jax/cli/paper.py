@@ -20,7 +20,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "paper",
         help="reproduce the paper's table and figures",
-        description="Reproduce Table 1 and Figures 1 to 6 of Zobel, Reininghaus and Hotz: a CSV and PNG pictures.",
+        description="Reproduce Table 1 and Figures 1 to 6 of Zobel, Reininghaus and Hotz, and count the triangles of a "
+        "remark: tables and PNG pictures.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

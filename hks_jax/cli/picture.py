@@ -45,14 +45,15 @@ def draw(
         first: a title and a scalar (*shape,), drawn before the signature in grey.
         title: of the whole picture.
     """
-    values, inside = result.values, np.isfinite(result.values[0])
+    values, inside, volume = result.values, np.isfinite(result.values[0]), result.volume
+    assert isinstance(volume, TensorVolume)
     if titles is None:
         # Fitted tensors are in mm²/s, and their grids in mm.
-        seconds = result.volume.order == "fit" and result.report["settings"]["metric"] == "inverse"
+        seconds = volume.order == "fit" and result.report["settings"]["metric"] == "inverse"
         titles = [f"$t$ = {number_text(t)}{' s' * seconds}" for t in result.times]
     if first is not None:
         titles, values = [first[0], *titles], np.concatenate([first[1][None], values])
-    grid, box = cropped(result.volume, inside)
+    grid, box = cropped(volume, inside)
     values, inside, spacing = values[:, *box], inside[box], grid.spacing
 
     rows = math.ceil(len(values) / 4)
@@ -85,9 +86,10 @@ def draw_volume(result: Result, path: Path, through: tuple[int, int, int] | None
         path: the picture's file.
         through: the voxel that the slices run through, or the nearest one in the domain; None: one in the middle.
     """
-    inside = np.isfinite(result.values[0])
+    inside, volume = np.isfinite(result.values[0]), result.volume
+    assert isinstance(volume, TensorVolume)
     node = middle_node(inside) if through is None else _nearest(inside, through)
-    grid, box = cropped(result.volume, inside)
+    grid, box = cropped(volume, inside)
     deep = away_from_rim(inside)
     volume_panels(
         result.values[:, *box],
@@ -95,7 +97,7 @@ def draw_volume(result: Result, path: Path, through: tuple[int, int, int] | None
         grid,
         node=[i - part.start for i, part in zip(node, box, strict=True)],
         limits=[tuple(np.quantile(values[deep], SPAN).tolist()) for values in result.values],
-        length_unit="mm" if result.volume.affine is not None else "",
+        length_unit="mm" if volume.affine is not None else "",
         label=LABELS[result.report["settings"]["normalisation"]],
         path=path,
     )

@@ -13,7 +13,7 @@ from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
 from hks_jax.cli.inputs import add_json_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
-from hks_jax.io.npz import load_npz
+from hks_jax.npz import load_npz
 
 DESCRIPTION = """\
 Draw a result that 'hks-jax hks', 'fit' or 'curvature' has written as npz: an image for each time, or with --points a
@@ -155,7 +155,7 @@ def read_saved(path: Path, name: str | None = None) -> Saved:
         if times.shape != values.shape[:1]:
             raise ValueError(f"{path}: got {found} of shape {values.shape} and times of shape {times.shape}")
     shape = values.shape[values.ndim - spacing.size :]
-    grid = Grid(shape, spacing.tolist(), arrays["origin"], arrays.get("mask"), "all")
+    grid = Grid(shape, spacing.tolist(), arrays["origin"].tolist(), arrays.get("mask"), "all")
     values = values.reshape(-1, *grid.shape).astype(np.float64)
     return Saved(values, times, grid, arrays.get("eigenvalues"))
 

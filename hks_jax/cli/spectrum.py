@@ -68,6 +68,7 @@ def run(args: argparse.Namespace) -> None:
             volume = read_volume(args, progress)
         settings = Settings(
             metric=args.metric or "tensor",
+            interpolation=args.interpolation,
             k=args.k,
             boundary=args.boundary,
             components=args.components,

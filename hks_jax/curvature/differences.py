@@ -85,7 +85,7 @@ def _choose(
     padded = np.pad(inside, width, mode="wrap") if wraps else np.pad(inside, width)
     n = inside.shape[axis]
 
-    def shifted(offset: int) -> np.ndarray:
+    def shifted(offset: np.integer) -> np.ndarray:
         return padded.take(np.arange(reach + offset, reach + offset + n), axis=axis)
 
     fits = [np.logical_and.reduce([shifted(offset) for offset in run]) for run in offsets]

@@ -82,10 +82,10 @@ def inner(inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[A
 
 
 def metric_function(field: TensorField) -> Callable[[Array], Array]:
-    """Return the field's function, symmetrised, in the precision of its argument."""
+    """Return the field's function, symmetrised, in the precision of its argument; NaN if not positive definite."""
     function = field.function
     assert function is not None
-    return lambda x: spd.symmetrise(jnp.asarray(function(x), x.dtype))
+    return lambda x: spd.positive_or_nan(spd.symmetrise(jnp.asarray(function(x), x.dtype)))
 
 
 def metric_jet(field: TensorField, wraps: tuple[bool, ...]) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:

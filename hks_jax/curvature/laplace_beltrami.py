@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.checks import real_array
 from hks_jax.curvature.jet import (
     Jet,
     at_nodes,
@@ -48,11 +49,9 @@ def laplace_beltrami(
     if callable(f):
         f = f if isinstance(f, jtu.Partial) else jtu.Partial(f)
     else:
-        f = jnp.asarray(f)
+        f = real_array("f", f)
         if f.shape != field.grid.shape:
             raise ValueError(f"f: got shape {f.shape}; expected the grid's shape {field.grid.shape}, or a function")
-        if not jnp.issubdtype(f.dtype, jnp.floating):
-            f = f.astype(jnp.result_type(float))
     return _laplace_beltrami(field, f, wraps_per_axis(periodic, field.grid.dimension))
 
 
@@ -68,7 +67,11 @@ def _scalar_jet(
 ) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
     inside = domain_nodes(field.grid, wraps)
     if callable(f):
-        return at_nodes(lambda x: function_jet(lambda y: jnp.asarray(f(y), y.dtype), x), field.grid, inside), inside
+
+        def number(x: Array) -> Array:
+            return real_array("f", f(x)).astype(x.dtype)
+
+        return at_nodes(lambda x: function_jet(number, x), field.grid, inside), inside
     return nodal_jet(jnp.where(inside, f, 0), field.grid, inside, wraps)
 
 

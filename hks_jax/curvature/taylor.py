@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-Series = Float[Array, " n_terms"]
+Series = Float[Array, " _n_terms"]
 
 
 def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> Float[Array, "*components n_terms"]:

@@ -4,17 +4,18 @@ The Chebyshev expansion of exp(−tD⁻¹K) needs one stencil product a degree, 
 nodes with each neighbour; all times come from the same products.
 """
 
-import math
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
-from scipy.special import ive
 
+from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.fem.halo import Slabs
+from hks_jax.linear.chebyshev import chebyshev_recurrence
+from hks_jax.linear.heat_series import heat_coefficients, least_degree
+from hks_jax.linear.spectral_bounds import gershgorin
 from hks_jax.traced import is_traced
 
 
@@ -47,19 +48,22 @@ def heat_columns(
     slabs.check("stiffness", stiffness, 1)
     slabs.check("lumped", lumped, 0)
     slabs.check("columns", columns, 0)
+    for name, given in (("columns", columns), ("times", times)):
+        require_real(name, given)
     times = jnp.asarray(times, columns.dtype)
     if times.ndim != 1:
         raise ValueError(f"times: got shape {times.shape}; expected (n_times,)")
-    if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance: got {tolerance}; expected between 0 and 1")
-    top = _gershgorin(stiffness, lumped)
+    require_number("tolerance", tolerance, 1)
+    if degree is not None:
+        require_count("degree", degree)
+    top = gershgorin(stiffness, _inverse(lumped))
     if degree is None:
         if is_traced((top, times)):
             raise ValueError("degree: not given, and the matrices or times are traced; expected a number")
         if times.size and not float(jnp.min(times)) >= 0:
             raise ValueError(f"times: got {times}; expected no negative ones")
-        degree = _degree(float(jnp.max(times, initial=0)) * float(top), tolerance)
-    return chebyshev_series(slabs, stiffness, lumped, columns, top, _heat_series(times, top, degree))
+        degree = least_degree(float(jnp.max(times, initial=0)) * float(top) / 2, tolerance)
+    return chebyshev_series(slabs, stiffness, lumped, columns, top, heat_coefficients(times, top, degree))
 
 
 @partial(jax.jit, static_argnames="slabs")
@@ -69,7 +73,7 @@ def chebyshev_series(
     lumped: Float[Array, "*padded"],
     columns: Float[Array, "*padded b"],
     top: Float[Array, ""],
-    series: Float[Array, "m degree+1"],
+    series: Float[Array, "m terms"],
 ) -> Float[Array, "m *padded b"]:
     """Return Σₙ seriesₘₙ Tₙ(2D⁻¹K/top − 1) columns, ``top`` a bound on the spectrum of D⁻¹K, degree at least 1.
 
@@ -77,20 +81,16 @@ def chebyshev_series(
     """
 
     def share(stiffness: Array, lumped: Array, x: Array, top: Array, series: Array) -> Array:
-        inverse = jnp.where(lumped > 0, 1 / jnp.where(lumped > 0, lumped, 1), 0)
-        matrix = (2 / top) * stiffness * inverse
+        matrix = (2 / top) * stiffness * _inverse(lumped)
 
-        def add(total: Array, row: Array, y: Array) -> Array:
-            return total + jnp.multiply.outer(row, y)
+        def product(y: Array) -> Array:
+            return slabs.local_product(matrix, y) - y
 
-        def step(state: tuple[Array, Array, Array], row: Array) -> tuple[tuple[Array, Array, Array], None]:
-            before, y, total = state
-            following = 2 * (slabs.local_product(matrix, y) - y) - before
-            return (y, following, add(total, row, following)), None
+        def add(n: Any, y: Array, total: Array) -> Array:
+            return total + jnp.multiply.outer(series[:, n], y)
 
-        first = slabs.local_product(matrix, x) - x
-        total = add(jnp.multiply.outer(series[:, 0], x), series[:, 1], first)
-        return jax.lax.scan(step, (x, first, total), series[:, 2:].T)[0][2]
+        start = jnp.multiply.outer(jnp.zeros_like(series[:, 0]), x)
+        return chebyshev_recurrence(product, x, series.shape[1] - 1, start, add)[2]
 
     everywhere = jax.sharding.PartitionSpec()
     specs = slabs.spec(1), slabs.spec(0), slabs.spec(0), everywhere, everywhere
@@ -99,28 +99,6 @@ def chebyshev_series(
     )
 
 
-@jax.jit
-def _gershgorin(stiffness: Float[Array, "offsets *shape"], lumped: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Return a bound on the spectrum of D⁻¹K that no field escapes."""
-    sums = jnp.sum(jnp.abs(stiffness), axis=0)
-    return jnp.max(jnp.where(lumped > 0, sums / jnp.where(lumped > 0, lumped, 1), 0))
-
-
-@partial(jax.jit, static_argnames="degree")
-def _heat_series(times: Float[Array, " m"], top: Float[Array, ""], degree: int) -> Float[Array, "m degree+1"]:
-    """Return the Chebyshev coefficients of exp(−tλ) on [0, top], by the cosine transform of its samples."""
-    samples = 2 * degree + 16
-    angles = (np.arange(samples) + 0.5) * (np.pi / samples)
-    weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
-    weights[:, 0] /= 2
-    values = jnp.exp(-times[:, None] * top * jnp.asarray((1 + np.cos(angles)) / 2, times.dtype))
-    return jnp.matmul(values, jnp.asarray(weights, times.dtype), precision="highest")
-
-
-def _degree(extent: float, tolerance: float) -> int:
-    """Return from where on the coefficients 2e^(−z) Iₙ(z), z = extent/2, add up to less than the tolerance."""
-    z = extent / 2
-    # They fall like exp(−n²/2z) up to n ≈ z, and faster beyond.
-    most = math.ceil(2 * math.sqrt(z * math.log(8 / tolerance)) + 4 * math.log(8 / tolerance) + 8)
-    tails = np.cumsum(2 * ive(np.arange(most + 1), z)[::-1])[::-1]
-    return max(1, int(np.argmax(tails <= tolerance)))
+def _inverse(lumped: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return D⁻¹, 0 at nodes that are not free."""
+    return jnp.where(lumped > 0, 1 / jnp.where(lumped > 0, lumped, 1), 0)

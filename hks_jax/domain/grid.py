@@ -10,8 +10,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.checks import require_real
 from hks_jax.domain.components import active_elements, label_nodes
-from hks_jax.domain.static_array import StaticArray
+from hks_jax.static_array import StaticArray
 
 
 @jax.tree_util.register_static
@@ -40,8 +41,8 @@ class Grid:
     def __init__(
         self,
         shape: Sequence[int],
-        spacing: float | Sequence[float] = 1.0,
-        origin: float | Sequence[float] = 0.0,
+        spacing: float | Sequence[float] | np.ndarray = 1.0,
+        origin: float | Sequence[float] | np.ndarray = 0.0,
         mask: Any = None,
         components: Literal["raise", "largest", "all"] = "raise",
     ) -> None:
@@ -59,8 +60,8 @@ class Grid:
     @classmethod
     def from_bounds(
         cls,
-        lower: float | Sequence[float],
-        upper: float | Sequence[float],
+        lower: float | Sequence[float] | np.ndarray,
+        upper: float | Sequence[float] | np.ndarray,
         shape: Sequence[int],
         **kwargs: Any,
     ) -> "Grid":
@@ -129,7 +130,8 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
         raise ValueError(f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, nodes per axis") from None
 
 
-def _per_axis(name: str, value: float | Sequence[float], dimension: int) -> tuple[float, ...]:
+def _per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: int) -> tuple[float, ...]:
+    require_real(name, value)
     try:
         values = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

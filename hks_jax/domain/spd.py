@@ -1,16 +1,32 @@
 """Small symmetric positive definite matrices: d = 2 and 3, batched over leading axes."""
 
-from functools import partial
+import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
+@jax.jit
 def symmetrise(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the symmetric part, ``(T + Tᵀ)/2``."""
     return 0.5 * (tensors + jnp.swapaxes(tensors, -1, -2))
+
+
+def identity_outside(
+    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray, "*shape"]
+) -> Float[Array, "*shape d d"]:
+    """Return the tensors, and the identity at nodes that are not inside."""
+    return tensors if inside.all() else identity_unless(inside, tensors)
+
+
+@jax.jit
+def identity_unless(
+    inside: Bool[np.ndarray | Array, "*shape"], tensors: Float[Array, "*shape d d"]
+) -> Float[Array, "*shape d d"]:
+    """Return the tensors, and the identity at nodes that are not inside, where these may be traced."""
+    return jnp.where(inside[..., None, None], tensors, jnp.eye(tensors.shape[-1], dtype=tensors.dtype))
 
 
 def adjugate(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
@@ -50,36 +66,116 @@ def is_spd(tensors: np.ndarray) -> np.ndarray:
     return np.logical_and.reduce(minors)
 
 
+# A product and not a choice: the derivative at the tensor itself is NaN too.
+@jax.jit
+def positive_or_nan(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+    """Return the matrices, d = 2 or 3, NaN in place of those that are not positive definite (Sylvester's criterion)."""
+    t = tensors
+    minors = t[..., 0, 0], t[..., 0, 0] * t[..., 1, 1] - t[..., 0, 1] * t[..., 1, 0], determinant(t)
+    positive = (minors[0] > 0) & (minors[1] > 0) & (minors[2] > 0)
+    return t * jnp.where(positive, 1, jnp.nan).astype(t.dtype)[..., None, None]
+
+
+@jax.jit
 def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the exponential of symmetric matrices."""
-    return _spectral("exp", tensors)
+    """Return the exponential of symmetric matrices, d = 2 or 3."""
+    return jax.checkpoint(_exp)(tensors)  # reverse mode keeps the matrices, and not a hundred numbers for each of them
 
 
+# With the trace taken off, Cayley and Hamilton say S² = qI (d = 2) or S³ = pS + |S| I (d = 3), so that exp S is a
+# polynomial in S of degree d − 1 whose coefficients are entire functions of q, or of p and |S|: no eigenvalue is
+# needed, and where eigenvalues meet nothing happens to derivatives of any order. The coefficients come from Taylor's
+# series at S/2ˢ, then s squarings; squared is E = exp − I, by 2E + E², which keeps the relative accuracy of E.
+_SQUARINGS, _TERMS = 8, 20
+
+
+def _exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+    d, tensors = tensors.shape[-1], symmetrise(tensors)
+    eye = jnp.eye(d, dtype=tensors.dtype)
+    mean = jnp.trace(tensors, axis1=-2, axis2=-1) / d
+    rest = tensors - mean[..., None, None] * eye
+    powers, coefficients = (_exp_in_2d if d == 2 else _exp_in_3d)(rest)
+    total = eye + sum(c[..., None, None] * power for c, power in zip(coefficients, (eye, *powers), strict=True))
+    return jnp.exp(mean)[..., None, None] * total
+
+
+def _exp_in_2d(rest: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Array]]:
+    """Return [S] and the coefficients of I and S in exp S − I; tr S = 0."""
+    q = jnp.square(rest[..., 0, 0]) + jnp.square(rest[..., 0, 1])
+    small = q / 4**_SQUARINGS
+    a = b = jnp.zeros_like(q)
+    for n in range(_TERMS // 2, 0, -1):  # Horner's scheme
+        a = small * (a + 1 / math.factorial(2 * n))
+        b = small * (b + 1 / math.factorial(2 * n + 1))
+    b = (1 + b) / 2**_SQUARINGS
+    for _ in range(_SQUARINGS):
+        a, b = 2 * a + a * a + b * b * q, 2 * b * (1 + a)
+    return [rest], [a, b]
+
+
+def _exp_in_3d(rest: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]:
+    """Return [S, S²] and the coefficients of I, S and S² in exp S − I; tr S = 0."""
+    square = _matmul(rest, rest)
+    p, r = 0.5 * jnp.trace(square, axis1=-2, axis2=-1), determinant(rest)
+    small_p, small_r = p / 4**_SQUARINGS, r / 8**_SQUARINGS
+    a = b = c = jnp.zeros_like(p)
+    for n in range(_TERMS, 0, -1):  # Horner's scheme: x ↦ S (1/n! + x), S³ = pS + rI
+        a, b, c = c * small_r, a + 1 / math.factorial(n) + c * small_p, b
+    b, c = b / 2**_SQUARINGS, c / 4**_SQUARINGS
+    for _ in range(_SQUARINGS):  # S³ = pS + rI, S⁴ = pS² + rS
+        a, b, c = (
+            2 * a + a * a + 2 * b * c * r,
+            2 * b + 2 * a * b + 2 * b * c * p + c * c * r,
+            2 * c + b * b + 2 * a * c + c * c * p,
+        )
+    return [rest, square], [a, b, c]
+
+
+@jax.jit
 def log(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the logarithm of symmetric positive definite matrices."""
-    return _spectral("log", tensors)
+    """Return the logarithm of symmetric positive definite matrices, d = 2 or 3; NaN for others."""
+    symmetric = symmetrise(tensors)
+    return _log_in_2d(symmetric) if tensors.shape[-1] == 2 else _log_by_eigenvalues(symmetric)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _spectral(name: str, tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+# T = mI + S, tr S = 0, S² = qI, has the eigenvalues m ± √q, so that log T = ½ log|T| I + atanh(√q/m)/√q S, and
+# atanh(x)/x is a smooth function of x² = q/m².
+def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
+    eye = jnp.eye(2, dtype=tensors.dtype)
+    mean = jnp.trace(tensors, axis1=-2, axis2=-1) / 2
+    scaled = tensors / mean[..., None, None]
+    rest = scaled - eye
+    square = jnp.square(rest[..., 0, 0]) + jnp.square(rest[..., 0, 1])
+    half = 0.5 * jnp.log(determinant(scaled))
+    small = square < 0.04
+    series = jnp.zeros_like(square)
+    for n in range(12, -1, -1):
+        series = series * jnp.where(small, square, 0) + 1 / (2 * n + 1)
+    root = jnp.sqrt(jnp.where(small, 0.04, square))
+    # atanh x = log(1 + x) − ½ log(1 − x²), and 1 − x² is the scaled determinant, which is accurate also near zero.
+    factor = jnp.where(small, series, (jnp.log1p(root) - half) / root)
+    return (jnp.log(mean) + half)[..., None, None] * eye + factor[..., None, None] * rest
+
+
+@jax.custom_jvp
+def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     values, vectors = jnp.linalg.eigh(tensors)
-    return _compose(vectors, getattr(jnp, name)(values)[..., None] * jnp.eye(values.shape[-1], dtype=values.dtype))
+    return _log_of_pairs(values, vectors)
 
 
 # d f(T) = V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences of f (Daleckii and Krein 1965), which are smooth where
 # eigenvalues meet; the derivatives of the eigenvectors are not.
-@_spectral.defjvp
-def _spectral_jvp(name: str, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+@_log_by_eigenvalues.defjvp
+def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     values, vectors = jnp.linalg.eigh(primals[0])
     a, b = values[..., :, None], values[..., None, :]
-    half = (a - b) / 2
-    if name == "exp":
-        differences = jnp.exp((a + b) / 2) * _sinhc(half)
-    else:
-        ratio = half / ((a + b) / 2)
-        differences = 2 / (a + b) * _atanhc(ratio)
+    differences = 2 / (a + b) * _atanhc((a - b) / (a + b))
     inner = _matmul(_matmul(jnp.swapaxes(vectors, -1, -2), tangents[0]), vectors)
-    return _spectral(name, primals[0]), _compose(vectors, differences * inner)
+    return _log_of_pairs(values, vectors), _compose(vectors, differences * inner)
+
+
+def _log_of_pairs(values: Float[Array, "... d"], vectors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+    return _compose(vectors, jnp.log(values)[..., None] * jnp.eye(values.shape[-1], dtype=values.dtype))
 
 
 def _compose(vectors: Float[Array, "... d d"], inner: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
@@ -88,12 +184,6 @@ def _compose(vectors: Float[Array, "... d d"], inner: Float[Array, "... d d"]) -
 
 def _matmul(a: Float[Array, "... d d"], b: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     return jnp.matmul(a, b, precision="highest")
-
-
-def _sinhc(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return sinh(x)/x."""
-    small = jnp.abs(x) < 1e-2
-    return jnp.where(small, 1 + x**2 / 6 + x**4 / 120, jnp.sinh(x) / jnp.where(small, 1, x))
 
 
 def _atanhc(x: Float[Array, "..."]) -> Float[Array, "..."]:

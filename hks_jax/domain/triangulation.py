@@ -1,50 +1,100 @@
-"""The connectivity of a triangle mesh."""
+"""The connectivity of a mesh of simplices: triangles or tetrahedra."""
 
 from functools import cached_property
+from itertools import combinations
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hks_jax.domain.static_array import StaticArray
+from hks_jax.static_array import StaticArray
+
+FACETS = {
+    2: np.array([[1, 2], [2, 0], [0, 1]]),
+    3: np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]),
+}
+"""By dimension, the corners of a simplex's facets: row i is the facet without corner i. Where the simplex is positively
+oriented, its facets are oriented outward."""
 
 
 @jax.tree_util.register_static
 class Triangulation:
-    """The connectivity of a triangle mesh: static, hashable."""
+    """The connectivity of a mesh of triangles or tetrahedra: static, hashable.
 
-    def __init__(self, faces: Int[np.ndarray, "F 3"], n_vertices: int) -> None:
-        self._faces = StaticArray(faces, dtype=np.int64)
+    Facets, which are the edges of triangles and the triangles of tetrahedra, are numbered cell by cell: facet
+    (d + 1) c + i is the one of cell c without its corner i. One between two cells has two numbers.
+    """
+
+    def __init__(self, cells: Int[np.ndarray, "n corners"], n_vertices: int) -> None:
+        self._cells = StaticArray(cells, dtype=np.int64)
         self.n_vertices = n_vertices
 
     @property
-    def faces(self) -> Int[np.ndarray, "F 3"]:
-        """Vertex indices, one row per triangle."""
-        return self._faces.value
+    def cells(self) -> Int[np.ndarray, "n corners"]:
+        """Vertex indices, one row per triangle or tetrahedron."""
+        return self._cells.value
+
+    @property
+    def dimension(self) -> int:
+        """2 for triangles, 3 for tetrahedra."""
+        return self.cells.shape[1] - 1
+
+    def facet_vertices(self, facets: Int[np.ndarray, " m"]) -> Int[np.ndarray, "m d"]:
+        """Return the vertices of facets."""
+        cell, corner = np.divmod(facets, self.dimension + 1)
+        return self.cells[cell[:, None], FACETS[self.dimension][corner]]
 
     @cached_property
-    def boundary_vertices(self) -> np.ndarray:
-        """The vertices on edges that belong to one triangle only, bool (V,)."""
-        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        unique, counts = np.unique(edges, axis=0, return_counts=True)
+    def _grouped_facets(self) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """All facets, those with the same vertices beside each other; which begin such a group; the parity of each."""
+        vertices = self.facet_vertices(np.arange(self.cells.size))
+        odd = np.zeros(len(vertices), dtype=bool)
+        for a, b in combinations(range(self.dimension), 2):
+            odd ^= vertices[:, a] > vertices[:, b]
+        vertices = np.sort(vertices, axis=1)
+        order = np.lexsort(vertices.T[::-1])
+        begins = np.ones(order.size, dtype=bool)
+        begins[1:] = (vertices[order[1:]] != vertices[order[:-1]]).any(axis=1)
+        return order, begins, odd[order]
+
+    @cached_property
+    def boundary_facets(self) -> Int[np.ndarray, " m"]:
+        """The facets that belong to one cell only, ascending."""
+        order, begins, _ = self._grouped_facets
+        return np.sort(order[begins & np.append(begins[1:], True)])
+
+    @cached_property
+    def overlaps(self) -> Int[np.ndarray, "m 2"]:
+        """Pairs of cells with a common facet of the same orientation: if both are positive, they are on one side of it.
+
+        Of three cells or more at one facet two are always on one side.
+        """
+        order, begins, odd = self._grouped_facets
+        again = np.flatnonzero(~begins)
+        again = again[(odd[again] == odd[again - 1]) | ~begins[again - 1]]
+        return np.stack([order[again - 1], order[again]], axis=1) // (self.dimension + 1)
+
+    @cached_property
+    def boundary_vertices(self) -> Bool[np.ndarray, " V"]:
+        """The vertices on facets that belong to one cell only, bool (V,)."""
         on_boundary = np.zeros(self.n_vertices, dtype=bool)
-        on_boundary[unique[counts == 1].ravel()] = True
+        on_boundary[self.facet_vertices(self.boundary_facets)] = True
         return on_boundary
 
     @cached_property
-    def labels(self) -> tuple[np.ndarray, int]:
+    def labels(self) -> tuple[Int[np.ndarray, " V"], int]:
         """The connected component of each vertex (1 … n), and their number n."""
-        rows, cols = self.faces[:, [0, 1]].ravel(), self.faces[:, [1, 2]].ravel()
+        rows, cols = self.cells[:, :-1].ravel(), self.cells[:, 1:].ravel()
         graph = coo_matrix((np.ones(rows.size), (rows, cols)), shape=(self.n_vertices,) * 2)
         count, labels = connected_components(graph, directed=False)
         return labels + 1, int(count)
 
     def __eq__(self, other: object) -> bool:
         return self is other or (
-            isinstance(other, Triangulation) and self.n_vertices == other.n_vertices and self._faces == other._faces
+            isinstance(other, Triangulation) and self.n_vertices == other.n_vertices and self._cells == other._cells
         )
 
     def __hash__(self) -> int:
-        return hash((self.n_vertices, self._faces))
+        return hash((self.n_vertices, self._cells))

@@ -1,23 +1,36 @@
 """How many eigenvalues lie below a number, without computing any."""
 
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int
+import math
 
-from hks_jax.domain.surface_mesh import SurfaceMesh
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.checks import require_number
+from hks_jax.compilation import jit_quickly
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.dissection import dissect
-from hks_jax.eigen.host import factorise_on_host, host_matrices
-from hks_jax.eigen.multifrontal import factorise
+from hks_jax.eigen.quality import indistinct
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
-from hks_jax.fem.space import GridSpace
+from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.multifrontal import factorise, try_out
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.traced import is_traced
+
+_PROBES = 4
+"""Random right-hand sides to try a factorisation out."""
+_LEAST_PIVOT = 0.375
+"""The least pivot with which a count is tried again, as a power of ε."""
+_BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
+"""How far beside σ, relative, to count where the factorisation at σ itself is not to be trusted."""
+
+Count = tuple[Int[Array, ""], Bool[Array, ""]]
 
 
 def count_eigenvalues(
-    domain: TensorField | SurfaceMesh | Pencil | MirrorPencil,
+    domain: TensorField | SimplicialMesh | SymmetricPencil | MirrorPencil,
     below: Float[Array, ""] | float,
     boundary: BoundarySpec = "neumann",
     mass: MassKind = "consistent",
@@ -25,25 +38,87 @@ def count_eigenvalues(
     """Count the eigenvalues below a number, with their multiplicities.
 
     By Sylvester's law of inertia these are the negative eigenvalues of K − σM, which a factorisation LDLᵀ shows: one
-    factorisation certifies that a list of eigenvalues is complete. Traceable on grids; on meshes SuperLU counts, on
-    the host.
+    factorisation certifies that a list of eigenvalues is complete. Each is tried out on random right-hand sides, and
+    counts only where its error is too small to change the inertia. Where it is not, because σ is an eigenvalue or one
+    of a part of the domain, it is counted on both sides of σ. Traceable.
 
     Args:
-        domain: a tensor field, a surface mesh, or a pencil from `assemble`.
+        domain: a tensor field, a mesh, or a pencil from `assemble` or `sparse_pencil`.
         below: σ, in 1/(metric length)²; not itself an eigenvalue, where the count is uncertain.
         boundary: see `assemble`; belongs to the pencil if one is given.
         mass: likewise.
 
     Returns:
-        How many eigenvalues are less than σ.
+        How many eigenvalues are less than σ; traced, −1 where that is uncertain.
+
+    Raises:
+        ValueError: σ is not a finite number, or cannot be told from an eigenvalue; with the counts beside it.
     """
-    pencil = domain if isinstance(domain, Pencil | MirrorPencil) else assemble(domain, boundary, mass)
-    return jnp.asarray(sum(_count(part, jnp.asarray(below, part.stiffness.dtype)) for part in pencil.parts))
+    require_number("below", below, above=-math.inf)
+    pencil = domain if isinstance(domain, SymmetricPencil | MirrorPencil) else assemble(domain, boundary, mass)
+    shift = jnp.asarray(below, pencil.parts[0].stiffness.dtype)
+    count, sound = _total(pencil, shift)
+    if is_traced((count, sound)):
+        return jnp.where(sound, count, -1)
+    if sound:
+        return count
+    size = max(abs(float(shift)), float(_smallest_scale(pencil)))
+    for relative in _BESIDE:
+        low, high = float(shift) - relative * size, float(shift) + relative * size
+        (under, sound_under), (over, sound_over) = (_total(pencil, jnp.asarray(s, shift.dtype)) for s in (low, high))
+        if sound_under and sound_over:
+            if under == over:
+                return under
+            raise ValueError(
+                f"below: got {float(shift):.15g}, which cannot be told from an eigenvalue; {int(under)} eigenvalues "
+                f"are below {low:.12g} and {int(over)} below {high:.12g}. Count below one of these"
+            )
+    raise ValueError(
+        f"below: got {float(shift):.15g}, where rounding in {shift.dtype} leaves the count uncertain. "
+        "Use another number, or float64"
+    )
 
 
-def _count(pencil: Pencil, below: Float[Array, ""]) -> Int[Array, ""]:
-    if isinstance(pencil.stiffness, StencilOperator) and isinstance(pencil.space, GridSpace):
-        return factorise(dissect(pencil.space), pencil, below).negative
-    data, matrices = host_matrices(pencil)
-    K, M = matrices(*map(np.asarray, data))
-    return jnp.asarray(int((factorise_on_host(K - float(below) * M).U.diagonal() < 0).sum()))
+def _total(pencil: SymmetricPencil | MirrorPencil, shift: Float[Array, ""]) -> Count:
+    """Return how many eigenvalues of all parts are below, and whether that is certain."""
+    counts = [certain_count(part, shift) for part in pencil.parts]
+    return sum((count for count, _ in counts), jnp.zeros((), int)), jnp.all(jnp.stack([sound for _, sound in counts]))
+
+
+@jit_quickly()
+def certain_count(pencil: SymmetricPencil, shift: Float[Array, ""]) -> Count:
+    """Return how many eigenvalues of one pencil are below σ, and whether that is certain."""
+    dissection = dissect(pencil.pattern)
+    probes = jax.random.normal(jax.random.key(0), (pencil.size, _PROBES), shift.dtype)
+
+    bounded = float(jnp.finfo(shift.dtype).eps) ** _LEAST_PIVOT
+
+    def attempt(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        tries, _, _ = state
+        least = jnp.where(tries > 0, bounded, 0).astype(shift.dtype)
+        return tries + 1, *count_once(pencil, dissection, shift, probes, least)
+
+    # A loop, so that the factorisation is compiled once.
+    none = jnp.zeros((), int)
+    start = none, none, jnp.zeros((), bool)
+    _, negative, sound = jax.lax.while_loop(lambda state: (state[0] < 2) & ~state[2], attempt, start)
+    return negative, sound
+
+
+def count_once(
+    pencil: SymmetricPencil,
+    dissection: Dissection,
+    shift: Float[Array, ""],
+    probes: Float[Array, "n_dof b"],
+    least: Float[Array, ""] | float = 0.0,
+) -> Count:
+    """Return what one factorisation says, and whether it is certain: random right-hand sides try it out."""
+    factor = factorise(dissection, pencil.shifted(shift), least)
+    return factor.negative, try_out(factor, pencil, shift, probes).sound
+
+
+def _smallest_scale(pencil: SymmetricPencil | MirrorPencil) -> Float[Array, ""]:
+    """Return the least distance of eigenvalues to expect: what σ near zero is compared with."""
+    if isinstance(pencil, Pencil | MirrorPencil):
+        return 1 / pencil.volume ** (2 / pencil.space.dimension)
+    return indistinct(pencil, pencil.stiffness.dtype)

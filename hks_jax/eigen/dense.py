@@ -6,20 +6,25 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from hks_jax.checks import require_number
 from hks_jax.eigen.solver import Eigensolver, RawPairs
-from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.standard_form import standard_form, transposed_solve
 
 
-class Dense(Eigensolver):
+class Dense(Eigensolver[SymmetricPencil]):
     """Cholesky reduction M = LLᵀ to L⁻¹KL⁻ᵀ, then `eigh`: O(n³) time, O(n²) memory, exact multiplicities."""
 
     name: ClassVar[str] = "dense"
     tolerance: float = eqx.field(default=1e-8, static=True)
 
-    def lowest(self, pencil: Pencil, k: int) -> RawPairs:
+    def __check_init__(self) -> None:
+        """Check the settings."""
+        require_number("tolerance", self.tolerance, 1)
+
+    def lowest(self, pencil: SymmetricPencil, k: int) -> RawPairs:
         """Return the k lowest eigenpairs."""
         return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
 
@@ -30,9 +35,7 @@ class Dense(Eigensolver):
 
 @partial(jax.jit, static_argnames="k")
 def _dense(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"], k: int) -> RawPairs:
-    factor = jnp.linalg.cholesky(mass)
-    half = solve_triangular(factor, stiffness, lower=True)
-    reduced = solve_triangular(factor, half.T, lower=True)
+    reduced, factor = standard_form(stiffness, mass)
     values, vectors = jnp.linalg.eigh(reduced)
-    vectors = solve_triangular(factor, vectors[:, :k], trans="T", lower=True)
+    vectors = transposed_solve(factor, vectors[:, :k])
     return values[:k], vectors.T, jnp.asarray(jnp.inf, values.dtype)

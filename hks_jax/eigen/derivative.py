@@ -1,30 +1,39 @@
 """The lowest eigenpairs of a pencil, and their derivatives with respect to stiffness and mass."""
 
 from functools import partial
+from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.traced import is_traced
+
+Telling = Literal["nothing", "warning", "error"]
+"""What follows where the derivative does not converge, besides NaN."""
 
 Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
 Certified = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3))
-def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Certified:
+@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4))
+def lowest(solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, throw: bool) -> Certified:
     """Return the k + extra lowest eigenvalues, their eigenvectors, these again as the frame, and the solver's bound.
 
     The derivative of the frame is that of the eigenvectors without what rotates them among the first k. The derivatives
-    of the last ``extra`` are set to zero.
+    of the last ``extra`` are set to zero. Where the derivative does not converge it is NaN: an error, if ``throw``;
+    else a warning where values are concrete.
     """
     values, vectors, complete_below = solver.lowest(pencil, k + extra)
-    values, vectors = _exact_null_modes(pencil, values, vectors)
+    values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
     return values, vectors, vectors, complete_below
 
 
@@ -48,79 +57,125 @@ def lowest(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Certified
 # sum over j > k alone, which no basis of the first k changes (hks_jax/signatures/spectral.py).
 @lowest.defjvp
 def _lowest_jvp(
-    solver: Eigensolver, k: int, extra: int, primals: tuple[Pencil], changes: tuple[Pencil]
+    solver: Eigensolver,
+    k: int,
+    extra: int,
+    throw: bool,
+    primals: tuple[SymmetricPencil],
+    changes: tuple[SymmetricPencil],
 ) -> tuple[Certified, Certified]:
     pencil, change = first_order_only(primals[0]), changes[0]
-    n_dof = pencil.space.n_dof
+    n_dof = pencil.size
     total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
     values, vectors, complete_below = solver.lowest(pencil, total)
-    values, vectors = _exact_null_modes(pencil, values, vectors)
-    d_values, d_vectors, d_frame = _tangents(solver, k, pencil, change, values, vectors)
-    d_vectors, d_frame = (jnp.pad(d, ((0, extra), (0, 0))) for d in (d_vectors, d_frame))
-    values, vectors = values[: k + extra], vectors[: k + extra]
-    tangents = jnp.pad(d_values, (0, extra)), d_vectors, d_frame, jnp.zeros_like(complete_below)
+    values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
+    quiet = is_traced(primals) or solver.warns
+    telling: Telling = "error" if throw else "nothing" if quiet else "warning"
+    tangents = *_tangents(solver, k, extra, telling, pencil, change, values, vectors), jnp.zeros_like(complete_below)
+    values, vectors = _leading(values, vectors, k + extra)
     return (values, vectors, vectors, complete_below), tangents
 
 
-@partial(jax.jit, static_argnames=("solver", "k"))
+@partial(jax.jit, static_argnames="size")
+def _leading(
+    values: Float[Array, " p"], vectors: Float[Array, "p n_dof"], size: int
+) -> tuple[Float[Array, " size"], Float[Array, "size n_dof"]]:
+    return values[:size], vectors[:size]
+
+
+@partial(jax.jit, static_argnames=("solver", "k", "extra", "telling"))
 def _tangents(
     solver: Eigensolver,
     k: int,
-    pencil: Pencil,
-    change: Pencil,
+    extra: int,
+    telling: Telling,
+    pencil: SymmetricPencil,
+    change: SymmetricPencil,
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
 ) -> Lowest:
-    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs."""
+    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs, and zeros for ``extra``."""
     eigenvalues, functions = values[:k], vectors[:k]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     into = jnp.matmul(force, vectors.T, precision="highest")
     gap = eigenvalues[:, None] - values
-    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(eigenvalues[:, None], values)
+    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(jnp.abs(eigenvalues)[:, None], jnp.abs(values))
     apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
     rotation = jnp.where(apart, into / jnp.where(apart, gap, 1), 0)
     gauge = -jnp.matmul(moved, functions.T, precision="highest") / 2
     within = jnp.where(apart[:, :k], rotation[:, :k], gauge)
     frame = jnp.matmul(rotation[:, k:], vectors[k:], precision="highest")
-    frame = frame + _outside(solver, pencil, values, vectors, -force)
-    return jnp.diagonal(into), jnp.matmul(within, functions, precision="highest") + frame, frame
+    frame = frame + _outside(solver, telling, pencil, values, vectors, -force)
+    d_vectors = jnp.matmul(within, functions, precision="highest") + frame
+    d_vectors, frame = (jnp.pad(d, ((0, extra), (0, 0))) for d in (d_vectors, frame))
+    return jnp.pad(jnp.diagonal(into), (0, extra)), d_vectors, frame
 
 
 def _outside(
     solver: Eigensolver,
-    pencil: Pencil,
+    telling: Telling,
+    pencil: SymmetricPencil,
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
     rhs: Float[Array, "k n_dof"],
 ) -> Float[Array, "k n_dof"]:
     """Solve (K − λᵢM) xᵢ = Q rhsᵢ on the complement of the p computed eigenvectors."""
-    if values.size == pencil.space.n_dof:
+    k, n_null = rhs.shape[0], min(pencil.n_null, rhs.shape[0])
+    if values.size == pencil.size or n_null == k:
         return jnp.zeros_like(rhs)
-    shifts = values[: rhs.shape[0], None]
+    shifts = values[:k, None]
 
     def matvec(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
 
     # Outside the linear solve, so that many products with one Jacobian share it.
-    prepared = solver.prepare_complement(pencil, values, rhs.shape[0])
+    prepared = solver.prepare_complement(pencil, values, k)
 
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return solver.solve_complement(prepared, pencil, values, vectors, b)
+        return _told(telling, solver.solve_complement(prepared, pencil, values, vectors, b))
 
-    return jax.lax.custom_linear_solve(matvec, rhs, solve, symmetric=True)
+    # No force acts on the constants: they stay in the kernel of the stiffness. In reverse mode, where their rows are
+    # cotangents, it is their solutions that do not count.
+    x = jax.lax.custom_linear_solve(matvec, rhs.at[:n_null].set(0), solve, symmetric=True)
+    return x.at[:n_null].set(0)
+
+
+def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+    """Return x; where rows of it are NaN, warn or raise."""
+    failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
+    if telling == "error":
+        return eqx.error_if(x, failed > 0, _message("some", len(x)))
+    if telling == "warning":
+
+        def warn(failed: Array | np.ndarray) -> np.ndarray:
+            if failed:
+                warn_of_accuracy(_message(str(int(failed)), len(x)))
+            return np.zeros((), x.dtype)
+
+        return x + jax.pure_callback(warn, jax.ShapeDtypeStruct((), x.dtype), failed, vmap_method="sequential")
+    return x
+
+
+def _message(failed: str, total: int) -> str:
+    return (
+        f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, and their part is NaN. k "
+        "may cut a cluster of eigenvalues, or the eigenpairs themselves did not converge: take another k or solver, or "
+        "set multiplet='drop' in `eigenpairs`"
+    )
 
 
 @jax.jit
 def _exact_null_modes(
-    pencil: Pencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
+    pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
     """Put the constants, which the stiffness annihilates exactly, in place of the solver's approximations to them.
 
     Their eigenvalue is 0 and not the ±1e-13 of a solver; what rounding left of them in the other vectors is taken out.
     """
     mass, dtype = pencil.mass, values.dtype
-    n_null = min(pencil.space.n_null, values.size)
+    assert isinstance(pencil, Pencil)
+    n_null = min(pencil.n_null, values.size)
     # The barrier keeps XLA from computing with long constants while it compiles.
     constants = jax.lax.optimization_barrier(jnp.asarray(pencil.space.null_labels == np.arange(n_null)[:, None], dtype))
     constants /= jnp.sqrt(jnp.sum(constants * mass.apply(constants), axis=1, keepdims=True))

@@ -1,5 +1,7 @@
 """Eigenpairs of the Laplace–Beltrami operator, and what is known of their quality."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,33 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.linear.pencil import SymmetricPencil
+
+
+class RESULTS(eqx.Enumeration):
+    """What came of a computation of eigenpairs: a code that is traced, as those of lineax and optimistix."""
+
+    successful = ""
+    not_finite = "The matrices are not finite: tensors are NaN, infinite or not positive definite."
+    unconverged = (
+        "Some eigenpairs did not converge (`.converged` says which), or were not found and are NaN. Use float64, fewer "
+        "pairs, or another solver."
+    )
+    unconfirmed = (
+        "The solver could not confirm that it missed no eigenvalue from `.complete_below` on. Use another solver, or a "
+        "slightly different k."
+    )
+
+
+def result_of(
+    pencil: SymmetricPencil | MirrorPencil, converged: Bool[Array, " k"], unconfirmed: Bool[Array, ""]
+) -> RESULTS:
+    """Return what came of eigenpairs, the gravest of what failed."""
+    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(pencil) if eqx.is_inexact_array(leaf)]
+    code: Any = RESULTS  # whose members are strings until the class is made
+    result = code.where(unconfirmed, code.unconfirmed, code.successful)
+    result = code.where(jnp.all(converged), result, code.unconverged)
+    return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
 
 class Eigenpairs(eqx.Module):
@@ -71,44 +100,52 @@ class Eigenpairs(eqx.Module):
     @property
     def last_eigenvalue(self) -> Float[Array, ""]:
         """The largest eigenvalue that is kept."""
-        return self.eigenvalues[jnp.sum(self.kept) - 1]
+        return _last(self.eigenvalues, self.kept)
 
     @property
     def cut_multiplet(self) -> Array:
         """How many of the last kept pairs belong to a multiple eigenvalue that the truncation cuts; 0 if none is."""
-        last = jax.lax.stop_gradient(self.last_eigenvalue)
-        tolerance = self.multiplet_tolerance * jnp.maximum(last, jnp.finfo(last.dtype).tiny)
-        together = jnp.sum(self.kept & (self.eigenvalues >= last - tolerance))
-        return jnp.where(self.next_eigenvalue - last <= tolerance, together, 0)
+        known = self.eigenvalues, self.kept, self.next_eigenvalue, self.multiplet_tolerance
+        return _cut_multiplet(*jax.lax.stop_gradient(known))
+
+    @property
+    def unconfirmed(self) -> Bool[Array, ""]:
+        """Whether the solver has a certificate, and it ends before the last eigenvalue."""
+        return self.complete_below < self.last_eigenvalue * (1 - 2 * self.multiplet_tolerance)
+
+    @property
+    def result(self) -> RESULTS:
+        """What came of it, as a traced code: compare with ``RESULTS.successful``, or call its ``error_if``."""
+        return result_of(self.pencil, self.converged, self.unconfirmed)
 
     def messages(self) -> list[str]:
         """Say in sentences what limits these pairs; empty if nothing does. Needs concrete values."""
-        found = []
+        sentences = []
         bad = ~np.asarray(self.converged)
         if bad.any():
             missing = int(np.isnan(np.asarray(self.eigenvalues)).sum())
             worst = np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
             remedy = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
-            found.append(
-                f"{int(bad.sum())} of {self.k} eigenpairs did not converge ({missing} of them not found, worst "
+            sentences.append(
+                f"{int(bad.sum())} of {self.k} eigenpairs did not converge ({missing} of them not sentences, worst "
                 f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
                 f"Use float64, fewer pairs, or {remedy}"
             )
         bound, last = float(self.complete_below), float(self.last_eigenvalue)
-        if bound < last * (1 - 2 * float(self.multiplet_tolerance)):
-            found.append(
+        if bool(self.unconfirmed):
+            sentences.append(
                 f"the {self.solver_name} solver could not confirm that it missed no eigenvalue between {bound:.6g} and "
                 f"{last:.6g}. Use another solver, or a slightly different k"
             )
         cut, kept = int(self.cut_multiplet), int(self.kept.sum())
         if cut:
             remedy = f"Take k = {kept - cut} or a larger one" if cut < kept else "Take a larger k"
-            found.append(
+            sentences.append(
                 f"k = {kept} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = "
                 f"{float(self.last_eigenvalue):.6g}, have equals beyond k, and which of them are here is arbitrary. "
                 f"{remedy}"
             )
-        return found
+        return sentences
 
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Needs concrete values."""
@@ -126,3 +163,21 @@ class Eigenpairs(eqx.Module):
         if kept < self.k:
             lines.append(f"{kept} of them kept, so that no multiple eigenvalue is cut")
         return "\n".join(lines + self.messages())
+
+
+@jax.jit
+def _last(values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, ""]:
+    return values[jnp.sum(kept) - 1]
+
+
+@jax.jit
+def _cut_multiplet(
+    values: Float[Array, " k"],
+    kept: Bool[Array, " k"],
+    next_eigenvalue: Float[Array, ""],
+    multiplet_tolerance: Float[Array, ""],
+) -> Int[Array, ""]:
+    last = _last(values, kept)
+    tolerance = multiplet_tolerance * jnp.maximum(last, jnp.finfo(last.dtype).tiny)
+    together = jnp.sum(kept & (values >= last - tolerance))
+    return jnp.where(next_eigenvalue - last <= tolerance, together, 0)

@@ -1,13 +1,19 @@
 """A guard: what stands in a first-derivative rule must not be differentiated again."""
 
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
-import jax
+from hks_jax.linear.not_differentiable import not_differentiable
 
 Tree = TypeVar("Tree")
 
+_MESSAGE = (
+    "second derivatives of eigenpairs and of their signatures with respect to the tensors, the vertices or the "
+    "pencil are not implemented. First derivatives are, and their derivatives with respect to times and other "
+    "parameters of the filter (in the other order, with jax.jvp for the inner one). For a Hessian use Gauss-Newton "
+    "products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
+)
 
-@jax.custom_jvp
+
 def first_order_only(tree: Tree) -> Tree:
     """Return ``tree`` unchanged; differentiating it raises NotImplementedError.
 
@@ -15,14 +21,4 @@ def first_order_only(tree: Tree) -> Tree:
     rotate within multiple eigenvalues in a way that first derivatives do not know, so that differentiating the rules
     gives wrong numbers there. An error is better.
     """
-    return tree
-
-
-@first_order_only.defjvp
-def _refuse(primals: tuple, tangents: tuple) -> NoReturn:
-    raise NotImplementedError(
-        "second derivatives of eigenpairs and of their signatures with respect to the tensors, the vertices or the "
-        "pencil are not implemented. First derivatives are, and their derivatives with respect to times and other "
-        "parameters of the filter (in the other order, with jax.jvp for the inner one). For a Hessian use Gauss-Newton "
-        "products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
-    )
+    return not_differentiable(_MESSAGE, tree)

@@ -1,6 +1,7 @@
 """The mixed problems of a reflected domain, their spectra merged into one."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,9 @@ from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
 
-def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str) -> Eigenpairs:
+def solve_mirror(
+    pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str, throw: bool
+) -> Eigenpairs:
     """Solve the mixed problems and return the k + extra lowest pairs of all.
 
     How many come from each part is not known beforehand. Where values are concrete, ask for a fair share with a margin
@@ -32,7 +35,8 @@ def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra
         solver if limit <= solver.max_pairs(part.space.n_dof) else Dense(solver.tolerance)
         for solver, part, limit in zip(solvers, parts, limits, strict=True)
     ]
-    solved = [solve_part(part, solver, w, 0, name) for part, solver, w in zip(parts, solvers, wanted, strict=True)]
+    problems = zip(parts, solvers, wanted, strict=True)
+    solved = [solve_part(part, solver, size, 0, name, throw) for part, solver, size in problems]
     while not traced:
         spectra = [np.asarray(jax.lax.stop_gradient(pairs.eigenvalues)) for pairs in solved]
         merged = np.sort(np.concatenate(spectra))
@@ -46,10 +50,11 @@ def solve_mirror(pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra
             break
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
-            solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name)
+            solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name, throw)
     return _merge(pencil, tuple(solved), k, extra, name)
 
 
+@partial(jax.jit, static_argnames=("k", "extra", "name"))
 def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
     values = jnp.concatenate([pairs.eigenvalues for pairs in solved])
     lowest = jnp.argsort(values)[: k + extra]

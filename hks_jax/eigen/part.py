@@ -7,13 +7,16 @@ from jaxtyping import Array, Float
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import lowest
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.quality import indistinct, values_and_defects
+from hks_jax.eigen.quality import quality
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import Pencil
 
 
-def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str) -> Eigenpairs:
-    """Return k + extra pairs of one pencil, the last ``extra`` of them without derivatives."""
+def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool) -> Eigenpairs:
+    """Return k + extra pairs of one pencil, the last ``extra`` of them without derivatives.
+
+    With ``throw``, a derivative that does not converge is an error.
+    """
     n_dof = pencil.space.n_dof
     if k + extra > solver.max_pairs(n_dof):
         raise ValueError(
@@ -21,19 +24,20 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
-    values, vectors, frame, complete_below = lowest(solver, pencil, k, extra)
-    residuals, converged, rounding = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)
+    values, vectors, frame, complete_below = lowest(solver, pencil, k, extra, throw)
+    residuals, converged, *others = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)
+    kept, part, next_eigenvalue, multiplet_tolerance = others
     return Eigenpairs(
         values,
         vectors,
         frame,
         residuals,
         converged,
-        kept=jnp.ones(values.shape, bool),
-        part=jnp.zeros(values.shape, int),
-        next_eigenvalue=jnp.asarray(jnp.inf, values.dtype),
+        kept=kept,
+        part=part,
+        next_eigenvalue=next_eigenvalue,
         complete_below=complete_below,
-        multiplet_tolerance=jnp.clip(rounding[-1], 1e-6, 1e-3),
+        multiplet_tolerance=multiplet_tolerance,
         pencil=pencil,
         solver_name=name,
     )
@@ -42,14 +46,10 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
 @jit_quickly(static_argnames="tolerance")
 def _quality(
     pencil: Pencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"], tolerance: float
-) -> tuple[Array, Array, Array]:
-    """Return residuals, whether they are small enough, and what rounding alone makes of them, each (k,)."""
-    first = values[min(pencil.space.n_null, values.size - 1)]
-    _, defect = values_and_defects(pencil, vectors, values)
-    scale = jnp.maximum(jnp.abs(values), jnp.abs(first))
-    scale = jnp.where(scale > 0, scale, 1)
-    residuals = defect / scale
-    # Rounding excuses a residual of a per cent at most: beyond that, the pair is not known, whatever the reason.
-    rounding = indistinct(pencil, values.dtype) / scale
-    converged = (residuals <= jnp.maximum(tolerance, jnp.minimum(rounding, 0.01))) & (values >= 0)
-    return residuals, converged, rounding
+) -> tuple[Array, ...]:
+    """Return residuals (k,), whether they are small enough (k,), and what `Eigenpairs` has of pairs not yet cut."""
+    first = values[min(pencil.n_null, values.size - 1)]
+    residuals, small, rounding = quality(pencil, values, vectors, first, tolerance)
+    converged = small & (values >= 0)
+    kept, part = jnp.ones(values.shape, bool), jnp.zeros(values.shape, int)
+    return residuals, converged, kept, part, jnp.asarray(jnp.inf, values.dtype), jnp.clip(rounding[-1], 1e-6, 1e-3)

@@ -3,16 +3,16 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.pencil import SymmetricPencil
 
 _ROWS = 8
 """How many vectors to look at together: what is computed from them stays in the cache."""
 
 
 def values_and_defects(
-    pencil: Pencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
+    pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Return λ, if not given the Rayleigh quotient φᵀKφ / φᵀMφ, and ‖Kφ − λMφ‖ / ‖Mφ‖ of each vector."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
@@ -23,18 +23,37 @@ def values_and_defects(
         columns = jax.lax.optimization_barrier(jax.lax.dynamic_slice_in_dim(vectors, start, size).T)
         force, image = stiffness(columns), mass(columns)
         if values is None:
-            here = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
+            quotients = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
         else:
-            here = jax.lax.dynamic_slice_in_dim(values, start, size)
-        return here, jnp.linalg.norm(force - here * image, axis=0) / jnp.linalg.norm(image, axis=0)
+            quotients = jax.lax.dynamic_slice_in_dim(values, start, size)
+        return quotients, jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
-    found_values, defects = jax.lax.map(measure, jnp.asarray(starts))
+    all_values, defects = jax.lax.map(measure, jnp.asarray(starts))
     block = np.arange(m) // size
     place = block, np.arange(m) - starts[block]
-    return found_values[place], defects[place]
+    return all_values[place], defects[place]
 
 
-def indistinct(pencil: Pencil, dtype: np.dtype) -> Float[Array, ""]:
+def quality(
+    pencil: SymmetricPencil,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    unit: Float[Array, ""],
+    tolerance: float,
+) -> tuple[Float[Array, " k"], Bool[Array, " k"], Float[Array, " k"]]:
+    """Return residuals relative to the eigenvalues, whether they are small enough, and what rounding alone makes.
+
+    Eigenvalues smaller than ``unit`` are measured by it.
+    """
+    _, defect = values_and_defects(pencil, vectors, values)
+    scale = jnp.maximum(jnp.abs(values), jnp.abs(unit))
+    scale = jnp.where(scale > 0, scale, 1)
+    residuals, rounding = defect / scale, indistinct(pencil, values.dtype) / scale
+    # Rounding excuses a residual of a per cent at most: beyond that, the pair is not known, whatever the reason.
+    return residuals, residuals <= jnp.maximum(tolerance, jnp.minimum(rounding, 0.01)), rounding
+
+
+def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
     """Return the distance below which rounding in K alone makes two eigenvalues one: 4 ε λ_max.
 
     4·max(Kᵢᵢ/Mᵢᵢ) is λ_max on a uniform grid in 2D and 3D.

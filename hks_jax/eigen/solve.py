@@ -6,16 +6,16 @@ import jax
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.block_lanczos import BlockLanczos
-from hks_jax.eigen.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.dense import Dense
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
+from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
+from hks_jax.eigen.host.shift_invert import ShiftInvert
+from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.mirror import solve_mirror
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice, check_choice, truncate
 from hks_jax.eigen.part import solve_part
-from hks_jax.eigen.shift_invert import ShiftInvert
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
@@ -32,12 +32,13 @@ _LARGE, _LARGE_IN_3D = 4_000_000, 1_000_000
 
 
 def eigenpairs(
-    domain: TensorField | SurfaceMesh | Pencil | MirrorPencil,
+    domain: TensorField | SimplicialMesh | Pencil | MirrorPencil,
     k: int,
     boundary: BoundarySpec = "neumann",
     solver: str | Eigensolver = "auto",
     mass: MassKind = "consistent",
     multiplet: MultipletChoice = "report",
+    throw: bool = False,
 ) -> Eigenpairs:
     """Compute the k lowest eigenpairs of the Laplace–Beltrami operator.
 
@@ -46,23 +47,27 @@ def eigenpairs(
     the eigenvalue is simple (docs/derivatives.md).
 
     Args:
-        domain: a tensor field, a surface mesh, or a pencil from `assemble` (one whose stiffness annihilates the
+        domain: a tensor field, a mesh, or a pencil from `assemble` (one whose stiffness annihilates the
             constants of natural components, and so must its perturbations).
         k: how many pairs, 1 … number of degrees of freedom.
         boundary: see `assemble`; belongs to the pencil if one is given.
-        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (grids, above all 2D),
+        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (2D and surfaces above all),
             ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
             ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts. ``"report"`` warns; ``"drop"`` leaves its copies
             out of every signature; ``"complete"`` computes 8 pairs more and takes the missing copies in (or drops
             it, if 8 are too few). What is left out is still in the arrays, and marked in ``.kept``.
+        throw: whether a failure is an error, also under `jit`, where no warning is possible: pairs whose ``.result`` is
+            not successful, and derivatives that do not converge. It takes a callback to the host. Else pairs carry the
+            code and derivatives are NaN, with a warning where values are concrete.
 
     Returns:
         The pairs with residuals and convergence flags. λ of a constant (one per natural component) is exactly zero.
 
     Raises:
         ValueError: k out of range, an unknown solver, boundary or mass.
+        RuntimeError: with ``throw``, what failed.
 
     Warns:
         AccuracyWarning: unconverged pairs, or a multiple eigenvalue that k cuts (where values are concrete).
@@ -86,10 +91,13 @@ def eigenpairs(
     name = " + ".join(dict.fromkeys(choice.name for choice in choices))
     extra = min(1, total - size)  # to see where the spectrum is cut
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_mirror(pencil, choices, size, extra, name)
+        pairs = solve_mirror(pencil, choices, size, extra, name, throw)
     else:
-        pairs = solve_part(pencil, choices[0], size, extra, name)
+        pairs = solve_part(pencil, choices[0], size, extra, name, throw)
     pairs = truncate(pairs, k, multiplet)
+    if throw:
+        result = jax.lax.stop_gradient(pairs).result
+        pairs = result.error_if(pairs, result != RESULTS.successful)
     known = jax.lax.stop_gradient(pairs)
     if not is_traced(known.eigenvalues):
         for message in known.messages():
@@ -106,11 +114,10 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
         n = pencil.space.n_dof
         if n <= 1500 or 4 * k > n:
             return Dense()
-        if not isinstance(pencil.stiffness, StencilOperator):
-            return ShiftInvert()
         # In 3D factorisations fill in.
         if pencil.space.dimension == 3:
-            large = n * k >= _LARGE_IN_3D and k <= ChebyshevFilter().max_pairs(n)
+            grid = isinstance(pencil.stiffness, StencilOperator)
+            large = grid and n * k >= _LARGE_IN_3D and k <= ChebyshevFilter().max_pairs(n)
             return ChebyshevFilter() if large else ShiftInvert()
         # Block Lanczos is faster from about 60² nodes on, but takes some ten seconds to compile. In float32 matrices
         # it has float32 factors, where the host's solver has float64.

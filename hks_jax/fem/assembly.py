@@ -1,4 +1,4 @@
-"""From a tensor field or a surface to its stiffness and mass: one element's integrals, mapped over all elements."""
+"""From a tensor field or a mesh to its stiffness and mass: one element's integrals, mapped over all elements."""
 
 from functools import lru_cache, partial
 from itertools import product
@@ -10,33 +10,38 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.domain.static_array import StaticArray
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain import spd
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, mirror_problems, normalise_boundary
-from hks_jax.fem.elements import at_quadrature, element_matrices, tensor_product_element, triangle_element
-from hks_jax.fem.operators import DiagonalOperator, Operator, SparseOperator, StencilOperator
+from hks_jax.fem.elements import at_quadrature, element_matrices, simplex_element, tensor_product_element
+from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
-from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.fem.resolution import grid_resolution, mesh_resolution
+from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
+from hks_jax.linear.pattern import SparsePattern
 
 MassKind = Literal["consistent", "lumped"]
 
 
 def assemble(
-    domain: TensorField | SurfaceMesh, boundary: BoundarySpec = "neumann", mass: MassKind = "consistent"
+    domain: TensorField | SimplicialMesh, boundary: BoundarySpec = "neumann", mass: MassKind = "consistent"
 ) -> Pencil | MirrorPencil:
     """Assemble the generalized eigenproblem Kφ = λMφ of the Laplace–Beltrami operator.
 
     K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus and Hotz, section 3), with Q1 elements and 2^d
-    Gauss points on grids, T interpolated multilinearly; with P1 elements on surface meshes.
+    Gauss points on grids, T (or its logarithm: `TensorField.interpolation`) interpolated multilinearly; with P1
+    elements on meshes, where T is constant on each triangle or tetrahedron.
 
     Args:
-        domain: a tensor field or a surface mesh.
+        domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
         boundary: ``"neumann"`` (natural), ``"dirichlet"`` (φ = 0: these nodes are eliminated), ``"periodic"`` (node n
             is node 0: an axis of n nodes has the period n·h) or ``"mirror"`` (the domain reflected on every side); one
             name for all axes or one per axis, where a pair (low, high) of the first two tells the sides apart. They
-            act on the sides of the grid; the rim of a mask is always natural. A surface mesh takes ``"neumann"`` or
-            ``"dirichlet"``, which act on its rim.
+            act on the sides of the grid; the rim of a mask is always natural. A mesh takes ``"neumann"`` or
+            ``"dirichlet"``, which act on its boundary.
         mass: ``"consistent"`` or ``"lumped"`` (row sums; diagonal).
 
     Returns:
@@ -50,12 +55,12 @@ def assemble(
     """
     if mass not in ("consistent", "lumped"):
         raise ValueError(f'mass: got {mass!r}; expected "consistent" or "lumped"')
-    if isinstance(domain, SurfaceMesh):
+    if isinstance(domain, SimplicialMesh):
         if boundary not in ("neumann", "dirichlet"):
-            raise ValueError(f'boundary: got {boundary!r}; a surface mesh takes "neumann" or "dirichlet"')
+            raise ValueError(f'boundary: got {boundary!r}; a mesh takes "neumann" or "dirichlet"')
         return _assemble_mesh(domain, mesh_space(domain.triangulation, boundary), mass)
     if not isinstance(domain, TensorField):
-        raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField or a SurfaceMesh")
+        raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
     if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
         raise ValueError("domain: got a batch of tensor fields; expected one. Map over the batch with jax.vmap")
     sides = normalise_boundary(boundary, domain.grid.dimension)
@@ -72,52 +77,53 @@ def assemble(
 
 def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Pencil:
     # The masks go in as arrays, so that problems that differ only in them share one compilation.
-    tensors = field.domain_tensors
-    tensors = jnp.where(space.domain[..., None, None], tensors, jnp.eye(space.dimension, dtype=tensors.dtype))
-    stiffness, consistent, lumped, width = _grid_integrals(
-        tensors, space.elements, free_couplings(space), space.periodic, space.grid.spacing
+    tensors, settings = field.tensors, (space.periodic, space.grid.spacing, field.interpolation)
+    stiffness, consistent, lumped, volume = _grid_integrals(
+        tensors, space.domain, space.elements, free_couplings(space), *settings
     )
-    return _pencil(
-        StencilOperator(coefficients=stiffness, space=space),
-        StencilOperator(coefficients=consistent, space=space),
-        lumped,
-        width,
-        mass,
-    )
+    # Constant to derivatives before it is computed, it is not compiled again for them.
+    resolution = grid_resolution(jax.lax.stop_gradient(tensors), space.domain, *settings, mass == "lumped")
+    chosen = _chosen_mass(mass, space, StencilOperator(coefficients=consistent, space=space), lumped)
+    stiffness = StencilOperator(coefficients=stiffness, space=space)
+    return Pencil(stiffness, chosen, resolution.mapped(space.restrict), volume, space)
 
 
-@partial(jax.jit, static_argnames=("periodic", "spacing"))
+def _chosen_mass(
+    mass: MassKind, space: FunctionSpace, consistent: PatternedOperator, lumped: Float[Array, "*node_shape"]
+) -> Operator:
+    return consistent if mass == "consistent" else DiagonalOperator(entries=space.restrict(lumped))
+
+
+@partial(jax.jit, static_argnames=("periodic", "spacing", "interpolation"))
 def _grid_integrals(
     tensors: Float[Array, "*shape d d"],
+    domain: Bool[Array, "*shape"],
     elements: Bool[Array, "*elements"],
     couplings: Bool[Array, "offsets *shape"],
     periodic: tuple[bool, ...],
     spacing: tuple[float, ...],
+    interpolation: Interpolation,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return stiffness and mass as stencils, ∫ √|T| hᵢ of all nodes, and the nodes' mesh width."""
+    """Return stiffness and mass as stencils, ∫ √|T| hᵢ of all nodes, and the volume."""
     element = tensor_product_element(spacing)
+    tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
 
-    def integrals(corner_tensors: Float[Array, "n d d"]) -> tuple[Array, Array]:
-        return element_matrices(at_quadrature(corner_tensors, element), element)
+    # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them
+    # into everything that reads a component, and compute them again for each.
+    nodal = tensors if interpolation == "linear" else spd.log(tensors)
+    metric = jax.vmap(lambda corners: at_quadrature(corners, element))(_corner_tensors(nodal, periodic))
+    if interpolation == "log-euclidean":
+        metric = jax.lax.optimization_barrier(spd.exp(jax.lax.optimization_barrier(metric)))
 
     def stencil(matrices: Float[Array, "E n n"]) -> Float[Array, "offsets *shape"]:
         kept = jnp.where(elements[..., None, None], matrices.reshape(*elements.shape, *matrices.shape[1:]), 0)
         return _stencil(kept, periodic)
 
-    stiffness, mass = jax.vmap(integrals)(_corner_tensors(tensors, periodic))
-    squared = jnp.asarray(np.square(spacing), tensors.dtype)
-    width = jnp.sqrt(jnp.max(jnp.diagonal(tensors, axis1=-2, axis2=-1) * squared, axis=-1))
+    stiffness, mass = jax.vmap(lambda points: element_matrices(points, element))(metric)
     stiffness, mass = stencil(stiffness), stencil(mass)
     # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
     lumped = jnp.sum(mass, axis=0)
-    return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, width
-
-
-def _pencil(stiffness: Operator, consistent: Operator, lumped: Array, width: Array, mass: MassKind) -> Pencil:
-    """Choose the mass; ``lumped`` and ``width`` are nodal."""
-    space, volume = stiffness.space, jnp.sum(lumped)
-    chosen = consistent if mass == "consistent" else DiagonalOperator(entries=space.restrict(lumped), space=space)
-    return Pencil(stiffness, chosen, space.restrict(width), volume)
+    return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, jnp.sum(lumped)
 
 
 def _corner_tensors(tensors: Float[Array, "*shape d d"], periodic: tuple[bool, ...]) -> Float[Array, "E n d d"]:
@@ -163,33 +169,33 @@ def free_couplings(space: GridSpace) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnames=("space", "mass"))
-def _assemble_mesh(mesh: SurfaceMesh, space: MeshSpace, mass: MassKind) -> Pencil:
-    element = triangle_element()
-    metric, points = mesh.metric, element.weights.size
+def _assemble_mesh(mesh: SimplicialMesh, space: MeshSpace, mass: MassKind) -> Pencil:
+    metric, element = mesh.metric, simplex_element(space.dimension)
+    cells, n_vertices = space.triangulation.cells, space.triangulation.n_vertices
+    points = element.weights.size
 
-    def integrals(triangle_metric: Float[Array, "2 2"]) -> tuple[Array, Array]:
-        return element_matrices(jnp.broadcast_to(triangle_metric, (points, 2, 2)), element)
+    def integrals(cell_metric: Float[Array, "d d"]) -> tuple[Array, Array]:
+        return element_matrices(jnp.broadcast_to(cell_metric, (points, *cell_metric.shape)), element)
 
     stiffness, consistent = jax.vmap(integrals)(metric)
-    where, slots, rows, cols = _mesh_pattern(space)
+    where, slots, pattern = _mesh_pattern(space)
 
-    def gather(matrices: Float[Array, "F 3 3"]) -> SparseOperator:
-        data = jax.ops.segment_sum(matrices.reshape(-1)[where.value], slots.value, rows.value.size)
-        return SparseOperator(data=data, space=space, rows=rows, cols=cols)
+    def gather(matrices: Float[Array, "n corners corners"]) -> SparseOperator:
+        entries = jax.ops.segment_sum(matrices.reshape(-1)[where], slots, pattern.rows.size)
+        return SparseOperator(entries, pattern)
 
-    # A vertex is as coarse as its longest edge.
-    longest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(metric, axis1=1, axis2=2), axis=1), 0))
-    width = jax.ops.segment_max(jnp.repeat(longest, 3), mesh.faces.ravel(), mesh.vertices.shape[0])
-    lumped = jax.ops.segment_sum(jnp.sum(consistent, axis=-1).ravel(), mesh.faces.ravel(), mesh.vertices.shape[0])
-    return _pencil(gather(stiffness), gather(consistent), lumped, width, mass)
+    lumped = jax.ops.segment_sum(jnp.sum(consistent, axis=-1).ravel(), cells.ravel(), n_vertices)
+    resolution = mesh_resolution(metric, cells, n_vertices, mass == "lumped")
+    chosen = _chosen_mass(mass, space, gather(consistent), lumped)
+    return Pencil(gather(stiffness), chosen, resolution.mapped(space.restrict), jnp.sum(lumped), space)
 
 
 @lru_cache(maxsize=16)
-def _mesh_pattern(space: MeshSpace) -> tuple[StaticArray, StaticArray, StaticArray, StaticArray]:
-    """Which local entries count (both ends free), the matrix entry that each adds to, and the entries' positions."""
-    n = space.n_dof
-    faces = space.degrees_of_freedom[space.triangulation.faces]
-    rows, cols = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, (1, 3)).ravel()
+def _mesh_pattern(space: MeshSpace) -> tuple[np.ndarray, np.ndarray, SparsePattern]:
+    """Return which local entries count (both ends free), the matrix entry that each adds to, and the pattern."""
+    n, corners = space.n_dof, space.dimension + 1
+    cells = space.degrees_of_freedom[space.triangulation.cells]
+    rows, cols = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, (1, corners)).ravel()
     where = np.flatnonzero((rows >= 0) & (cols >= 0))
     keys, slots = np.unique(rows[where] * n + cols[where], return_inverse=True)
-    return StaticArray(where), StaticArray(slots), StaticArray(keys // n), StaticArray(keys % n)
+    return where, slots, SparsePattern(n, keys // n, keys % n)

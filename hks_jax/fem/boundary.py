@@ -1,6 +1,7 @@
 """Boundary conditions per axis and side; the mirror as a set of mixed problems; reflected strips."""
 
 from itertools import product
+from types import EllipsisType
 from typing import TypeAlias
 
 import jax.numpy as jnp
@@ -89,10 +90,12 @@ def reflect(field: TensorField, width: int) -> TensorField:
     mask = None if grid.mask is None else np.pad(grid.mask, pad, mode="reflect")
     origin = [o - width * h for o, h in zip(grid.origin, grid.spacing, strict=True)]
     shape = [n + 2 * width for n in grid.shape]
-    return TensorField(Grid(shape, grid.spacing, origin, mask, components="all"), tensors)
+    return TensorField(Grid(shape, grid.spacing, origin, mask, components="all"), tensors, field.interpolation)
 
 
-def crop(values: Float[Array, "*leading_and_enlarged"], grid: Grid) -> Float[Array, "*leading_and_shape"]:
+def crop(
+    values: Float[Array | np.ndarray, "*leading_and_enlarged"], grid: Grid
+) -> Float[Array | np.ndarray, "*leading_and_shape"]:
     """Cut the trailing axes of ``values`` centrally down to the shape of ``grid``: the inverse of `reflect`."""
     d = grid.dimension
     excess = [big - n for big, n in zip(np.shape(values)[-d:], grid.shape, strict=True)]
@@ -101,4 +104,6 @@ def crop(values: Float[Array, "*leading_and_enlarged"], grid: Grid) -> Float[Arr
             f"values: got trailing shape {np.shape(values)[-d:]}; expected {grid.shape} plus an even number of nodes "
             "per axis, as `reflect` makes it"
         )
-    return values[(..., *[slice(e // 2, e // 2 + n) for e, n in zip(excess, grid.shape, strict=True)])]
+    centre = [slice(e // 2, e // 2 + n) for e, n in zip(excess, grid.shape, strict=True)]
+    index: tuple[EllipsisType | slice, ...] = (..., *centre)
+    return values[index]

@@ -1,5 +1,6 @@
 """The element: shape functions at quadrature points, and the integrals of one element."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -70,9 +71,15 @@ def tensor_product_element(spacing: tuple[float, ...]) -> Element:
     return Element(values, gradients, np.full(n, np.prod(spacing) / n))
 
 
-@lru_cache(maxsize=1)
-def triangle_element() -> Element:
-    """Return the P1 element on the unit triangle with the three-point rule that is exact for the mass."""
-    values = np.full((3, 3), 1 / 6) + np.eye(3) / 2
-    gradients = np.broadcast_to(np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]), (3, 3, 2))
-    return Element(values, np.array(gradients), np.full(3, 1 / 6))
+# With d + 1 points, one beside each corner, whose barycentric coordinates are 1 − d·a and d times a, the rule of equal
+# weights is exact for polynomials of degree two if Σ over the points of hᵢhⱼ has the mean 1/((d + 1)(d + 2)), i ≠ j:
+# 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), whose smaller solution is the a below.
+@lru_cache(maxsize=2)
+def simplex_element(dimension: int) -> Element:
+    """Return the P1 element on the unit triangle or tetrahedron, with d + 1 points: exact for the mass."""
+    d = dimension
+    beside = (d + 2 - math.sqrt(d + 2)) / ((d + 1) * (d + 2))
+    values = np.full((d + 1, d + 1), beside) + (1 - (d + 1) * beside) * np.eye(d + 1)
+    gradients = np.concatenate([-np.ones((1, d)), np.eye(d)])
+    weights = np.full(d + 1, 1 / math.factorial(d + 1))
+    return Element(values, np.stack([gradients] * (d + 1)), weights)

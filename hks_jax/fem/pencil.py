@@ -1,32 +1,41 @@
 """The matrix pencil of the Laplace–Beltrami operator."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hks_jax.fem.operators import Operator
+from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.linear.operators import Operator
+from hks_jax.linear.pencil import SymmetricPencil
 
 
-class Pencil(eqx.Module):
-    """The stiffness K and mass M of Kφ = λMφ, symmetric, K ⪰ 0, M ≻ 0.
+class Pencil(SymmetricPencil):
+    """The stiffness K ⪰ 0 and mass M ≻ 0 of functions on a domain.
 
     Attributes:
         stiffness: K; multiply with ``@``, or take ``.to_scipy()``, ``.to_dense()``.
         mass: M, likewise.
-        mesh_width: the local distance of neighbouring nodes in the units of the metric, (n_dof,).
+        resolution: what the spacing of the nodes does to signatures, for estimates.
         volume: the area or volume of the domain in the units of the metric, eliminated nodes included.
+        space: the space of the functions.
     """
 
-    stiffness: Operator
-    mass: Operator
-    mesh_width: Float[Array, " n_dof"]
+    resolution: Resolution
     volume: Float[Array, ""]
+    space: FunctionSpace = eqx.field(static=True)
 
     @property
-    def space(self) -> FunctionSpace:
-        """The space of the degrees of freedom."""
-        return self.stiffness.space
+    def mesh_width(self) -> Float[Array, " n_dof"]:
+        """The local distance of neighbouring nodes in the units of the metric, (n_dof,)."""
+        return self.resolution.mesh_width
+
+    @property
+    def n_null(self) -> int:
+        """How many constants K annihilates: those of natural components."""
+        return self.space.n_null
 
     @property
     def parts(self) -> tuple["Pencil", ...]:
@@ -68,17 +77,22 @@ class MirrorPencil(eqx.Module):
         return self.parts[0].mesh_width
 
     @property
+    def resolution(self) -> Resolution:
+        """What the spacing of the nodes does to signatures, for estimates."""
+        return self.parts[0].resolution
+
+    @property
     def volume(self) -> Float[Array, ""]:
         """The area or volume of the reflected domain."""
         return len(self.parts) * self.parts[0].volume
 
     def apply_stiffness(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
         """Apply to each row, a function of one part in the space of the first, the stiffness of its part."""
-        return self._apply([piece.stiffness for piece in self.parts], x, part)
+        return self._apply(lambda piece: piece.stiffness, x, part)
 
     def apply_mass(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
         """Apply to each row the mass of its part."""
-        return self._apply([piece.mass for piece in self.parts], x, part)
+        return self._apply(lambda piece: piece.mass, x, part)
 
     def among(
         self, images: Float[Array, "k n_dof"], vectors: Float[Array, "k n_dof"], part: Int[Array, " k"]
@@ -87,10 +101,10 @@ class MirrorPencil(eqx.Module):
         products = len(self.parts) * jnp.matmul(images, vectors.T, precision="highest")
         return jnp.where(part[:, None] == part, products, 0)
 
-    def _apply(self, operators: list[Operator], x: Array, part: Array) -> Array:
+    def _apply(self, operator: Callable[[Pencil], Operator], x: Array, part: Array) -> Array:
         total = jnp.zeros_like(x)
-        for i, operator in enumerate(operators):
+        for i, piece in enumerate(self.parts):
             rows = self.space.extend(jnp.where(part[:, None] == i, x, 0), outside=0.0)
-            image = operator.space.extend(operator.apply(operator.space.restrict(rows)), outside=0.0)
+            image = piece.space.extend(operator(piece).apply(piece.space.restrict(rows)), outside=0.0)
             total = total + self.space.restrict(image)
         return total

@@ -1,5 +1,6 @@
 """The rim of a domain, grid sides and mask alike: its length or area, and zero on all of it."""
 
+import math
 from itertools import product
 
 import jax
@@ -8,12 +9,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.domain.components import wrap_nodes
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.domain.triangulation import FACETS
 from hks_jax.fem.assembly import free_couplings
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
+from hks_jax.fem.space import FunctionSpace, GridSpace
 
 
 @jax.tree_util.register_static
@@ -42,8 +44,8 @@ def pin_rim(pencil: Pencil) -> Pencil:
         StencilOperator(coefficients=jnp.where(couplings, operator.coefficients, 0), space=space)
         for operator in (pencil.stiffness, pencil.mass)
     )
-    width = space.restrict(natural.extend(pencil.mesh_width))
-    return Pencil(stiffness, mass, width, pencil.volume)
+    resolution = pencil.resolution.mapped(lambda values: space.restrict(natural.extend(values)))
+    return Pencil(stiffness, mass, resolution, pencil.volume, space)
 
 
 def rim_nodes(space: GridSpace) -> Bool[np.ndarray, "*shape"]:
@@ -59,14 +61,14 @@ def rim_nodes(space: GridSpace) -> Bool[np.ndarray, "*shape"]:
     return space.domain & (count < 2**space.dimension)
 
 
-def rim_measure(domain: TensorField | SurfaceMesh, space: FunctionSpace) -> float:
+def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
     """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part.
 
     Args:
         domain: the field or mesh; not traced.
         space: the space of its functions, which knows the conditions.
     """
-    if isinstance(domain, SurfaceMesh):
+    if isinstance(domain, SimplicialMesh):
         return _mesh_rim(domain, space)
     assert isinstance(space, GridSpace)
     return sum(_grid_rim(domain, space, axis) for axis in range(space.dimension))
@@ -98,12 +100,12 @@ def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
     return float(faces @ sign)
 
 
-def _mesh_rim(mesh: SurfaceMesh, space: FunctionSpace) -> float:
-    assert isinstance(space, MeshSpace)
-    metric = np.asarray(mesh.metric, np.float64)
-    # Edge lengths² of v₁−v₀, v₂−v₁, v₀−v₂ in the basis (v₁−v₀, v₂−v₀).
-    squared = np.einsum("ea,fab,eb->fe", steps := np.array([[1, 0], [-1, 1], [0, -1]]), metric, steps)
-    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
-    _, index, counts = np.unique(edges, axis=0, return_index=True, return_counts=True)
-    length = float(np.sqrt(squared.ravel()[index[counts == 1]]).sum())
-    return -length if "dirichlet" in space.boundary[0] else length
+def _mesh_rim(mesh: SimplicialMesh, space: FunctionSpace) -> float:
+    """Add up the facets that belong to one cell only."""
+    d, triangulation = space.dimension, mesh.triangulation
+    cell, corner = np.divmod(triangulation.boundary_facets, d + 1)
+    corners = np.concatenate([np.zeros((1, d)), np.eye(d)])[FACETS[d][corner]]  # in the basis of the cell's edges
+    steps = corners[:, 1:] - corners[:, :1]
+    gram = np.einsum("fia,fab,fjb->fij", steps, np.asarray(mesh.metric, np.float64)[cell], steps)
+    measure = float(np.sqrt(np.linalg.det(gram)).sum()) / math.factorial(d - 1)
+    return -measure if "dirichlet" in space.boundary[0] else measure

@@ -73,7 +73,7 @@ class FunctionSpace:
     def restrict(self, nodal: Float[Array, "*leading_and_node_shape"]) -> Float[Array, "... n_dof"]:
         """Take the values at the free nodes."""
         flat = jnp.reshape(nodal, (*nodal.shape[: nodal.ndim - len(self.node_shape)], self.free.size))
-        return flat if self._all_free else flat[..., self._free_indices]
+        return flat if self._all_free else taken(flat, self._free_indices)
 
     def extend(
         self, values: Float[Array, "... n_dof"], outside: float = float("nan")
@@ -82,15 +82,29 @@ class FunctionSpace:
         shape = (*values.shape[:-1], *self.node_shape)
         if self._all_free:
             return values.reshape(shape)
-        fill = jnp.asarray(np.where(self.domain.ravel(), 0.0, outside), values.dtype)
-        full = jnp.broadcast_to(fill, (*values.shape[:-1], fill.size))
-        return full.at[..., self._free_indices].set(values, unique_indices=True, indices_are_sorted=True).reshape(shape)
+        fill = np.where(self.domain.ravel(), 0.0, outside).astype(values.dtype)
+        return _spread(values, self._free_indices, fill).reshape(shape)
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, FunctionSpace) and self._key == other._key)
 
     def __hash__(self) -> int:
         return hash(self._key)
+
+
+# The indices go in as arrays, so that equal numbers of them, wherever they lie, share one compilation.
+@jax.jit
+def taken(values: Float[Array, "... n"], indices: Int[np.ndarray | Array, " m"]) -> Float[Array, "... m"]:
+    """Return the values at some places of the last axis."""
+    return values[..., indices]
+
+
+@jax.jit
+def _spread(
+    values: Float[Array, "... m"], indices: Int[np.ndarray | Array, " m"], fill: Float[np.ndarray | Array, " n"]
+) -> Float[Array, "... n"]:
+    full = jnp.broadcast_to(fill, (*values.shape[:-1], fill.size))
+    return full.at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
 
 
 @jax.tree_util.register_static
@@ -128,16 +142,16 @@ class GridSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class MeshSpace(FunctionSpace):
-    """The P1 space on a triangulation."""
+    """The P1 space on a mesh of triangles or tetrahedra."""
 
     def __init__(self, triangulation: Triangulation, condition: str) -> None:
         self.triangulation = triangulation
         self.boundary = ((condition, condition),)
-        self.node_shape, self.dimension = (triangulation.n_vertices,), 2
+        self.node_shape, self.dimension = (triangulation.n_vertices,), triangulation.dimension
         self.domain = np.ones(self.node_shape, dtype=bool)
         self.free = ~triangulation.boundary_vertices if condition == "dirichlet" else self.domain
         if not self.free.any():
-            raise ValueError("boundary: every vertex is on the mesh's rim, so that Dirichlet leaves none free")
+            raise ValueError("boundary: every vertex is on the mesh's boundary, so that Dirichlet leaves none free")
         self._labels, self.n_components = triangulation.labels
         self._key = (triangulation, condition)
 

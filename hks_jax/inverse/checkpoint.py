@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import os
-import zipfile
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 
 from hks_jax.atomic import atomic_path
 from hks_jax.inverse.metric_fit import Step
+from hks_jax.npz import load_npz
 
 
 class Checkpoint(NamedTuple):
@@ -54,30 +54,30 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        ValueError: it is of another fit, or no checkpoint.
+        ValueError: it is of another fit, damaged, or no checkpoint.
     """
     try:
-        data = np.load(path)
-        marked = str(data["mark"])
-    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile):
-        raise ValueError(f"checkpoint: {path} is not one of a fit; give another name, or remove it") from None
-    with data:
-        if marked != mark:
-            raise ValueError(
-                f"checkpoint: {path} is of another fit (another target, initial field or setting); give another name, "
-                "or remove it"
-            )
-        history = []
-        for step, loss, misfit, gradient, accepted, seconds, stage, start in data["history"]:
-            history.append(
-                Step(int(step), loss, misfit, gradient, bool(accepted), float(seconds), int(stage), int(start))
-            )
-        return Checkpoint(
-            data["values"],
-            history,
-            int(data["start"]),
-            int(data["stage"]),
-            float(data["step_size"]),
-            data["best"],
-            list(map(float, data["losses"])),
+        data = load_npz(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"checkpoint: {error}; or give another name, or remove it") from error
+    lacking = {"mark", *Checkpoint._fields} - set(data)
+    if lacking:
+        names = ", ".join(sorted(lacking))
+        raise ValueError(f"checkpoint: {path} is not one of a fit, it lacks {names}; give another name, or remove it")
+    if str(data["mark"]) != mark:
+        raise ValueError(
+            f"checkpoint: {path} is of another fit (another target, initial field or setting); give another name, "
+            "or remove it"
         )
+    history = []
+    for step, loss, misfit, gradient, accepted, seconds, stage, start in data["history"]:
+        history.append(Step(int(step), loss, misfit, gradient, bool(accepted), float(seconds), int(stage), int(start)))
+    return Checkpoint(
+        data["values"],
+        history,
+        int(data["start"]),
+        int(data["stage"]),
+        float(data["step_size"]),
+        data["best"],
+        list(map(float, data["losses"])),
+    )

@@ -13,19 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.inverse import checkpoint as files
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Loss, Observation, Signature, observe
 from hks_jax.inverse.optimise import Optimiser, loss_of, optimise
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
-from hks_jax.inverse.problem import Problem, fit_solver, most_pairs, pairs_below, pairs_for
+from hks_jax.inverse.problem import Problem, fit_solver, most_pairs, pairs_below, pairs_for, unknowns_of
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.smoothing import Euclidean, InnerProduct, smoothing
+from hks_jax.inverse.truncated import more_pairs, observed_times, truncation_misfit, truncation_shows
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
 
 OPTIMISERS = ("gauss-newton", "lbfgs", "bfgs")
@@ -83,13 +87,19 @@ def fit_metric(
         weights: ≥ 0, broadcast to the target's shape; 0 for what is not observed (it may be NaN there).
         regularisers: of `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
         noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``): stop where the misfit reaches it.
-        k: eigenpairs; by default as many as the smallest time needs.
+        k: eigenpairs; by default so many that a share of 1e-6 of the heat trace at the smallest time lies beyond them,
+            by Weyl's law; all, if so many are needed. They become more if the fit comes to a field of more volume. For
+            ``"wks"`` what lies up to 2σ above the largest energy.
         boundary: as for `eigenpairs`.
         solver: eigensolver; ``"auto"`` chooses for many products with one Jacobian.
         optimiser: ``"gauss-newton"`` (damped, matrix-free), ``"lbfgs"``, ``"bfgs"``, or a solver of optimistix.
         smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth; 0 for no preference; by
             default a tenth of the domain, and 0 for ``"conformal"`` without noise.
-        tolerance: the change of unknowns and residuals (root mean square) at which it has converged.
+        tolerance: what the unknowns u still change, relative to 1 + |u| (root mean square over all of them), when it
+            has converged: both the last step and what is left by it and the one before, were they the beginning of a
+            geometric series, are below it; after this the linear systems are solved to 30 times more digits, with three
+            times as many products, and a step of that kind must meet it too. Directions that so many products do not
+            find are not in it: `identifiability` tells of them. (Solvers of optimistix: the last step alone.)
         max_steps: steps per stage.
         continuation: stages: the first fits the largest times alone, the last all of them.
         starts: how often to start, the first time from ``init``, then from random smooth changes of it; the best wins.
@@ -101,6 +111,9 @@ def fit_metric(
     Returns:
         The fit. ``fit.result`` says how it ended; nothing is raised when it stalls or is interrupted.
 
+    Warns:
+        AccuracyWarning: the misfit is near to what k pairs leave out: the fit matches its own truncation.
+
     Raises:
         ValueError: a target that is NaN, not positive or of the wrong shape; times that the grid cannot resolve; an
             unknown choice; a checkpoint of another fit.
@@ -109,16 +122,20 @@ def fit_metric(
     if not isinstance(init, TensorField):
         raise TypeError(f"init: got {type(init).__name__}; expected hks_jax.TensorField")
     for name, number in (("max_steps", max_steps), ("continuation", continuation), ("starts", starts)):
-        if number != int(number) or number < 1:
-            raise ValueError(f"{name}: got {number}; expected an integer from 1")
-    if noise is not None and not 0 < noise < math.inf:
-        raise ValueError(f"noise: got {noise}; expected a positive standard deviation, or None")
+        require_count(name, number)
+    require_number("tolerance", tolerance, 1)
+    require_number("spread", spread, inclusive=True)
+    if noise is not None:
+        require_number("noise", noise)
+    if smoothness is not None:
+        require_number("smoothness", smoothness, inclusive=True)
     pencil = assemble(init, boundary)
-    space, volume, dtype = pencil.space, float(pencil.volume), init.domain_tensors.dtype
+    space, dtype = pencil.space, init.domain_tensors.dtype
     unknowns: Unknowns
     if callable(parametrisation) and not isinstance(parametrisation, Parametrisation):
         if parameters is None:
             raise ValueError("parameters: got None; a parametrisation by a function needs parameters to start from")
+        require_real("parameters", parameters)
         unknowns = Free(parametrisation, parameters, init)
     else:
         unknowns = Nodal(choose_parametrisation(parametrisation), init, nodes_of(space.domain))
@@ -130,7 +147,7 @@ def fit_metric(
     stages = _stages(whole, weights, np.shape(target), continuation, observation)
     problems = []
     for each in stages:
-        pairs = _pairs(each, k, np.shape(target), volume, space)
+        pairs = _pairs(each, k, np.shape(target), pencil, init)
         chosen = fit_solver(space.n_dof, pairs, pencil) if solver == "auto" else solver
         problems.append(Problem(unknowns, each, tuple(regularisers), pairs, boundary, chosen))
 
@@ -157,7 +174,10 @@ def fit_metric(
         log.history, log.losses, log.best = list(resumed.history), list(resumed.losses), jnp.asarray(resumed.best)
         clock -= log.history[-1].seconds
     result = best_result = "interrupted"
-    for log.start in range(resumed.start if resumed else 0, starts):
+    # The last stage may be followed by one with more eigenpairs, in which no start is open any more.
+    extended = resumed is not None and resumed.stage == len(problems)
+    first_start = resumed.start if resumed else 0
+    for log.start in range(starts if extended else first_start, starts):
         values, step_size, from_stage = _moved(first, inner_product, spread, seed, log.start), 1.0, 0
         if resumed and log.start == resumed.start:
             values, step_size, from_stage = jnp.asarray(resumed.values), resumed.step_size, resumed.stage
@@ -177,9 +197,30 @@ def fit_metric(
         log.losses.append(reached)
         if result == "interrupted":
             break
-    final, misfit = map(float, loss_of(problems[-1], log.best))
+    problem = problems[-1]
+    if extended and resumed is not None:
+        log.best, best_result = jnp.asarray(resumed.values), "converged"
+    log.stage = len(problems)
+    # k was chosen for the volume of the start: the fit may have come to more of it.
+    while True:
+        final, misfit = map(float, loss_of(problem, log.best))
+        left = float(truncation_misfit(problem, log.best))
+        shows = truncation_shows(misfit, left)
+        wanted = more_pairs(problem, log.best) if shows and k is None else problem.k
+        if wanted <= problem.k or best_result in ("interrupted", "not finite"):
+            break
+        chosen = fit_solver(space.n_dof, wanted, pencil) if solver == "auto" else solver
+        problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
+        method = _optimiser(optimiser, tolerance, noise, inner_product, 1.0)
+        log.best, best_result = optimise(problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock)
+    if shows:
+        warn_of_accuracy(
+            f"k: {problem.k} eigenpairs leave out what amounts to a misfit of about {left:.1e}, and the fit's is "
+            f"{misfit:.1e}: it has fitted its own truncation. Use k=None, or k={more_pairs(problem, log.best)} or "
+            f"more; only if the target was itself computed with {problem.k} pairs is nothing wrong"
+        )
     history, losses = tuple(log.history), tuple(log.losses)
-    return MetricFit(unknowns.field(log.best), final, misfit, history, best_result, log.best, problems[-1], losses)
+    return MetricFit(unknowns.field(log.best), final, misfit, history, best_result, log.best, problem, losses)
 
 
 @dataclasses.dataclass
@@ -221,7 +262,13 @@ def _stages(
     return [*stages, whole]
 
 
-def _pairs(observation: Observation, k: int | None, shape: tuple[int, ...], volume: float, space: Any) -> int:
+def _pairs(
+    observation: Observation,
+    k: int | None,
+    shape: tuple[int, ...],
+    pencil: Pencil | MirrorPencil,
+    field: TensorField,
+) -> int:
     """Return how many eigenpairs to compute."""
     if observation.signature == "eigenvalues":
         return shape[0]
@@ -233,17 +280,14 @@ def _pairs(observation: Observation, k: int | None, shape: tuple[int, ...], volu
     if observation.signature == "wks":
         assert observation.sigma is not None
         reach = float(jnp.max(observation.times) + 2 * observation.sigma)
-        wanted = pairs_below(math.exp(reach), volume, space.dimension)
-        if k is None and wanted > most_pairs(space.n_dof):
+        wanted, unknowns = pairs_below(math.exp(reach), pencil, field), unknowns_of(pencil)
+        if k is None and wanted > most_pairs(unknowns):
             raise ValueError(
                 f"times: got energies up to {float(jnp.max(observation.times)):.4g}, which take about {wanted} "
-                f"eigenpairs; with {space.n_dof} unknowns {most_pairs(space.n_dof)} can be fitted. Use lower energies"
+                f"eigenpairs; with {unknowns} unknowns {most_pairs(unknowns)} can be fitted. Use lower energies"
             )
     else:
-        # Only the times that are observed in this stage.
-        per_time = math.prod(shape[1:])
-        times = np.asarray(observation.times)[np.unique(observation.entries.value // per_time)]
-        wanted = pairs_for(times, volume, space.dimension, space.n_dof)
+        wanted = pairs_for(observed_times(observation), pencil, field)  # those of this stage
     return wanted if k is None else k
 
 
@@ -254,8 +298,6 @@ def _inner_product(unknowns: Unknowns, smoothness: float | None, noise: float | 
     if smoothness is None:
         extent = max(h * (n - 1) for h, n in zip(grid.spacing, grid.shape, strict=True))
         smoothness = 0.1 * extent if unknowns.smooth or noise is not None else 0.0
-    if not 0 <= smoothness < math.inf:
-        raise ValueError(f"smoothness: got {smoothness}; expected a length ≥ 0 in coordinate units")
     return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype)
 
 

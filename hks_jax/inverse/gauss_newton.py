@@ -10,6 +10,7 @@ import lineax as lx  # type: ignore[import-untyped]
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.checks import require_count, require_number
 from hks_jax.inverse.smoothing import Euclidean, InnerProduct
 from hks_jax.inverse.unknowns import Values
 
@@ -18,12 +19,38 @@ _SCALE = 2.0**40
 length one and an operator so large that no change matters, the residual alone decides."""
 
 
+_TIGHTER, _LONGER = 30, 3
+"""By what the linear systems are solved more exactly before a fit counts as converged."""
+_FREE = 0.01
+"""What part of a step's curvature may be damping if the step is to tell how far the solution is."""
+
+
+def remaining_change(last: Array, before: Array) -> Array:
+    """Return the larger of the last step and of what would still follow if the last two began a geometric series."""
+    ratio = last / jnp.where(before > 0, before, jnp.inf)
+    ratio = jnp.where(before > 0, ratio, jnp.inf)
+    return jnp.where(ratio < 1, last * jnp.maximum(1, ratio / jnp.where(ratio < 1, 1 - ratio, 1)), jnp.inf)
+
+
 class _State(eqx.Module):
-    """The last accepted unknowns, the linearisation and the gradient there, and whether no step is needed any more."""
+    """What is known at the last accepted unknowns.
+
+    Attributes:
+        values: the unknowns.
+        f_info: the linearisation there.
+        gradient: the gradient.
+        change: the size of the last step, in tolerances.
+        damped: B in the direction of that step over the curvature that it saw: times μ, the part of damping.
+        tight: whether the linear systems are solved more exactly.
+        done: whether no step is needed any more.
+    """
 
     values: Values
     f_info: Any
     gradient: Values
+    change: Float[Array, ""]
+    damped: Float[Array, ""]
+    tight: Bool[Array, ""]
     done: Bool[Array, ""]
 
 
@@ -34,7 +61,7 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
     linearisation. Their result is a descent direction whenever they stop.
 
     Attributes:
-        tolerance: the relative and absolute change of unknowns and residuals at which no further step is computed.
+        tolerance: what the unknowns still change, relative and absolute, when no further step is computed.
         damping: μ at step size 1.
         inner_product: B.
         inner_tolerance: reduction of the linear residual.
@@ -52,20 +79,28 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
         empty = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, f_info_struct
         )
-        return _State(y, empty, jnp.zeros_like(y), jnp.zeros((), bool))
+        far, no = jnp.asarray(jnp.inf, y.dtype), jnp.zeros((), bool)
+        return _State(y, empty, jnp.zeros_like(y), far, far, no, no)
 
     def query(self, y: Values, f_info: Any, state: _State) -> _State:
-        """Return the gradient Jᵀr with the linearisation."""
-        still = self._small(y - state.values, y)
-        still &= self._small(f_info.residual - state.f_info.residual, f_info.residual)
-        return _State(y, f_info, f_info.compute_grad(), still)
+        """Return the gradient Jᵀr with the linearisation, and what the step that led here tells."""
+        step = y - state.values
+        change = optx.rms_norm(step / (self.tolerance * (1 + jnp.abs(y))))
+        moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
+        damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
+        damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
+        settled = moved & (remaining_change(change, state.change) < 1)
+        change = jnp.where(moved, change, jnp.inf)
+        return _State(y, f_info, f_info.compute_grad(), change, damped, state.tight | settled, state.tight & settled)
 
-    def _small(self, change: Array, values: Array) -> Bool[Array, ""]:
-        return optx.rms_norm(change / (self.tolerance * (1 + jnp.abs(values)))) < 1
+    def done(self, step_size: Array, state: _State) -> Bool[Array, ""]:
+        """Tell whether the unknowns have converged, and not only been held by damping."""
+        return state.done & (self.damping / step_size * state.damped < _FREE)
 
     def step(self, step_size: Array, state: _State) -> tuple[Values, optx.RESULTS]:
         """Return the step δ."""
-        step = jax.lax.cond(state.done, lambda: jnp.zeros_like(state.gradient), lambda: self._solve(step_size, state))
+        done = self.done(step_size, state)
+        step = jax.lax.cond(done, lambda: jnp.zeros_like(state.gradient), lambda: self._solve(step_size, state))
         fine = jnp.all(jnp.isfinite(step))
         return step, optx.RESULTS.where(fine, optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence)
 
@@ -81,12 +116,14 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
         semidefinite = lx.positive_semidefinite_tag
         operator = lx.FunctionLinearOperator(normal, structure, semidefinite)
         preconditioner = lx.FunctionLinearOperator(self.inner_product.solve, structure, semidefinite)
+        tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
+        steps = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
         size = jnp.linalg.norm(gradient)
         scaled = gradient / jnp.where(size > 0, size, 1)
         found = lx.linear_solve(
             operator,
             scaled,
-            lx.CG(0.0, self.inner_tolerance, optx.two_norm, stabilise_every=None, max_steps=self.inner_steps),
+            lx.CG(0.0, tolerance, optx.two_norm, stabilise_every=None, max_steps=steps),
             options={"preconditioner": preconditioner},
             throw=False,
         )
@@ -101,12 +138,13 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
     """The default solver of `hks_jax.fit_metric`.
 
     Args:
-        tolerance: the relative and absolute change of unknowns and residuals (root mean square) at which it stops.
+        tolerance: what the unknowns still change, relative and absolute (root mean square), when it stops; see
+            `hks_jax.fit_metric`.
         damping: μ of the first step, relative to the scale of the data.
         growth: by what μ is divided after a step that kept what the linearisation promised.
         inner_product: in which steps are small.
-        inner_tolerance: reduction of the linear residual in each step.
-        inner_steps: at most so many products with JᵀJ in each step.
+        inner_tolerance: reduction of the linear residual in each step; the last steps go 30 times further.
+        inner_steps: at most so many products with JᵀJ in each step; in the last steps three times as many.
     """
 
     rtol: float
@@ -125,6 +163,11 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
         inner_tolerance: float = 3e-2,
         inner_steps: int = 120,
     ) -> None:
+        require_number("tolerance", tolerance)
+        require_number("damping", damping, inclusive=True)
+        require_number("growth", growth, above=1)
+        require_number("inner_tolerance", inner_tolerance, 1)
+        require_count("inner_steps", inner_steps)
         self.rtol = self.atol = tolerance
         self.norm = optx.rms_norm
         self.descent = DampedDescent(
@@ -132,3 +175,9 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
         )
         self.search = optx.ClassicalTrustRegion(high_cutoff=0.5, high_constant=growth)
         self.verbose = _silent
+
+    def terminate(
+        self, fn: Any, y: Values, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """Tell whether the unknowns have converged."""
+        return self.descent.done(state.search_state.step_size, state.descent_state), state.result

@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import require_count, require_number
 from hks_jax.inverse.metric_fit import MetricFit
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
+from hks_jax.linear.chebyshev import chebyshev_recurrence
 
 _ROUNDS = 4
 """Rounds of Chebyshev filtering for the weakest directions, each with what the last one found."""
@@ -20,7 +22,7 @@ class Identifiability(eqx.Module):
 
     With independent residuals of standard deviation σ the information about the unknowns is JᵀJ/σ². Against a prior of
     standard deviation τ, a direction v of JᵀJ with eigenvalue s² is determined by s²/(s² + σ²/τ²): near one by the
-    data, near zero by the prior.
+    data, near zero by the prior. The prior is white: it expects nothing of neighbours.
 
     Attributes:
         strengths: (n,) the largest eigenvalues s² of JᵀJ, descending; per unit of residual variance.
@@ -29,7 +31,10 @@ class Identifiability(eqx.Module):
         weak_directions: (n_weak, *values) directions that the data hardly see.
         resolution: (nodes,) for each node of the domain, what part of its unknowns the data determine: 0 … 1. A lower
             bound, by the n directions alone.
-        deviation: (nodes,) the standard deviation of a node's unknowns (root mean square) that is left. An upper bound.
+        deviation: (nodes,) the standard deviation of a node's unknowns (root mean square) that is left, by the n
+            directions alone: an upper bound of that of the exact posterior, to first order, under a white prior
+            (unknowns independent of each other, of standard deviation τ each). Under a prior that expects
+            neighbours to be alike less is left.
         effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
         noise: σ.
         prior: τ.
@@ -75,7 +80,7 @@ def identifiability(
         n: how many strong directions.
         n_weak: how many weak ones.
         noise: σ, the standard deviation of each entry's residual before weighting (0.01 for 1 % under ``"log"``).
-        prior: τ, in the units of the parametrisation.
+        prior: τ, in the units of the parametrisation, of every unknown alone.
         iterations: of the subspace iteration; each takes n + 8 products with J and with Jᵀ.
         seed: of the random start.
 
@@ -92,6 +97,9 @@ def identifiability(
     total = values.size
     if not 1 <= n <= total or not 1 <= n_weak <= total:
         raise ValueError(f"n, n_weak: got {n}, {n_weak}; expected 1 … {total}, the number of unknowns")
+    require_number("noise", noise)
+    require_number("prior", prior)
+    require_count("iterations", iterations)
     keys = jax.random.split(jax.random.key(seed))
     start = jax.random.normal(keys[0], (min(n + 8, total), *values.shape), values.dtype)
     strengths, directions = _strongest(problem, values, start, iterations)
@@ -144,22 +152,22 @@ def _strongest(problem: Problem, values: Values, start: Array, iterations: int) 
 def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, ""], degree: int) -> tuple[Array, Array]:
     product = _information(problem, values)
     shape = start.shape
-    block = _orthonormal(start.reshape(shape[0], -1)).reshape(shape)
-    values = jnp.full(shape[0], 0.2 * top)
-    for _ in range(_ROUNDS):
+
+    def improve(_: Any, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        values, block = found
         # A Chebyshev polynomial that is small between what is weak as far as is known and the top, and grows below.
         cut = jnp.mean(values)
         centre, half = (1.1 * top + cut) / 2, (1.1 * top - cut) / 2
 
-        def recur(_: Any, state: tuple[Array, Array], centre: Array = centre, half: Array = half) -> tuple:
-            before, now = state
-            return now, 2 / half * (product(now) - centre * now) - before
+        def scaled(x: Array) -> Array:
+            return (product(x) - centre * x) / half
 
-        first = (product(block) - centre * block) / half
-        _, block = jax.lax.fori_loop(1, degree, recur, (block, first))
+        block, _, _ = chebyshev_recurrence(scaled, block, degree)
         block = _orthonormal(block.reshape(shape[0], -1)).reshape(shape)
-        values, block = _ritz(block, product(block), largest=False)
-    return values, block
+        return _ritz(block, product(block), largest=False)
+
+    block = _orthonormal(start.reshape(shape[0], -1)).reshape(shape)
+    return jax.lax.fori_loop(0, _ROUNDS, improve, (jnp.full(shape[0], 0.2 * top), block))
 
 
 def _orthonormal(rows: Float[Array, "n m"]) -> Float[Array, "n m"]:

@@ -9,7 +9,7 @@ from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
 
 RESULTS = {
-    "converged": "the unknowns and the residuals no longer change",
+    "converged": "the unknowns no longer change by more than the tolerance",
     "noise level reached": "the misfit is what the stated noise explains",
     "steps exhausted": "max_steps was reached; allow more",
     "stalled": "no step improves the loss any more; damping, regularisers or k may need a change",

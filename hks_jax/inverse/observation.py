@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.domain.static_array import StaticArray
+from hks_jax.checks import require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.signatures.heat import heat_trace, hks
+from hks_jax.signatures.heat import heat_trace, hks_of_pairs
 from hks_jax.signatures.times import checked_times
 from hks_jax.signatures.wave import wks
+from hks_jax.static_array import StaticArray
 
 Signature = Callable[[Eigenpairs], Array]
 Loss = Callable[[Array, Array], Array]
@@ -54,7 +55,7 @@ class Observation(eqx.Module):
         if callable(self.signature):
             return self.signature(pairs)
         if self.signature == "hks":
-            return hks(pairs, self.times)
+            return hks_of_pairs(pairs, self.times)
         if self.signature == "wks":
             return wks(pairs, self.times, self.sigma)
         if self.signature == "heat-trace":
@@ -63,9 +64,12 @@ class Observation(eqx.Module):
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
         """Return the residuals, half of whose sum of squares is the misfit."""
-        predicted = self.predict(pairs).reshape(-1)[self.entries.value]
+        return self.compare(self.predict(pairs))
+
+    def compare(self, predicted: Array) -> Float[Array, " m"]:
+        """Return the residuals of a whole signature."""
         loss = self.loss if callable(self.loss) else LOSSES[self.loss]
-        return self.root_weights * loss(predicted, self.target)
+        return self.root_weights * loss(predicted.reshape(-1)[self.entries.value], self.target)
 
 
 def observe(
@@ -90,6 +94,8 @@ def observe(
     if not callable(loss) and loss not in LOSSES:
         names = ", ".join(map(repr, LOSSES))
         raise ValueError(f"loss: got {loss!r}; expected {names}, or a function of predicted and target values")
+    for name, given in (("target", target), ("times", times), ("weights", weights)):
+        require_real(name, given)
     values = np.asarray(target, np.float64)
     nodal = (signature in ("hks", "wks")) if not callable(signature) else False
     if signature in ("hks", "heat-trace"):
@@ -97,6 +103,7 @@ def observe(
     elif signature == "wks":
         if sigma is None:
             raise ValueError("sigma: got None; expected the width of the wave kernel signature, as for `wks`")
+        require_number("sigma", sigma)
         times, sigma = jnp.asarray(times, dtype), jnp.asarray(sigma, dtype)
     else:
         times = None

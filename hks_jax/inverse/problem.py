@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.block_lanczos import BlockLanczos
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.operators import StencilOperator
@@ -18,8 +18,10 @@ from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.unknowns import Unknowns, Values
+from hks_jax.signatures.tail import resolving
+from hks_jax.signatures.weyl import weyl_count
 
-_TAIL = 1e-3
+TAIL = 1e-6
 """What part of the heat trace at the smallest time may lie beyond the pairs that are computed."""
 _LOST = 0.05
 """What part makes a time unresolvable."""
@@ -70,10 +72,9 @@ def fit_solver(n_dof: int, k: int, pencil: Pencil | MirrorPencil) -> str | Eigen
     return "shift-invert"
 
 
-def pairs_below(eigenvalue: float, volume: float, dimension: int) -> int:
+def pairs_below(eigenvalue: float, pencil: Pencil | MirrorPencil, field: TensorField) -> int:
     """Return about how many eigenvalues lie below one, by Weyl's law, and some more."""
-    constant = 4 * math.pi if dimension == 2 else 6 * math.pi**2
-    return math.ceil(1.1 * volume / constant * eigenvalue ** (dimension / 2)) + 4
+    return math.ceil(1.1 * float(weyl_count(pencil, [eigenvalue], field)[0])) + 4
 
 
 def most_pairs(n_dof: int) -> int:
@@ -81,22 +82,27 @@ def most_pairs(n_dof: int) -> int:
     return max(n_dof // 4, min(n_dof, 20))
 
 
-def pairs_for(times: Any, volume: float, dimension: int, n_dof: int) -> int:
-    """Return how many eigenpairs resolve the smallest time.
+def pairs_for(times: Any, pencil: Pencil | MirrorPencil, field: TensorField) -> int:
+    """Return how many eigenpairs resolve the smallest time to `TAIL`: all, if that many are needed.
 
     Raises:
-        ValueError: more than the grid has.
+        ValueError: the grid does not resolve that time.
     """
-    smallest, most = float(np.min(np.asarray(times))), most_pairs(n_dof)
+    smallest, n_dof, d = float(np.min(np.asarray(times))), unknowns_of(pencil), pencil.space.dimension
+    most = most_pairs(n_dof)
 
     def count(tail: float) -> int:
-        # Of the heat trace exp(−Λt) lies beyond Λ in 2D, and a little more in 3D.
-        return pairs_below(-math.log(tail) / smallest, volume, dimension)
+        return pairs_below(resolving(tail, d) / smallest, pencil, field)
 
     if count(_LOST) > most:
-        least = smallest * (count(_LOST) / most) ** (2 / dimension)
+        least = smallest * (count(_LOST) / most) ** (2 / d)
         raise ValueError(
             f"times: got {smallest:.4g}, which takes about {count(_LOST)} eigenpairs to resolve to {_LOST:.0%}; with "
             f"{n_dof} unknowns {most} can be fitted. Use times from about {least:.3g}, or a finer grid"
         )
-    return min(count(_TAIL), most)
+    return min(count(TAIL), n_dof)
+
+
+def unknowns_of(pencil: Pencil | MirrorPencil) -> int:
+    """Return how many eigenpairs there are."""
+    return sum(part.space.n_dof for part in pencil.parts)

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import require_number
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.inverse.parametrisation import to_coordinates
@@ -23,6 +24,10 @@ class Regulariser(eqx.Module):
     """
 
     weight: eqx.AbstractVar[float]
+
+    def __check_init__(self) -> None:
+        """Check the weight."""
+        require_number("weight", self.weight, inclusive=True)
 
     @abstractmethod
     def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
@@ -50,6 +55,10 @@ class TotalVariation(Regulariser):
 
     weight: float
     epsilon: float = 0.1
+
+    def __check_init__(self) -> None:
+        """Check the threshold."""
+        require_number("epsilon", self.epsilon)
 
     def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
         """Return gradients at the nodes, scaled so that half their square is the penalty."""

@@ -10,12 +10,12 @@ from jaxtyping import Array, Float
 
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.dissection import dissect
-from hks_jax.eigen.multifrontal import Factorisation, factorise
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.inverse.unknowns import Values
+from hks_jax.linear.dissection import dissect
+from hks_jax.linear.multifrontal import Factorisation, factorise
 
 
 class InnerProduct(eqx.Module):
@@ -81,6 +81,6 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     assert isinstance(pencil.space, GridSpace)
     factor = None
     if length > 0:
-        dissection = jax.tree.map(jnp.asarray, dissect(pencil.space))
-        factor = factorise(dissection, pencil, jnp.asarray(-1 / length**2, dtype))
+        dissection = jax.tree.map(jnp.asarray, dissect(pencil.pattern))
+        factor = factorise(dissection, pencil.shifted(jnp.asarray(-1 / length**2, dtype)))
     return Smoothing(pencil, factor, jnp.asarray(length, dtype), jnp.mean(pencil.mass.diagonal()))

@@ -11,9 +11,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from hks_jax.domain.static_array import StaticArray
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.inverse.parametrisation import Parametrisation
+from hks_jax.static_array import StaticArray
 
 Values = Float[Array, "..."]
 
@@ -76,7 +76,7 @@ class Nodal(Unknowns):
         all_tensors = self.init.domain_tensors.reshape(-1, grid.dimension, grid.dimension)
         moved = self.parametrisation.tensors(values, self._base)
         full = all_tensors.at[self.nodes.value].set(moved)
-        return TensorField(grid, full.reshape(*grid.shape, grid.dimension, grid.dimension))
+        return TensorField(grid, full.reshape(self.init.domain_tensors.shape), self.init.interpolation)
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
         """Return the parameters' slopes along the grid's edges, axis by axis; zero where an end is outside."""
@@ -98,7 +98,7 @@ class Free(Unknowns):
     Attributes:
         function: maps them to a field, or to tensors on the grid of the initial field.
         parameters: where to start, any pytree of floating point arrays.
-        init: the initial field, for its grid.
+        init: the initial field, for its grid and interpolation.
     """
 
     function: Callable[[Any], Any] = eqx.field(static=True)
@@ -121,7 +121,9 @@ class Free(Unknowns):
     def field(self, values: Values) -> TensorField:
         """Return the field with these parameters."""
         found = self.function(self.unravel(values))
-        return found if isinstance(found, TensorField) else TensorField(self.init.grid, found)
+        if isinstance(found, TensorField):
+            return found
+        return TensorField(self.init.grid, found, self.init.interpolation)
 
 
 def nodes_of(domain: np.ndarray) -> StaticArray:

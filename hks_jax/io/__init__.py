@@ -8,6 +8,7 @@ from hks_jax.io.dwi import fit_dwi as fit_dwi
 from hks_jax.io.masks import erode as erode
 from hks_jax.io.masks import read_mask as read_mask
 from hks_jax.io.mesh import read_mesh as read_mesh
+from hks_jax.io.mesh import read_mesh_arrays as read_mesh_arrays
 from hks_jax.io.read import read_tensors as read_tensors
 from hks_jax.io.repair import REPAIRS as REPAIRS
 from hks_jax.io.repair import find_invalid as find_invalid

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.io.masks import as_mask
-from hks_jax.io.npz import load_npy, load_npz
 from hks_jax.io.tensor_order import choices, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
+from hks_jax.npz import load_npy, load_npz
 
 
 def read_tensors(
@@ -34,7 +34,7 @@ def read_tensors(
     tensors, order = _matrices(name, values, order or _text(arrays, "order"))
     d = tensors.shape[-1] if tensors.ndim else 0
     affine, mask = arrays.get("affine"), arrays.get("mask")
-    affine = None if affine is None else np.asarray(affine, np.float64)
+    affine = None if affine is None else _real(f"{name}: affine", affine)
     frame = frame or _text(arrays, "frame") or "voxel"
     if frame != "voxel":
         if affine is None or d != 3:
@@ -44,8 +44,8 @@ def read_tensors(
         raise ValueError(f"spacing: {name} has its own, {np.asarray(arrays['spacing']).tolist()}; leave this out")
     return TensorVolume(
         tensors,
-        _per_axis(arrays.get("spacing", 1.0) if spacing is None else spacing, d),
-        _per_axis(arrays.get("origin", 0.0), d),
+        _per_axis(f"{name}: spacing", arrays.get("spacing", 1.0) if spacing is None else spacing, d),
+        _per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
         None if mask is None else as_mask(f"{name}: mask", mask),
         affine,
         order=order,
@@ -54,8 +54,8 @@ def read_tensors(
     )
 
 
-def _matrices(name: str, values: np.ndarray, order: str | None) -> tuple[Float[np.ndarray, "*shape d d"], str]:
-    """Return matrices from matrices, or from the six or three components of symmetric ones; and their order."""
+def _matrices(name: str, values: np.ndarray, order: str | None) -> tuple[Float[np.ndarray, "..."], str]:
+    """Return matrices from the six or three components of symmetric ones, other arrays as they are; and their order."""
     if (values.ndim, values.shape[-1:]) not in ((4, (6,)), (3, (3,))):
         if order not in (None, "matrix"):
             raise ValueError(f"order: {name} holds whole matrices along the grid's axes; leave this out")
@@ -69,9 +69,16 @@ def _matrices(name: str, values: np.ndarray, order: str | None) -> tuple[Float[n
 
 
 def _text(arrays: Mapping[str, Any], key: str) -> str | None:
-    return None if key not in arrays else str(np.asarray(arrays[key]).item())
+    return None if key not in arrays else str(np.asarray(arrays[key]))
 
 
-def _per_axis(value: Any, d: int) -> tuple[float, ...]:
-    array = np.asarray(value, np.float64)
+def _real(name: str, value: Any) -> Float[np.ndarray, "..."]:
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: got dtype {array.dtype}; expected real numbers")
+    return array.astype(np.float64)
+
+
+def _per_axis(name: str, value: Any, d: int) -> tuple[float, ...]:
+    array = _real(name, value)
     return tuple((np.full(d, array) if array.ndim == 0 else array.ravel()).tolist())

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import warnings
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from hks_jax.io.masks import as_mask, read_mask
 from hks_jax.io.provenance import digest
 from hks_jax.io.tensor_order import to_voxel_axes
 from hks_jax.io.volume import TensorVolume
+from hks_jax.reading import existing, reading
 
 
 class ExampleBrain(NamedTuple):
@@ -89,7 +91,7 @@ def fit_dwi(
             f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
             "at least 6 and 1"
         )
-    signal = nifti.voxels(image)[..., used]
+    signal = nifti.voxels(path, image)[..., used]
     inside, found = _inside(mask, signal[..., b[used] <= threshold], affine, segmentation)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
@@ -144,7 +146,10 @@ def _dipy() -> tuple[ModuleType, ModuleType, ModuleType]:
 
 
 def _numbers(path: str | os.PathLike[str]) -> Float[np.ndarray, "..."]:
-    try:
-        return np.loadtxt(nifti.existing(path), dtype=np.float64)
-    except ValueError as error:
-        raise ValueError(f"{os.fspath(path)}: expected a table of numbers ({error})") from error
+    file = existing(path)
+    with reading(file, "a table of numbers"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a table without numbers
+        numbers = np.loadtxt(file, dtype=np.float64)
+        if not numbers.size or not np.isfinite(numbers).all():
+            raise ValueError("it has none, or NaN or infinite ones")
+    return numbers

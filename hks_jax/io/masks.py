@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
 
+from hks_jax.checks import require_real
 from hks_jax.io import nifti, nrrd
-from hks_jax.io.npz import load_npy, load_npz
+from hks_jax.npz import load_npy, load_npz
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -26,7 +27,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
     name = os.fspath(path)
     if nifti.is_nifti(path):
         image = nifti.load(path)
-        values = nifti.voxels(image)
+        values = nifti.voxels(path, image)
         while values.ndim > 3 and values.shape[-1] == 1:
             values = values[..., 0]
         if affine is not None:
@@ -50,6 +51,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
 def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
     """Return zeros and ones as booleans; raise ValueError for anything else."""
     array = np.asarray(values)
+    require_real(name, array)
     if array.dtype != bool and not np.isin(array, (0, 1)).all():
         raise ValueError(f"{name}: got mask values other than 0 and 1; threshold it first, for example mask > 0.5")
     return array.astype(bool)

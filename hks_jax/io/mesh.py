@@ -1,147 +1,136 @@
-"""Triangle meshes through meshio, and VTK's polygonal data, which meshio leaves out, through VTK; both are optional."""
+"""Meshes of triangles or tetrahedra in files: what reads which format, and writing through meshio."""
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
+from hks_jax.domain.simplices import signed_measure
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.io.nifti import existing
-from hks_jax.io.vtk_image import holds_dataset, require_vtk
+from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.io import cortex
+from hks_jax.io.mesh_formats import Loaded, meshio, polygonal, through_meshio
+from hks_jax.io.vtk_image import holds_dataset
+from hks_jax.reading import existing
 
-READ = (".vtk", ".vtu", ".vtp", ".ply", ".stl", ".obj", ".off")
-WRITTEN = (".vtu", ".vtk", ".ply")
-"""The formats with room for values at the vertices."""
-
-
-def meshio() -> ModuleType:
-    """Import meshio.
-
-    Raises:
-        ImportError: it is not installed; says how to get it.
-    """
-    try:
-        import meshio
-    except ImportError as error:
-        raise ImportError(
-            'reading and writing meshes needs meshio, which is not installed: pip install "hks-jax[mesh]"'
-        ) from error
-    return meshio
+READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", ".gii.gz")
+"""The suffixes of meshes; FreeSurfer's surfaces, which have none of their own, are known by their first bytes."""
+WRITTEN = {".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".ply": "ply"}
+"""The formats with room for values at the vertices, and what meshio calls them. PLY has triangles only."""
 
 
-def read_mesh(path: str | os.PathLike[str], *, clean: bool = False) -> SurfaceMesh:
-    """Read a triangle mesh: ``.vtk``, ``.vtu``, ``.ply``, ``.stl``, ``.obj``, ``.off`` through meshio.
+def read_mesh(path: str | os.PathLike[str], *, clean: bool = False) -> SurfaceMesh | TetMesh:
+    """Read a mesh: tetrahedra, where the file has any, or else triangles.
 
-    Polygonal data in ``.vtk`` and ``.vtp``, which meshio does not read, come through VTK. Quadrilaterals (there, all
-    polygons) are cut into triangles; vertices keep their order. STL has no vertices, only corners: those at the same
-    place become one vertex.
+    ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply``, ``.stl``, ``.obj``, ``.off`` through meshio; polygonal data in
+    ``.vtk`` and ``.vtp``, which meshio does not read, through VTK; GIFTI (``.gii``) and FreeSurfer's surfaces
+    (``lh.white``, … by their first bytes) through nibabel, their coordinates as they are in the file.
+
+    Quadrilaterals (of polygonal data all polygons) are cut into triangles; vertices keep their order. STL has no
+    vertices, only corners: those at the same place become one vertex. Beside tetrahedra, the triangles, lines and
+    points of their boundary are passed over.
 
     Args:
         path: the file.
-        clean: make one vertex of those at the same place (as at a texture's seams), then drop triangles without area
-            and vertices without a triangle, all of which a `SurfaceMesh` refuses. The vertices are numbered anew, in
-            the order of the file.
+        clean: make one vertex of those at the same place (as at a texture's seams), then drop cells without area or
+            volume and vertices without a cell, and turn tetrahedra round whose vertices are in the other order, all of
+            which a `SurfaceMesh` or `TetMesh` refuses. The vertices are numbered anew, in the order of the file.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: an unknown kind of file, an unreadable one, other cells than triangles and quadrilaterals, or a mesh
-            that `SurfaceMesh` refuses.
-        ImportError: meshio, or for polygonal data VTK, is missing.
+        ValueError: an unknown kind of file, an unreadable one, cells that are neither triangles, quadrilaterals nor
+            tetrahedra, or a mesh that `SurfaceMesh` or `TetMesh` refuses.
+        ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
-    vertices, faces = _load(str(existing(path)))
-    if clean:
-        vertices, faces = _cleaned(vertices, faces)
+    loaded = _load(path, clean)
+    make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
     try:
-        return SurfaceMesh(vertices, faces)
+        return make(loaded.vertices, loaded.cells)
     except ValueError as error:
         remedy = "" if clean else ". clean=True merges vertices at one place and drops what has no area or no face"
+        if not clean and make is TetMesh:
+            remedy = ". clean=True merges vertices at one place, drops what is flat or unused, and orders the others"
         raise ValueError(f"{os.fspath(path)}: {error}{remedy}") from error
 
 
+def read_mesh_arrays(
+    path: str | os.PathLike[str], *, clean: bool = False
+) -> dict[str, Float[np.ndarray, "V *components"]]:
+    """Read the arrays at the vertices of a mesh, by name, such as tensors or the signatures that `save` writes.
+
+    Formats that have such arrays are ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply``; others give none.
+
+    Args:
+        path: the file.
+        clean: as for `read_mesh`: the arrays follow the numbering that it gives.
+
+    Returns:
+        The arrays of real numbers, floating point, (V,) or (V, components): symmetric tensors of nine components
+        become (V, 3, 3) by ``array.reshape(-1, 3, 3)``.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file that is no mesh, or unreadable.
+        ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
+    """
+    return _load(path, clean).arrays
+
+
+def is_mesh(path: Path) -> bool:
+    """Tell whether a file is one that `read_mesh` reads, by its suffix or, for want of one, its first bytes."""
+    name = path.name.lower()
+    if name.endswith(".vtk"):
+        return path.is_file() and not holds_dataset(path, "STRUCTURED_POINTS")
+    return name.endswith(READ) or cortex.is_freesurfer(path)
+
+
 def write(
-    path: str | os.PathLike[str], arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SurfaceMesh, record: str
+    path: str | os.PathLike[str], arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str
 ) -> Path:
     """Write a mesh with values at its vertices, and a file ``path.json`` beside it that says where they came from."""
     name = os.fspath(path)
-    suffix = Path(name).suffix.lower()
-    if suffix not in WRITTEN:
-        raise ValueError(f"path: got {name!r}; values at vertices are written as {', '.join(WRITTEN)} or .npz")
+    suffix, solid = Path(name).suffix.lower(), mesh.triangulation.dimension == 3
+    allowed = [s for s in WRITTEN if not (solid and s == ".ply")]
+    if suffix not in allowed:
+        what = "values at the vertices of tetrahedra" if solid else "values at vertices"
+        raise ValueError(f"path: got {name!r}; {what} are written as {', '.join(allowed)} or .npz")
     library = meshio()
-    cells = [("triangle", mesh.faces.astype(np.int32))]  # what PLY has room for
+    cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # what PLY has room for
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})
     with atomic_path(name + ".json") as beside, atomic_path(name) as temporary:
-        getattr(library, suffix[1:]).write(str(temporary), whole)
+        getattr(library, WRITTEN[suffix]).write(str(temporary), whole)
         beside.write_text(json.dumps(json.loads(record), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return Path(path)
 
 
-def _load(name: str) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    suffix = Path(name).suffix.lower()
-    if suffix not in READ:
-        raise ValueError(f"{name}: unknown kind of mesh; expected {', '.join(READ)}")
-    if suffix == ".vtp" or (suffix == ".vtk" and holds_dataset(name, "POLYDATA")):
-        return _polygonal(name)
-    library = meshio()
-    try:
-        # The format's own reader: meshio.read ends the process where it cannot read a file.
-        with np.errstate(over="ignore"):  # of a text's letters, which it takes for a number of triangles first
-            read = getattr(library, suffix[1:]).read(name)
-    except (library.ReadError, ValueError, KeyError, IndexError, AssertionError, OSError, EOFError) as error:
-        raise ValueError(f"{name}: meshio cannot read it as {suffix} ({error or type(error).__name__})") from error
-    points = np.asarray(read.points, np.float64)
-    others = {block.type for block in read.cells} - {"triangle", "quad", "vertex", "line"}
-    if others:
-        raise ValueError(f"{name}: has {', '.join(sorted(others))} cells; expected triangles (or quadrilaterals)")
-    faces = [_triangles(block.data) for block in read.cells if block.type in ("triangle", "quad")]
-    if points.ndim != 2 or points.shape[1] not in (2, 3) or not faces:
-        raise ValueError(f"{name}: has no triangles; expected a surface in two or three dimensions")
-    flat = np.zeros((len(points), 3 - points.shape[1]))
-    return np.concatenate([points, flat], axis=1), np.concatenate(faces).astype(np.int64)
+def _load(path: str | os.PathLike[str], clean: bool) -> Loaded:
+    file = existing(path)
+    name = file.name.lower()
+    if name.endswith((".gii", ".gii.gz")):
+        loaded = cortex.load_gifti(file)
+    elif name.endswith(".vtp") or (name.endswith(".vtk") and holds_dataset(file, "POLYDATA")):
+        loaded = polygonal(str(file))
+    elif name.endswith(READ):
+        loaded = through_meshio(str(file))
+    elif cortex.is_freesurfer(file):
+        loaded = cortex.load_freesurfer(file)
+    else:
+        raise ValueError(f"{file}: unknown kind of mesh; expected {', '.join(READ)}, or a surface of FreeSurfer's")
+    return _cleaned(loaded) if clean else loaded
 
 
-def _polygonal(name: str) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    require_vtk()
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
-    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    reader = vtkPolyDataReader() if name.lower().endswith(".vtk") else vtkXMLPolyDataReader()
-    errors: list[str] = []
-    reader.AddObserver("ErrorEvent", lambda source, event: errors.append(event))
-    reader.SetFileName(name)
-    triangles = vtkTriangleFilter()
-    triangles.PassLinesOff()
-    triangles.PassVertsOff()
-    triangles.SetInputConnection(reader.GetOutputPort())
-    triangles.Update()
-    surface = triangles.GetOutput()
-    if errors or not surface.GetNumberOfPolys():
-        raise ValueError(f"{name}: VTK finds no triangles in it; expected polygonal data, whole")
-    points = np.asarray(vtk_to_numpy(surface.GetPoints().GetData()), np.float64)
-    faces = np.asarray(vtk_to_numpy(surface.GetPolys().GetConnectivityArray()), np.int64)
-    return points, faces.reshape(-1, 3)
-
-
-def _triangles(cells: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "m 3"]:
-    if cells.shape[1] == 3:
-        return cells
-    return np.stack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
-
-
-def _cleaned(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    _, first, inverse = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
-    faces = first[inverse.ravel()[faces]]
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    longest = np.max([np.sum((p - q) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    faces = faces[area > 1e-10 * longest]
-    used, numbered = np.unique(faces, return_inverse=True)
-    return vertices[used], numbered.reshape(faces.shape)
+def _cleaned(loaded: Loaded) -> Loaded:
+    _, first, inverse = np.unique(loaded.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
+    cells = first[inverse.ravel()[loaded.cells]]
+    measure, sound = signed_measure(loaded.vertices, cells)
+    if cells.shape[1] == 4:
+        cells = np.where(measure[:, None] < 0, cells[:, [1, 0, 2, 3]], cells)
+    cells = cells[sound]
+    used, numbered = np.unique(cells, return_inverse=True)
+    arrays = {name: values[used] for name, values in loaded.arrays.items()}
+    return Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays)

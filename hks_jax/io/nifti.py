@@ -1,15 +1,17 @@
 """NIfTI through nibabel, which is optional."""
 
+import gzip
+import math
 import os
-import zlib
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from hks_jax.checks import require_real
 from hks_jax.io.tensor_order import FRAMES, choices, pack, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
+from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
 SYMMETRIC_MATRIX = 1005
@@ -31,51 +33,60 @@ def nibabel() -> ModuleType:
         import nibabel
     except ImportError as error:
         raise ImportError(
-            'reading and writing NIfTI needs nibabel, which is not installed: pip install "hks-jax[dti]"'
+            "reading and writing NIfTI, GIFTI and FreeSurfer's files needs nibabel, which is not installed: "
+            'pip install "hks-jax[dti]"'
         ) from error
     return nibabel
 
 
 def load(path: str | os.PathLike[str]) -> Any:
-    """Open a NIfTI image.
+    """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not a NIfTI image.
+        ValueError: not a NIfTI image, or a damaged one.
     """
-    nib = nibabel()
-    existing(path)
-    try:
-        return nib.load(path)
-    except (nib.filebasedimages.ImageFileError, OSError, EOFError, zlib.error) as error:
-        raise ValueError(f"{os.fspath(path)}: not a readable NIfTI image ({error})") from error
+    nib, file = nibabel(), existing(path)
+    with reading(file, "a readable NIfTI image"):
+        if file.name.lower().endswith(".gz"):
+            with gzip.open(file) as stream:
+                content = stream.read()
+            kinds = {348: nib.Nifti1Image, 540: nib.Nifti2Image}
+            kind = next((kind for size, kind in kinds.items() if size in _either_order(content[:4])), None)
+            if kind is None:
+                raise ValueError("it does not begin with the size of NIfTI's header")
+            image, length = kind.from_bytes(content), len(content)
+        else:
+            image, length = nib.load(file), file.stat().st_size
+        _check_length(image, length)
+    return image
 
 
-def voxels(image: Any) -> np.ndarray:
-    """Return the voxel values of an image, scaled, floating point as stored or float64.
+def _either_order(head: bytes) -> tuple[int, int]:
+    return int.from_bytes(head, "little"), int.from_bytes(head, "big")
+
+
+def _check_length(image: Any, length: int) -> None:
+    """Raise ValueError where the header contradicts the length of the file."""
+    data = image.dataobj
+    declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
+    if declared != length:
+        raise ValueError(f"{data.dtype} of shape {image.shape} end at byte {declared}, the file at {length}")
+
+
+def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
+    """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64.
 
     Raises:
-        ValueError: a damaged file.
+        ValueError: a damaged file; values that are not real numbers.
     """
-    try:
+    with reading(path, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
-    except (OSError, EOFError, ValueError, zlib.error) as error:
-        raise ValueError(f"{image.get_filename()}: the voxel data are damaged or incomplete ({error})") from error
+    require_real(os.fspath(path), data)
+    if data.dtype.kind not in "fiub":
+        raise ValueError(f"{os.fspath(path)}: has voxels of type {data.dtype}; expected real numbers")
     dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
     return np.ascontiguousarray(data, dtype=dtype.newbyteorder("="))
-
-
-def existing(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a file that exists.
-
-    Raises:
-        FileNotFoundError: it does not, or is a folder.
-    """
-    file = Path(path)
-    if not file.is_file():
-        what = "is a folder; expected a file" if file.is_dir() else "no such file"
-        raise FileNotFoundError(f"{file}: {what}")
-    return file
 
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
@@ -98,7 +109,7 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
         order = "nifti"
     elif declared and order != "nifti":
         notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
-    tensors = unpack(voxels(image).reshape(*shape[:3], 6), order)
+    tensors = unpack(voxels(name, image).reshape(*shape[:3], 6), order)
     frame = FRAMES[order] if frame is None else frame
     affine = np.asarray(image.affine, np.float64)
     spacing = np.linalg.norm(affine[:3, :3], axis=0)

@@ -1,7 +1,7 @@
 """NRRD through pynrrd, which is optional: tensors of every kind that the format defines, masks and results."""
 
 import os
-import zlib
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.nifti import existing
+from hks_jax.io.nrrd_checks import check_data, check_header
 from hks_jax.io.tensor_order import choices, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
+from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nrrd", ".nhdr")
 
@@ -99,13 +100,17 @@ def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
         FileNotFoundError: no such file.
         ValueError: not an NRRD file, or a damaged one.
     """
-    nrrd = pynrrd()
-    existing(path)
-    try:
-        data, header = nrrd.read(os.fspath(path), index_order="F")
-    except (nrrd.NRRDError, OSError, EOFError, ValueError, KeyError, IndexError, zlib.error) as error:
-        raise ValueError(f"{os.fspath(path)}: not a readable NRRD file ({error})") from error
-    return data.astype(data.dtype.newbyteorder("=")), dict(header)
+    nrrd, file = pynrrd(), existing(path)
+    with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
+        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not
+        header = dict(nrrd.read_header(stream))
+        start = stream.tell()
+        stream.seek(0)
+        check_header(stream.read(start), header)
+        check_data(file, header, stream, start)
+        stream.seek(start)
+        data = nrrd.read_data(header, stream, str(file), index_order="F")
+    return data.astype(data.dtype.newbyteorder("=")), header
 
 
 def read_image(path: str | os.PathLike[str]) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:

@@ -1,5 +1,6 @@
 """Reading tensor volumes."""
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
+from hks_jax.checks import require_number
 from hks_jax.io import arrays, nifti, nrrd, vtk_image
 from hks_jax.io.masks import as_mask, read_mask
 from hks_jax.io.provenance import digest
@@ -72,6 +74,7 @@ def read_tensors(
             disagree; tensors that `repair` cannot mend.
         ImportError: an optional library is missing; says what to install.
     """
+    require_number("confidence", confidence, above=-math.inf)
     name = os.fspath(path)
     numpys = name.lower().endswith((".npz", ".npy"))
     if array is not None and not (numpys or vtk_image.is_vtk_image(name)):

@@ -1,5 +1,6 @@
 """Tensors that are not positive definite: how many, where, and what may be done about them, if asked."""
 
+import math
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -7,7 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from hks_jax.checks import require_number
 from hks_jax.domain import spd
+from hks_jax.domain.tensor_checks import least_eigenvalue, refuse, unsymmetric
 from hks_jax.io.volume import TensorVolume
 
 Repair = Literal["clip", "mask", "nearest"]
@@ -25,6 +28,8 @@ LISTED = 20
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
     """Mark the voxels inside whose tensor is not finite and positive definite, or has an eigenvalue below `floor`."""
+    if floor is not None:
+        require_number("floor", floor, above=-math.inf)
     inside = volume.inside
     bad = np.zeros(volume.shape, bool)
     bad[inside] = ~spd.is_spd(volume.tensors[inside])
@@ -36,9 +41,7 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
 
 def find_unsymmetric(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
     """Mark the voxels inside whose matrix is unsymmetric beyond rounding, as `hks_jax.TensorField` refuses them."""
-    scale = np.abs(volume.tensors).max(axis=(-2, -1))
-    skew = np.abs(volume.tensors - np.swapaxes(volume.tensors, -1, -2)).max(axis=(-2, -1))
-    return volume.inside & (skew > 1e-5 * scale)
+    return volume.inside & unsymmetric(volume.tensors)
 
 
 def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
@@ -46,15 +49,13 @@ def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
     bad = find_invalid(volume)
     if bad.any():
         finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
-        what = f"{int(bad.sum())} of {int(volume.inside.sum())} tensors are not positive definite"
+        what = "not positive definite"
         if finite.any():
-            worst = np.linalg.eigvalsh(volume.tensors[finite].astype(np.float64)).min()
-            what += f", worst eigenvalue {worst:.3g}"
+            what += f", worst eigenvalue {least_eigenvalue(volume.tensors[finite]):.3g}"
         if (bad & ~finite).any():
             what += f", {int((bad & ~finite).sum())} of them NaN or infinite"
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
         choices = ", ".join(f'"{name}" ({does})' for name, does in REPAIRS.items())
-        raise ValueError(f"tensors: {what} (the first at voxel {first}). Choose {argument}: {choices}")
+        refuse("tensors", bad, volume.inside, "voxel", what, f"Choose {argument}: {choices}")
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
@@ -80,8 +81,8 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     """
     if method not in get_args(Repair):
         raise ValueError(f"repair: got {method!r}; expected {', '.join(map(repr, REPAIRS))}")
-    if floor is not None and not 0 < floor < np.inf:
-        raise ValueError(f"floor: got {floor}; expected a positive number")
+    if floor is not None:
+        require_number("floor", floor)
     volume = without_background(volume)
     bad, lowest = find_invalid(volume, floor), floor
     inside = volume.inside
@@ -142,7 +143,7 @@ def _clip(tensors: Float[np.ndarray, "n d d"], floor: float) -> Float[np.ndarray
 def _report(volume: TensorVolume, bad: np.ndarray, method: str, floor: float | None) -> dict[str, Any]:
     finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
     where = np.argwhere(bad)
-    worst = float(np.linalg.eigvalsh(volume.tensors[finite].astype(np.float64)).min()) if finite.any() else None
+    worst = least_eigenvalue(volume.tensors[finite]) if finite.any() else None
     return {
         "method": method,
         "floor": floor,

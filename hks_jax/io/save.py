@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplices import WORDS
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import mesh, nifti, nrrd, vtk_image
 from hks_jax.io.provenance import describe
 from hks_jax.io.repair import find_unsymmetric
@@ -22,7 +23,7 @@ SUFFIXES = (".npz", ".nii.gz", ".nii", ".nrrd", ".vti")
 def save(
     path: str | os.PathLike[str],
     values: Float[Any, "*n_times_and_shape"],
-    volume: TensorVolume | SurfaceMesh,
+    volume: TensorVolume | SimplicialMesh,
     *,
     name: str = "values",
     extra: Mapping[str, Any] | None = None,
@@ -40,8 +41,8 @@ def save(
     ``.npz``: the arrays `name` (the values), ``spacing``, ``origin``, ``mask`` and ``affine`` (where there are any),
     ``slice_axis`` (for a slice), and those in `extra`.
 
-    A mesh's ``.vtu``, ``.vtk``, ``.ply``: the mesh, and one array per time, which is in its name. Its ``.npz``: `name`,
-    ``vertices``, ``faces``, and those in `extra`.
+    A mesh's ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and of triangles ``.ply``: the mesh, and one array per time, which is
+    in its name. Its ``.npz``: `name`, ``vertices``, ``faces`` (of tetrahedra ``cells``), and those in `extra`.
 
     Every file says where it came from, in JSON: the version, the tensors' file with its SHA-256, order and frame, what
     was decided in reading it, and `provenance`. It is the comment extension of NIfTI; ``provenance`` in the others; for
@@ -65,15 +66,16 @@ def save(
         ImportError: an optional library is missing; says what to install.
     """
     array = np.asarray(values)
-    shape = (len(volume.vertices),) if isinstance(volume, SurfaceMesh) else volume.shape
+    shape = (len(volume.vertices),) if isinstance(volume, SimplicialMesh) else volume.shape
     n = array.ndim - len(shape)
     if n not in (0, 1) or array.shape[n:] != shape:
         raise ValueError(f"values: got shape {array.shape}; expected {shape}, or n_times before it")
     extra = dict(extra or {})
-    if isinstance(volume, SurfaceMesh):
+    if isinstance(volume, SimplicialMesh):
         record = describe(None, provenance)
         if os.fspath(path).endswith(".npz"):
-            place = {"vertices": np.asarray(volume.vertices), "faces": volume.faces}
+            cells = {WORDS[volume.triangulation.dimension].argument: volume.triangulation.cells}
+            place = {"vertices": np.asarray(volume.vertices), **cells}
             return _write_npz(path, {name: array, **place, **extra, "provenance": record})
         return mesh.write(path, _by_time(name, array, n, extra), volume, record)
     record = describe(volume, provenance)

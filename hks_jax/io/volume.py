@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hks_jax.checks import require_real
 from hks_jax.domain.grid import Grid
 
 AXES = "xyz"
@@ -31,7 +32,7 @@ class TensorVolume:
         repair: what was done to tensors that are not positive definite, for reports; empty if nothing was.
 
     Raises:
-        ValueError: shapes that do not agree.
+        ValueError: shapes that do not agree; spacings that are not positive, numbers that are not finite.
     """
 
     tensors: Float[np.ndarray, "*shape d d"]
@@ -48,18 +49,24 @@ class TensorVolume:
     repair: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        where = f"{self.source}: " if self.source else ""
+        require_real(f"{where}tensors", self.tensors)
         shape, d = self.tensors.shape[:-2], self.tensors.shape[-1]
         if self.tensors.ndim not in (4, 5) or self.tensors.shape[-2:] != (len(shape),) * 2:
-            raise ValueError(f"tensors: got shape {self.tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)")
+            raise ValueError(
+                f"{where}tensors: got shape {self.tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)"
+            )
         for name, value in (("spacing", self.spacing), ("origin", self.origin)):
             if len(value) != d or not np.isfinite(value).all():
-                raise ValueError(f"{name}: got {value}; expected {d} finite numbers, one per axis")
+                raise ValueError(f"{where}{name}: got {value}; expected {d} finite numbers, one per axis")
+        if min(self.spacing) <= 0:
+            raise ValueError(f"{where}spacing: got {self.spacing}; expected positive numbers")
         if self.mask is not None and (self.mask.shape != shape or self.mask.dtype != bool):
             raise ValueError(
-                f"mask: got shape {self.mask.shape}, dtype {self.mask.dtype}; expected booleans of shape {shape}"
+                f"{where}mask: got shape {self.mask.shape}, dtype {self.mask.dtype}; expected booleans of shape {shape}"
             )
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
-            raise ValueError(f"affine: got shape {self.affine.shape}; expected (4, 4), finite")
+            raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected (4, 4), finite")
 
     @property
     def shape(self) -> tuple[int, ...]:

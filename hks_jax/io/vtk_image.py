@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.nifti import existing
 from hks_jax.io.tensor_order import choices, nearest_rotation, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
+from hks_jax.io.vtk_checks import check_legacy, check_xml
+from hks_jax.reading import existing, reading
 
 SUFFIXES = (".vti", ".vtk")
 
@@ -52,25 +53,31 @@ def load(path: str | os.PathLike[str]) -> Any:
     from vtkmodules.vtkIOLegacy import vtkStructuredPointsReader
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
-    name = str(existing(path))
-    xml = name.lower().endswith(".vti")
-    errors: list[str] = []
+    file = existing(path)
+    name, errors = str(file), list[str]()
 
     def remember(source: Any, event: str, message: str) -> None:
         errors.append(message.split("): ")[-1].strip())
 
     remember.CallDataType = "string0"  # type: ignore[attr-defined]
-    reader: Any = vtkXMLImageDataReader() if xml else vtkStructuredPointsReader()
-    # VTK prints what its parts find wrong; what they would stumble over is looked at first.
-    if _whole_xml(name) and reader.CanReadFile(name) if xml else holds_dataset(name, "STRUCTURED_POINTS"):
+    # VTK prints what its parts find wrong, and ends the process for want of memory: what it would stumble over is
+    # looked at first.
+    with reading(file, "readable VTK image data (.vti, or structured points in .vtk)"):
+        if name.lower().endswith(".vti"):
+            check_xml(file, "ImageData")
+            reader: Any = vtkXMLImageDataReader()
+        else:
+            if not holds_dataset(name, "STRUCTURED_POINTS"):
+                raise ValueError("no dataset STRUCTURED_POINTS in the first kilobyte")
+            check_legacy(file)
+            reader = vtkStructuredPointsReader()
         for event in ("ErrorEvent", "WarningEvent"):
             reader.AddObserver(event, remember)
         reader.SetFileName(name)
         reader.Update()
-        if not errors:
-            return reader.GetOutput()
-    why = f" ({errors[0]})" if errors else ""
-    raise ValueError(f"{name}: not readable as VTK image data (.vti, or structured points in .vtk), or incomplete{why}")
+        if errors:
+            raise ValueError(errors[0])
+    return reader.GetOutput()
 
 
 def read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
@@ -192,12 +199,6 @@ def write_tensors(path: str | os.PathLike[str], volume: TensorVolume, record: st
         tensors[..., np.ix_(keep, keep)[0], np.ix_(keep, keep)[1]] = volume.tensors
     rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
     return write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record)
-
-
-def _whole_xml(name: str) -> bool:
-    with open(name, "rb") as stream:
-        stream.seek(max(0, os.path.getsize(name) - 64))
-        return b"</VTKFile>" in stream.read()
 
 
 def _check_length(name: str, array: Any) -> None:

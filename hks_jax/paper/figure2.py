@@ -8,16 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 
 from hks_jax import plot
 from hks_jax.curvature import hks_expansion
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import crop, reflect
-from hks_jax.paper.signature import enough_pairs, signature
+from hks_jax.paper.signature import flat_signature
 
 TIME = 0.01
 QUICK, FULL = 41, 201
+TITLES = ("natural boundary", "reflected strip", "reflected strip, cropped", "mirror", "along $u_2 = 1/2$")
 
 
 def flat(x: Float[Array, " 2"]) -> Float[Array, "2 2"]:
@@ -35,15 +37,14 @@ def figure2(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
     """Write ``figure2.png``."""
     n = FULL if full else QUICK
     grid = Grid.from_bounds(0.0, 1.0, (n, n))
-    fig = plot.new_figure(14.5, 6.8)
-    rows = fig.subplots(2, 4, width_ratios=(1, 1, 1, 1.25))
+    fig = plot.new_figure(18, 6.8)
+    rows = fig.subplots(2, 5, width_ratios=(1, 1, 1, 1, 1.25))
     for row, (name, metric) in zip(rows, {"flat metric": flat, "curved metric": bump}.items(), strict=True):
         field = TensorField.from_function(metric, grid)
         echo(f"figure2: {name}, {n}² nodes, three boundaries")
         _row(row, field, name)
-    for ax, title in zip(rows[0], ("natural boundary", "reflected strip, cropped", "mirror"), strict=False):
+    for ax, title in zip(rows[0], TITLES, strict=True):
         ax.set_title(title)
-    rows[0, 3].set_title("along $u_2 = 1/2$")
     return [plot.save_figure(fig, output / "figure2.png")]
 
 
@@ -51,21 +52,20 @@ def _row(panels: np.ndarray, field: TensorField, name: str) -> None:
     grid = field.grid
     # Over three diffusion lengths, heat falls to exp(−9).
     wide = reflect(field, round(3 * math.sqrt(TIME) / grid.spacing[0]))
+    before = flat_signature(wide, TIME)
     images = {
-        "natural": _signature(field, "neumann"),
-        "strip": np.asarray(crop(jnp.asarray(_signature(wide, "neumann")), grid)),
-        "mirror": _signature(field, "mirror"),
+        "natural": flat_signature(field, TIME),
+        "strip": np.asarray(crop(jnp.asarray(before), grid)),
+        "mirror": flat_signature(field, TIME, "mirror"),
     }
     expansion = 4 * math.pi * TIME * np.asarray(hks_expansion(field, jnp.array([TIME])))[0]
-    for ax, values in zip(panels, images.values(), strict=False):
-        plot.scalar_image(ax, values, grid, least_range=0.1, interpolation="bilinear")
+    drawn = [(field, images["natural"]), (wide, before), (field, images["strip"]), (field, images["mirror"])]
+    for ax, (domain, values) in zip(panels, drawn, strict=False):
+        plot.scalar_image(ax, values, domain.grid, least_range=0.1, interpolation="bilinear")
         ax.set_xlabel("$u_1$")
+    panels[1].add_patch(Rectangle((0, 0), 1, 1, fill=False, color="white", linestyle="--"))
     panels[0].set_ylabel(f"{name}\n$u_2$")
-    _profiles(panels[3], grid, images, expansion)
-
-
-def _signature(field: TensorField, boundary: str) -> np.ndarray:
-    return signature(field, [TIME], enough_pairs(field, TIME, boundary), boundary, normalisation="flat")[0]
+    _profiles(panels[4], grid, images, expansion)
 
 
 def _profiles(ax: Axes, grid: Grid, images: dict[str, np.ndarray], expansion: np.ndarray) -> None:

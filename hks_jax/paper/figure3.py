@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from hks_jax import plot
 from hks_jax.domain.examples import figure3_fields
-from hks_jax.paper.signature import enough_pairs, signature
+from hks_jax.paper.signature import flat_signature
 
 TIME = 1.0
 QUICK, FULL = 51, 201
@@ -22,13 +24,17 @@ def figure3(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
     n = FULL if full else QUICK
     fig = plot.new_figure(15, 7.2)
     tops, bottoms = fig.subplots(2, 4, sharex=True, sharey=True)
-    for top, bottom, title, field in zip(tops, bottoms, TITLES, figure3_fields(n).values(), strict=True):
-        k = enough_pairs(field, TIME, "mirror")
-        echo(f"figure3: {n}² nodes, {k} eigenpairs")
-        (values,) = signature(field, [TIME], k, boundary="mirror", normalisation="flat")
+    fields, images = list(figure3_fields(n).values()), []
+    for number, field in enumerate(fields, 1):
+        echo(f"figure3: field {number} of {len(fields)}, {n}² nodes")
+        images.append(flat_signature(field, TIME, "mirror"))
+    for top, title, field in zip(tops, TITLES, fields, strict=True):
         plot.ellipses(top, field, colorbar=top is tops[-1])
-        plot.scalar_image(bottom, values, field.grid, least_range=0.1, interpolation="bilinear")
         top.set_title(title)
+    low, high = np.min(images), np.max(images)
+    for bottom, image in zip(bottoms, images, strict=True):
+        last = bottom is bottoms[-1]
+        plot.scalar_image(bottom, image, fields[0].grid, vmin=low, vmax=high, colorbar=last, interpolation="bilinear")
         bottom.set_xlabel("$u_1$")
     tops[0].set_ylabel("unit circles of the metric\n$u_2$")
     bottoms[0].set_ylabel(rf"$4\pi t\,\mathrm{{HKS}}(t)$ at $t$ = {TIME:g}" + "\n$u_2$")

@@ -28,6 +28,6 @@ def figure4(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         top.set_title(name)
         bottom.set_xlabel("$u_1$")
     tops[0].set_ylabel("major (black), minor lines\n$u_2$")
-    bottoms[0].set_ylabel(f"HKS at $t$ = {TIME:g}\n$u_2$")
+    bottoms[0].set_ylabel(rf"$4\pi t\,\mathrm{{HKS}}(t)$ at $t$ = {TIME:g}" + "\n$u_2$")
     fig.suptitle("Constant eigenvalues, turning eigenvectors: the first three fields are flat, the others are not")
     return [plot.save_figure(fig, output / "figure4.png")]

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
+
 from hks_jax import plot
 from hks_jax.domain.examples import degenerate_point_field
 from hks_jax.paper.signature import continued_signature
@@ -17,14 +19,17 @@ INDICES = tuple(Fraction(n, 2) for n in (-4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 def figure5(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
     """Write ``figure5.png``."""
     n = FULL if full else QUICK
+    fields, images = [degenerate_point_field(float(index), n) for index in INDICES], []
+    for index, field in zip(INDICES, fields, strict=True):
+        echo(f"figure5: index {index}, {n}² nodes")
+        images.append(continued_signature(field, TIME, STRIP))
+    low, high = np.min(images), np.max(images)
     fig = plot.new_figure(16, 6.6)
     panels = fig.subplots(2, 5, sharex=True, sharey=True)
-    for ax, index in zip(panels.flat, INDICES, strict=True):
-        field = degenerate_point_field(float(index), n)
-        echo(f"figure5: index {index}, {n}² nodes")
-        values = continued_signature(field, TIME, STRIP)
-        plot.scalar_image(ax, values, field.grid, least_range=0.01, interpolation="bilinear")
+    for ax, index, field, values in zip(panels.flat, INDICES, fields, images, strict=True):
+        image = plot.scalar_image(ax, values, field.grid, vmin=low, vmax=high, colorbar=False, interpolation="bilinear")
         plot.integral_lines(ax, field, density=0.8, colors="white", linewidths=0.6, alpha=0.8)
         ax.set_title(f"index {str(index).replace('-', '−')}")
-    fig.suptitle(f"Degenerate points: HKS at $t$ = {TIME:g} and lines of the major eigenvector")
+    fig.colorbar(image, ax=panels, label=rf"$4\pi t\,\mathrm{{HKS}}(t)$ at $t$ = {TIME:g}", shrink=0.7, aspect=30)
+    fig.suptitle("Degenerate points: HKS and lines of the major eigenvector")
     return [plot.save_figure(fig, output / "figure5.png")]

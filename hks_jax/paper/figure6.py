@@ -9,7 +9,8 @@ from scipy.ndimage import distance_transform_edt
 
 from hks_jax import plot
 from hks_jax.domain.phantom import phantom
-from hks_jax.domain.tensor_field import MetricChoice, TensorField
+from hks_jax.domain.tensor_checks import MetricChoice
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
 from hks_jax.paper.signature import enough_pairs, signature
 

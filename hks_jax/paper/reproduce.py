@@ -11,6 +11,7 @@ from hks_jax.paper.figure4 import figure4
 from hks_jax.paper.figure5 import figure5
 from hks_jax.paper.figure6 import figure6
 from hks_jax.paper.table1 import table1
+from hks_jax.paper.triangles import triangles
 
 Echo = Callable[[str], None]
 
@@ -22,17 +23,18 @@ ITEMS: dict[str, Callable[[Path, bool, Echo], list[Path]]] = {
     "figure4": figure4,
     "figure5": figure5,
     "figure6": figure6,
+    "triangles": triangles,
 }
 
 
 def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:
-    """Write the paper's table and figures to a directory, and return the files written.
+    """Write the paper's table and figures, and a check of a remark, to a directory; return the files written.
 
     Args:
         output: the directory; made if it does not exist.
         full: the paper's sizes (many minutes) instead of quick ones (a minute or two).
-        only: some of ``"table1"``, ``"figure1"`` … ``"figure6"``; None: all.
-        echo: called with one line of text per step.
+        only: some of ``"table1"``, ``"figure1"`` … ``"figure6"``, ``"triangles"``; None: all.
+        echo: called with a line of text as each step begins, and as each item is written.
 
     Raises:
         ValueError: a name in `only` that does not exist.
@@ -44,10 +46,14 @@ def run(output: Path, full: bool = False, only: list[str] | None = None, echo: E
     output = Path(output)
     output.mkdir(parents=True, exist_ok=True)
     written = []
-    for name in names:
+    for number, name in enumerate(names, 1):
+
+        def say(text: str, place: str = f"[{number}/{len(names)}]") -> None:
+            echo(f"{place} {text}")
+
         start = time.perf_counter()
-        paths = ITEMS[name](output, full, echo)
+        paths = ITEMS[name](output, full, say)
         seconds = time.perf_counter() - start
-        echo(f"{name}: {', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
+        say(f"{name}: {', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
         written += paths
     return written

@@ -9,15 +9,20 @@ from jaxtyping import Float
 
 from hks_jax.accuracy import AccuracyWarning
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.solve import eigenpairs
+from hks_jax.eigen.weyl import weyl_number
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.signatures.heat import Normalisation, hks
+from hks_jax.signatures.heat import Normalisation, hks_of_pairs
+from hks_jax.spectrum_free.hks import hks_spectrum_free
+
+SMALL = 10_000
+"""Nodes up to which the signature at one time takes less by selected inversion than the eigenpairs that it needs."""
 
 
 def signature(
-    domain: TensorField | SurfaceMesh,
+    domain: TensorField | SimplicialMesh,
     times: Sequence[float],
     k: int,
     boundary: BoundarySpec = "neumann",
@@ -29,23 +34,35 @@ def signature(
         # exp(−λₖt) makes the last pairs invisible.
         warnings.filterwarnings("ignore", "k = .* cuts a multiple eigenvalue", AccuracyWarning)
         pairs = eigenpairs(domain, k, boundary)
-    return np.asarray(hks(pairs, np.asarray(times), normalisation))
+    return np.asarray(hks_of_pairs(pairs, np.asarray(times), normalisation))
 
 
 def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0) -> int:
     """Return k such that exp(−λₖt) is about exp(−exponent), by Weyl's law for a square.
 
-    N(λ) ≈ (area·λ + perimeter·√λ)/4π with natural sides. A mirror has four times the area, and no sides.
+    A mirror has four times the area, and no sides.
     """
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors)))
     area = float(np.sum(density[field.grid.inside]) * np.prod(field.grid.spacing))
-    scaled = area * exponent / time
-    count = 4 * scaled if boundary == "mirror" else scaled + 4 * math.sqrt(scaled)
-    return math.ceil(count / (4 * math.pi))
+    area, perimeter = (4 * area, 0.0) if boundary == "mirror" else (area, 4 * math.sqrt(area))
+    return math.ceil(weyl_number(exponent / time, area, 2, perimeter))
+
+
+def flat_signature(
+    field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0
+) -> Float[np.ndarray, "*shape"]:
+    """Return 4πt·HKS, which is 1 where a metric is flat and its sides are far.
+
+    On small grids that of the whole spectrum; on large ones that of the eigenpairs up to exp(−λₖt) ≈ exp(−exponent).
+    """
+    if math.prod(field.grid.shape) > SMALL:
+        return signature(field, [time], enough_pairs(field, time, boundary, exponent), boundary, "flat")[0]
+    (values,) = hks_spectrum_free(field, [time], boundary, method="selected-inversion")
+    return 4 * math.pi * time * np.asarray(values)
 
 
 def continued_signature(field: TensorField, time: float, distance: float) -> Float[np.ndarray, "*shape"]:
-    """Return the HKS of a metric given by a function, without boundary effect: continued beyond its grid.
+    """Return 4πt·HKS of a metric given by a function, without boundary effect: continued beyond its grid.
 
     The function's formula is evaluated over a strip of the given width (coordinates) around the grid; what the sides
     of the wide grid do to the HKS is cut off with the strip.
@@ -56,5 +73,4 @@ def continued_signature(field: TensorField, time: float, distance: float) -> Flo
     origin = [o - width * h for o, h in zip(grid.origin, grid.spacing, strict=True)]
     assert field.function is not None
     wide = TensorField.from_function(field.function, Grid(shape, grid.spacing, origin))
-    (values,) = signature(wide, [time], enough_pairs(wide, time, exponent=7.0))
-    return values[tuple(slice(width, width + n) for n in grid.shape)]
+    return flat_signature(wide, time, exponent=7.0)[tuple(slice(width, width + n) for n in grid.shape)]

@@ -74,7 +74,7 @@ def area_element(n: int) -> Float[np.ndarray, "n n"]:
 
 
 def relative_difference(
-    values: Float[np.ndarray, "m m"], reference: Float[np.ndarray, "m m"], weights: Float[np.ndarray, "m m"]
+    values: Float[np.ndarray, "*shape"], reference: Float[np.ndarray, "*shape"], weights: Float[np.ndarray, "*shape"]
 ) -> float:
     """Return √(Σ w (values − reference)² / Σ w reference²)."""
     return math.sqrt(np.sum(weights * (values - reference) ** 2) / np.sum(weights * reference**2))

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float, Real
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 from scipy.special import ndtr
@@ -82,7 +82,7 @@ def line_integral_convolution(
     field: TensorField,
     which: Which = "major",
     *,
-    values: Float[ArrayLike, "nx ny"] | None = None,
+    values: Real[ArrayLike, "nx ny"] | None = None,
     contrast: float = 0.75,
     pixels: int | None = None,
     length: int = 25,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Real
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -19,12 +19,12 @@ from hks_jax.plot.figure import number_text
 
 def hks_curves(
     ax: Axes,
-    values: Float[ArrayLike, "n_times *shape"],
-    times: Sequence[float] | Float[ArrayLike, " n_times"],
+    values: Real[ArrayLike, "n_times *shape"],
+    times: Sequence[float] | Real[ArrayLike, " n_times"],
     grid: Grid,
     points: Sequence[Sequence[float]],
     *,
-    expansion: Float[ArrayLike, "n_times *shape"] | None = None,
+    expansion: Real[ArrayLike, "n_times *shape"] | None = None,
     limit: float | None = None,
     labels: Sequence[str] | None = None,
     unit: str = "",

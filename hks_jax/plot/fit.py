@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
@@ -23,8 +23,8 @@ LEAST_DIFFERENCE = 1e-6
 
 def fit_panels(
     fit: "MetricFit",
-    target: Float[ArrayLike, "n_times nx ny"],
-    times: Sequence[float] | Float[ArrayLike, " n_times"] | None = None,
+    target: Real[ArrayLike, "n_times nx ny"],
+    times: Sequence[float] | Real[ArrayLike, " n_times"] | None = None,
     *,
     max_times: int = 3,
     title: str | None = None,

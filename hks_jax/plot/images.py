@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
@@ -19,7 +19,7 @@ from hks_jax.plot.figure import cell_extent, colour_bar, frame, new_figure, numb
 
 def scalar_image(
     ax: Axes,
-    values: Float[ArrayLike, "nx ny"],
+    values: Real[ArrayLike, "nx ny"],
     grid: Grid,
     *,
     cmap: str | Colormap = "viridis",
@@ -71,8 +71,8 @@ def scalar_image(
 
 
 def hks_panels(
-    values: Float[ArrayLike, "n_times nx ny"],
-    times: Sequence[float] | Float[ArrayLike, " n_times"],
+    values: Real[ArrayLike, "n_times nx ny"],
+    times: Sequence[float] | Real[ArrayLike, " n_times"],
     grid: Grid,
     *,
     titles: Sequence[str] | None = None,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Real
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
@@ -19,7 +19,7 @@ from hks_jax.plot.volumes import require_volume
 
 def isosurfaces(
     ax: Axes,
-    values: Float[ArrayLike, "nx ny nz"],
+    values: Real[ArrayLike, "nx ny nz"],
     grid: Grid,
     *,
     levels: int | Sequence[float] = 4,

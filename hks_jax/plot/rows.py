@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Real
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
@@ -17,8 +17,8 @@ from hks_jax.plot.images import scalar_image
 
 
 def time_rows(
-    rows: Mapping[str, Float[ArrayLike, "n_times nx ny"]],
-    times: Sequence[float] | Float[ArrayLike, " n_times"],
+    rows: Mapping[str, Real[ArrayLike, "n_times nx ny"]],
+    times: Sequence[float] | Real[ArrayLike, " n_times"],
     grid: Grid,
     *,
     unit: str = "",
@@ -82,7 +82,7 @@ def time_rows(
 
 def influence_map(
     ax: Axes,
-    influence: Float[ArrayLike, "nx ny"],
+    influence: Real[ArrayLike, "nx ny"],
     grid: Grid,
     *,
     levels: Sequence[float] = (0.01, 0.1),

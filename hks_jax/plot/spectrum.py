@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.plot.figure import SMALL
@@ -16,7 +16,7 @@ from hks_jax.signatures.weyl import weyl_count
 def spectrum(
     ax: Axes,
     pairs: Eigenpairs,
-    domain: TensorField | SurfaceMesh | None = None,
+    domain: TensorField | SimplicialMesh | None = None,
     *,
     remainder: bool = False,
     unit: str = "",

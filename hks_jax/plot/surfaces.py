@@ -1,10 +1,10 @@
-"""Triangulated surfaces in space, coloured by a scalar."""
+"""Triangulated surfaces in space, and the boundaries of solids, coloured by a scalar."""
 
 from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Real
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -12,12 +12,13 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.tet_mesh import TetMesh
 
 
 def surface(
     ax: Axes3D,
-    mesh: SurfaceMesh,
-    values: Float[ArrayLike, " V"],
+    mesh: SurfaceMesh | TetMesh,
+    values: Real[ArrayLike, " V"],
     *,
     cmap: str = "viridis",
     vmin: float | None = None,
@@ -27,11 +28,13 @@ def surface(
     zoom: float = 1.25,
     **kwargs: Any,
 ) -> ScalarMappable:
-    """Draw a surface coloured by its vertices' values, without axes, and return what a colour bar needs.
+    """Draw a surface, or a solid's boundary, coloured by its vertices' values; return what a colour bar needs.
+
+    It is drawn without axes. The colours of a solid are those of what is seen of it.
 
     Args:
         ax: three-dimensional axes (``fig.add_subplot(projection="3d")``).
-        mesh: the surface; tens of thousands of triangles draw in a few seconds.
+        mesh: the surface, or a solid mesh; tens of thousands of triangles draw in a few seconds.
         values: (V,), one per vertex; a triangle takes the mean of its three.
         cmap: colour map.
         vmin: value of the first colour; None: the least.
@@ -44,10 +47,13 @@ def surface(
     Raises:
         ValueError: values that are not of shape (V,).
     """
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
     scalars = np.asarray(values, dtype=np.float64)
-    if scalars.shape != (len(vertices),):
-        raise ValueError(f"values: got shape {scalars.shape}; expected ({len(vertices)},), one per vertex")
+    if scalars.shape != (len(mesh.vertices),):
+        raise ValueError(f"values: got shape {scalars.shape}; expected ({len(mesh.vertices)},), one per vertex")
+    if isinstance(mesh, TetMesh):
+        mesh, numbers = mesh.boundary()
+        scalars = scalars[numbers]
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
     corners = vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
@@ -39,8 +39,8 @@ def middle_node(inside: Bool[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
 
 
 def orthogonal_slices(
-    axes: Sequence[Axes],
-    values: Float[ArrayLike, "nx ny nz"],
+    axes: Sequence[Axes] | np.ndarray,
+    values: Real[ArrayLike, "nx ny nz"],
     grid: Grid,
     *,
     node: Sequence[int] | None = None,
@@ -91,8 +91,8 @@ def orthogonal_slices(
 
 
 def volume_panels(
-    values: Float[ArrayLike, "n_times nx ny nz"],
-    times: Sequence[float] | Float[ArrayLike, " n_times"],
+    values: Real[ArrayLike, "n_times nx ny nz"],
+    times: Sequence[float] | Real[ArrayLike, " n_times"],
     grid: Grid,
     *,
     node: Sequence[int] | None = None,
@@ -165,7 +165,9 @@ def volume_panels(
     return fig
 
 
-def _label_slices(axes: Sequence[Axes], grid: Grid, node: tuple[int, ...], unit: str, leftmost: bool) -> None:
+def _label_slices(
+    axes: Sequence[Axes] | np.ndarray, grid: Grid, node: tuple[int, ...], unit: str, leftmost: bool
+) -> None:
     suffix = f" ({unit})" if unit else ""
     for ax, normal in zip(axes, NORMALS, strict=True):
         first, second = (a for a in range(3) if a != normal)

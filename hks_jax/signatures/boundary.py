@@ -12,7 +12,7 @@ from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.rim import pin_rim
-from hks_jax.signatures.heat import hks
+from hks_jax.signatures.heat import hks_of_pairs
 
 
 def boundary_influence(
@@ -58,6 +58,6 @@ def boundary_influence(
     if pinned.space.n_dof == natural.space.n_dof:
         raise ValueError(f"boundary: got {boundary!r}; the domain has no rim whose influence could be seen")
     pairs = (eigenpairs(pencil, k, solver=solver, multiplet="complete") for pencil in (natural, pinned))
-    free, zero = (hks(each, times) for each in pairs)
+    free, zero = (hks_of_pairs(each, times) for each in pairs)
     # Rounding where both are equal, and truncation where both are small, may leave the interval.
     return jnp.clip((free - zero) / (free + zero), 0, 1)

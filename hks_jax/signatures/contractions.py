@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hks_jax.domain.static_array import StaticArray
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.static_array import StaticArray
 
 
 class Contraction(eqx.Module):

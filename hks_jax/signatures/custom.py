@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Custom
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal
@@ -35,6 +36,7 @@ def spectral_signature(
         ValueError: parameters without a common leading axis; bad sources.
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
+    require_real("parameters", parameters)
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     shapes = [leaf.shape for leaf in jax.tree.leaves(parameters)]
     if not shapes or len({shape[:1] for shape in shapes}) != 1 or not all(shapes):

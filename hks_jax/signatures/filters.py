@@ -7,8 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
+
+from hks_jax.linear.divided_differences import divided_difference, gauss
 
 
 class Filter(eqx.Module):
@@ -22,22 +23,8 @@ class Filter(eqx.Module):
         """Return f(x)."""
 
     def divided_difference(self, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return (f(high) − f(low))/(high − low) for low ≤ high, and f'(low) where they are equal.
-
-        The difference quotient loses digits where low and high are near; the mean of f' over the interval by Gauss
-        quadrature, which is the same number, does where they are far apart. The mean is taken where two rules for it
-        and the quotient agree as far as each can.
-        """
-        gap = high - low
-        slope = _derivative(self)
-        coarse, fine = (_mean(slope, low, gap, n) for n in (6, 12))
-        apart = gap > 0
-        change, size = self(high) - self(low), jnp.abs(self(high)) + jnp.abs(self(low))
-        eps = jnp.finfo(gap.dtype).eps
-        smooth = jnp.abs(fine - coarse) * gap <= eps * size
-        # Both rules may miss a sharp transition; the quotient does not.
-        smooth &= jnp.abs(fine * gap - change) <= jnp.sqrt(eps) * size
-        return jnp.where(~apart | smooth, fine, change / jnp.where(apart, gap, 1))
+        """Return (f(high) − f(low))/(high − low) for low ≤ high, and f'(low) where they are equal."""
+        return divided_difference(self, low, high)
 
 
 class Heat(Filter):
@@ -45,6 +32,7 @@ class Heat(Filter):
 
     time: Float[Array, "*m"]
 
+    @jax.jit
     def __call__(self, x: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return exp(−xt)."""
         return jnp.exp(-self.time * x)
@@ -54,7 +42,7 @@ class Heat(Filter):
         y = self.time * (high - low)
         # For small y the mean of exp(−sy) over 0 ≤ s ≤ 1, whose derivatives by t have no cancellation either.
         small = y < 1
-        nodes, weights = _gauss(8)
+        nodes, weights = gauss(8)
         near = sum(w * jnp.exp(-s * jnp.where(small, y, 0)) for s, w in zip(nodes, weights, strict=True))
         far = jnp.where(small, 1, y)
         return -self.time * jnp.exp(-self.time * low) * jnp.where(small, near, -jnp.expm1(-far) / far)
@@ -67,6 +55,7 @@ class Wave(Filter):
     sigma: Float[Array, "*m"]
     offset: Float[Array, "*m"]
 
+    @jax.jit
     def __call__(self, x: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return the bell of log x."""
         positive = x > 0
@@ -98,7 +87,7 @@ class Custom(Filter):
 
     def __call__(self, x: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return f(parameters, x)."""
-        return self.function(self.parameters, x)
+        return jnp.broadcast_to(jnp.asarray(self.function(self.parameters, x), x.dtype), x.shape)
 
 
 class Derivative(Filter):
@@ -116,22 +105,3 @@ class Derivative(Filter):
         if type(self.filter).divided_difference is Filter.divided_difference:
             return super().divided_difference(low, high)
         return jax.jvp(lambda f: f.divided_difference(low, high), (self.filter,), (self.direction,))[1]
-
-
-def _derivative(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    return lambda x: jax.jvp(function, (x,), (jnp.ones_like(x),))[1]
-
-
-def _gauss(n: int) -> tuple[list[float], list[float]]:
-    """Return Gauss–Legendre nodes and weights on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(n)
-    return ((1 + nodes) / 2).tolist(), (weights / 2).tolist()
-
-
-def _mean(function: Callable[[Array], Array], low: Array, gap: Array, n: int) -> Array:
-    """Return the mean over [low, low + gap] by n-point Gauss quadrature."""
-    nodes, weights = _gauss(n)
-    total = jnp.zeros_like(gap)
-    for s, w in zip(nodes, weights, strict=True):
-        total = total + w * function(low + s * gap)
-    return total

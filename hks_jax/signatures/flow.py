@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import spectral_flow
@@ -38,6 +39,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
     times, shape = checked_times("times", times, dtype), pairs.space.node_shape
+    require_real("functions", functions)
     u = jnp.asarray(functions, dtype)
     if u.shape[u.ndim - len(shape) :] != shape:
         raise ValueError(f"functions: got shape {u.shape}; expected {shape}, or more axes before it")

@@ -15,29 +15,12 @@ from hks_jax.signatures.truncation import warn_if_truncated
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
 
 
-def hks(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> Float[Array, "n_times *shape"]:
-    """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
-
-    Sun, Ovsjanikov and Guibas 2009, eq. 5; Zobel, Reininghaus and Hotz, section 2.
-
-    Args:
-        pairs: from `eigenpairs`.
-        times: (n_times,) positive, in (metric length)².
-        normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
-            domain's area or volume (→ 1 for large t); ``"flat"`` multiplies by (4πt)^(d/2) (→ 1 for small t inside).
-
-    Returns:
-        (n_times, *shape); NaN outside the mask, 0 at Dirichlet nodes. Units of "raw": 1/(metric length)^d.
-
-    Raises:
-        ValueError: times that are not positive and finite, or an unknown normalisation.
-
-    Warns:
-        AccuracyWarning: times too small for the number of pairs or for the grid (see `truncation`).
-    """
+def hks_of_pairs(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> Float[Array, "n_times *shape"]:
+    """Compute the heat kernel signature as a sum over eigenpairs: `hks_jax.hks` with its method ``"spectral"``."""
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     warn_if_truncated(pairs, times)
-    return spectral_diagonal(pairs, Heat(times), normaliser(pairs, times, normalisation))
+    scale = None if normalisation == "raw" else normaliser(pairs, times, normalisation)
+    return spectral_diagonal(pairs, Heat(times), scale)
 
 
 def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
+from hks_jax.checks import require_real
 from hks_jax.domain.tensor_field import TensorField
 
 
@@ -50,6 +51,8 @@ def gaussian_scale_space(
         ValueError: times that are not positive; functions of another shape.
     """
     grid, d = field.grid, field.grid.dimension
+    require_real("times", times)
+    require_real("functions", functions)
     t, u = np.asarray(times, np.float64), np.asarray(functions, np.float64)
     if t.ndim != 1 or not (np.isfinite(t) & (t > 0)).all():
         raise ValueError(f"times: got {times}; expected a vector of positive numbers")

@@ -1,6 +1,7 @@
 """Spectral functions Φ f(Λ) Φᵀ, on which every signature stands, and their derivative rule."""
 
-from functools import partial
+import operator
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -9,12 +10,12 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.domain.static_array import StaticArray
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
-from hks_jax.signatures.filters import Derivative, Filter
+from hks_jax.signatures.filters import Custom, Derivative, Filter
+from hks_jax.static_array import StaticArray
 
 
 def spectral_diagonal(
@@ -54,7 +55,12 @@ def spectral_flow(
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
     """Return Σᵢ f(λᵢ) for each of m filters. Its derivative is f'(λᵢ) dλᵢ: no eigenvector enters."""
-    return jnp.sum(_all_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
+    return sum_of(filters, pairs.eigenvalues, pairs.kept)
+
+
+def sum_of(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " m"]:
+    """Return Σᵢ f(λᵢ) over the kept pairs for each of m filters."""
+    return jnp.sum(_all_weights(filters, values, kept), axis=1)
 
 
 @jax.custom_jvp
@@ -62,7 +68,12 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
     """Read the kernels Φ f(Λ) Φᵀ of m filters."""
     # Where JAX differentiates this body and not the rule (the outer of two derivatives), it must not.
     pairs = first_order_only(pairs)
-    return contraction.weighted(_all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
+    return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
+
+
+@jax.jit
+def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Array:
+    return contraction.weighted(weights, vectors)
 
 
 # The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M where the eigenvectors are not. Of all n eigenpairs its
@@ -81,34 +92,38 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
-    value = _kernel(contraction, filters, pairs)
-    tangent = jnp.zeros_like(value)
+    value, terms = _kernel(contraction, filters, pairs), []
     if isinstance(contraction, Applied) and not _is_constant(d_contraction.functionals):
-        tangent += _kernel(contraction.along(d_contraction), filters, pairs)
+        terms.append(_kernel(contraction.along(d_contraction), filters, pairs))
     if not _is_constant(d_filters):
-        tangent += _kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs)
+        terms.append(_kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs))
     if not _is_constant(d_pairs.pencil):
         pairs = first_order_only(pairs)
-        tangent += _tangent(contraction, filters, pairs, *_instantiated((d_pairs.pencil, d_pairs.frame)))
+        known = pairs.pencil, pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
+        terms.append(_tangent(contraction, filters, *known, *_instantiated((d_pairs.pencil, d_pairs.frame))))
     elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
         pairs = first_order_only(pairs)
-        tangent += jax.jvp(
-            lambda values, vectors: contraction.weighted(_all_weights(filters, values, pairs.kept), vectors),
+        moved = jax.jvp(
+            lambda values, vectors: _weighted(contraction, _all_weights(filters, values, pairs.kept), vectors),
             (pairs.eigenvalues, pairs.vectors),
             _instantiated((d_pairs.eigenvalues, d_pairs.vectors)),
-        )[1]
-    return value, tangent
+        )
+        terms.append(moved[1])
+    return value, reduce(operator.add, terms) if terms else jnp.zeros_like(value)
 
 
 @jax.jit
 def _tangent(
     contraction: Contraction,
     filters: Filter,
-    pairs: Eigenpairs,
+    pencil: Pencil | MirrorPencil,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    kept: Bool[Array, " k"],
+    part: Int[Array, " k"],
     d_pencil: Pencil | MirrorPencil,
     d_frame: Float[Array, "k n_dof"],
 ) -> Array:
-    pencil, values, vectors, kept, part = pairs.pencil, pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where it does not count
     stiffness = pencil.among(d_pencil.apply_stiffness(vectors, part), vectors, part)
     mass = pencil.among(d_pencil.apply_mass(vectors, part), vectors, part)
@@ -124,11 +139,22 @@ def _tangent(
 
 def _weights(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
     """Return f(λᵢ), zero where the pairs are not kept."""
-    return jnp.where(kept, jnp.broadcast_to(one(values), values.shape), 0)
+    return jnp.where(kept, one(values), 0)
 
 
 def _all_weights(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, "m k"]:
+    plain = filters
+    while isinstance(plain, Derivative):
+        plain = plain.filter
+    # A user's function may be a new one at every call, for which nothing was compiled yet.
+    return (_each if isinstance(plain, Custom) else _each_at_once)(filters, values, kept)
+
+
+def _each(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, "m k"]:
     return jax.vmap(lambda one: _weights(one, values, kept))(filters)
+
+
+_each_at_once = jax.jit(_each)
 
 
 def _divided_differences(

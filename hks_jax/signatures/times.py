@@ -1,18 +1,21 @@
 """Times and energies: checks, and the defaults of Sun et al. and of Aubry et al."""
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from hks_jax.checks import require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.traced import is_traced
 
 
 def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
     """Return times as an array (n,); raise ValueError unless they are 1-D, positive and finite."""
+    require_real(name, times)
     try:
         array = jnp.asarray(times, dtype)
     except (TypeError, ValueError):
@@ -51,13 +54,18 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
         raise ValueError(
             f"pairs: all {pairs.n_null} eigenvalues kept are zero (one per natural component); compute more eigenpairs"
         )
-    values = pairs.eigenvalues
+    return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance, pairs.n_null)
 
+
+@partial(jax.jit, static_argnames="first")
+def _ends(
+    values: Float[Array, " k"], kept: Bool[Array, " k"], tolerance: Float[Array, ""], first: int
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     def mean_of_copies(value: Array) -> Array:
-        copies = pairs.kept & (jnp.abs(values - value) <= pairs.multiplet_tolerance * value)
-        return jnp.sum(jnp.where(copies, values, 0)) / jnp.sum(copies)
+        copies = kept & (jnp.abs(values - value) <= tolerance * value)
+        return jnp.sum(jnp.where(copies, values, 0)) / jnp.sum(copies, dtype=values.dtype)
 
-    return mean_of_copies(values[pairs.n_null]), mean_of_copies(pairs.last_eigenvalue)
+    return mean_of_copies(values[first]), mean_of_copies(values[jnp.sum(kept) - 1])
 
 
 def _n_positive(pairs: Eigenpairs) -> int:

@@ -5,8 +5,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from hks_jax.checks import require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Wave
 from hks_jax.signatures.spectral import spectral_diagonal, spectral_trace
@@ -35,15 +36,25 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     positive_range(pairs)
     if energies is None:
         energies, sigma = default_energies(pairs)
+    require_real("energies", energies)
+    require_real("sigma", sigma)
     energies, sigma = (jnp.asarray(value, pairs.eigenvalues.dtype) for value in (energies, sigma))
     if energies.ndim != 1 or energies.size == 0 or (not is_traced(energies) and not np.isfinite(energies).all()):
         raise ValueError(f"energies: got {energies}; expected a non-empty 1-D array of finite values of log λ")
-    if sigma.ndim != 0 or (not is_traced(sigma) and not 0 < float(sigma) < np.inf):
-        raise ValueError(f"sigma: got {sigma}; expected one positive width in log λ")
+    if sigma.ndim != 0:
+        raise ValueError(f"sigma: got shape {sigma.shape}; expected one positive width in log λ")
+    require_number("sigma", sigma)
     # The largest exponent is taken out of both sums: they do not underflow far outside of the spectrum.
-    positive = pairs.kept & (pairs.eigenvalues > 0)
-    logs = jnp.log(jnp.where(positive, pairs.eigenvalues, 1))
-    exponents = jnp.where(positive, -jnp.square((energies[:, None] - logs) / sigma) / 2, -jnp.inf)
-    offset = jax.lax.stop_gradient(jnp.max(exponents, axis=1))
+    offset = _largest_exponents(*jax.lax.stop_gradient((energies, sigma, pairs.eigenvalues, pairs.kept)))
     bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
+
+
+@jax.jit
+def _largest_exponents(
+    energies: Float[Array, " n"], sigma: Float[Array, ""], values: Float[Array, " k"], kept: Bool[Array, " k"]
+) -> Float[Array, " n"]:
+    positive = kept & (values > 0)
+    logs = jnp.log(jnp.where(positive, values, 1))
+    exponents = jnp.where(positive, -jnp.square((energies[:, None] - logs) / sigma) / 2, -jnp.inf)
+    return jnp.max(exponents, axis=1)

@@ -1,20 +1,21 @@
 """Weyl's law: how many eigenvalues there are, from the volume of a domain and of its rim."""
 
-import math
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.checks import require_real
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.weyl import weyl_number
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.rim import rim_measure
 
 
 def weyl_count(
-    problem: Eigenpairs | Pencil | MirrorPencil, values: Any, domain: TensorField | SurfaceMesh | None = None
+    problem: Eigenpairs | Pencil | MirrorPencil, values: Any, domain: TensorField | SimplicialMesh | None = None
 ) -> Float[np.ndarray, " n"]:
     """Return how many eigenvalues lie below each of some numbers, by Weyl's law.
 
@@ -35,16 +36,15 @@ def weyl_count(
     """
     pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
     d = pencil.space.dimension
+    require_real("values", values)
     numbers = np.asarray(values, np.float64)
-    if not (numbers >= 0).all():
-        raise ValueError(f"values: got {numbers.min()}; expected eigenvalues, which are not negative")
-    volume, root = float(pencil.volume), np.sqrt(numbers)
-    law = volume * numbers / (4 * math.pi) if d == 2 else volume * root**3 / (6 * math.pi**2)
+    if not (np.isfinite(numbers) & (numbers >= 0)).all():
+        raise ValueError(f"values: got {numbers.min()}; expected eigenvalues, finite and not negative")
     if domain is None:
-        return law
+        return weyl_number(numbers, float(pencil.volume), d)
     shape = domain.grid.shape if isinstance(domain, TensorField) else (len(domain.vertices),)
     if shape != pencil.space.node_shape:
         raise ValueError(f"domain: got one of shape {shape}; expected that of the problem, {pencil.space.node_shape}")
     # The mixed problems that make up a mirrored domain have opposite conditions on its mirrors.
     rim = sum(rim_measure(domain, part.space) for part in pencil.parts)
-    return law + (rim * root / (4 * math.pi) if d == 2 else rim * numbers / (16 * math.pi))
+    return weyl_number(numbers, float(pencil.volume), d, rim)

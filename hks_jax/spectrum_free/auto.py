@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
+from hks_jax.checks import require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import MirrorPencil, Pencil
-from hks_jax.fem.space import GridSpace
-from hks_jax.signatures import heat
-from hks_jax.signatures.heat import Normalisation
+from hks_jax.signatures.heat import Normalisation, hks_of_pairs, normaliser
 from hks_jax.signatures.times import checked_times, require_pairs
 from hks_jax.signatures.truncation import truncation
-from hks_jax.spectrum_free.hks import choose_method, hks_spectrum_free, plan, work
+from hks_jax.spectrum_free.choice import Unattainable, choose_method, least_work, work
+from hks_jax.spectrum_free.hks import hks_spectrum_free
 from hks_jax.traced import is_traced
 
 _DEARER = 10.0
@@ -83,7 +83,7 @@ def hks(
         normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
             domain's area or volume (→ 1 for large t); ``"flat"`` multiplies by (4πt)^(d/2) (→ 1 for small t inside).
         method: ``"spectral"``: the sum over the pairs. ``"spectrum-free"``: without them, from the matrices that they
-            belong to (grids; see `hks_spectrum_free`). ``"auto"``: the pairs at the times that they resolve to the
+            belong to (see `hks_spectrum_free`). ``"auto"``: the pairs at the times that they resolve to the
             tolerance, the other at the rest; `hks_auto` also reports which, and how they agree.
         tolerance: of the last two, relative to (4πt)^(−d/2).
 
@@ -98,12 +98,13 @@ def hks(
         AccuracyWarning: times too small for the number of pairs or for the grid (see `truncation`).
     """
     if method == "spectral":
-        return heat.hks(pairs, times, normalisation)
+        return hks_of_pairs(pairs, times, normalisation)
     if method == "auto":
         return hks_auto(pairs, times, normalisation, tolerance).values
     if method != "spectrum-free":
         raise ValueError(f'method: got {method!r}; expected "spectral", "spectrum-free" or "auto"')
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    require_number("tolerance", tolerance, 1)
     return _scaled(pairs, times, normalisation, _without(pairs.pencil, times, tolerance))
 
 
@@ -112,8 +113,8 @@ def hks_auto(
 ) -> AutomaticHKS:
     """Compute the heat kernel signature, each time by the method that reaches it, and report on it.
 
-    A time is left to the eigenpairs where the estimated share of what they leave out is below the tolerance. On grids
-    the others come from `hks_spectrum_free`. Where there are times of both kinds, the shortest of the former is
+    A time is left to the eigenpairs where the estimated share of what they leave out is below the tolerance. The
+    others come from `hks_spectrum_free`. Where there are times of both kinds, the shortest of the former is
     computed both ways, provided that this takes no more than ten times the work of the rest.
 
     Args:
@@ -127,11 +128,11 @@ def hks_auto(
 
     Raises:
         ValueError: as `hks`; traced values, from which no choice can be made.
-        TypeError: times that need the other method on a surface mesh.
 
     Warns:
         AccuracyWarning: the two differ by more than ten times the tolerance, or times too small for the grid.
     """
+    require_number("tolerance", tolerance, 1)
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     known_pairs, known_times = jax.lax.stop_gradient((pairs, times))
     if is_traced((known_pairs.eigenvalues, known_times)):
@@ -143,13 +144,8 @@ def hks_auto(
     spectral = np.asarray(estimate.tail) <= tolerance
     nan = jnp.full((), jnp.nan, times.dtype)
     if spectral.all():
-        values = heat.hks(pairs, times, normalisation)
+        values = hks_of_pairs(pairs, times, normalisation)
         return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, "none", nan, nan)
-    if not isinstance(pairs.space, GridSpace):
-        raise TypeError(
-            f"times: {int((~spectral).sum())} of {times.size} are too small for {pairs.k} pairs, and on a surface mesh "
-            "there is no other method; compute more eigenpairs, or use method='spectral'"
-        )
     small = np.flatnonzero(~spectral)
     pencil = pairs.pencil
     settings = choose_method(pencil, times[small], "auto", tolerance)
@@ -161,7 +157,7 @@ def hks_auto(
     overlap = difference = nan
     if spectral.any():
         large = np.flatnonzero(spectral)
-        of_pairs = heat.hks(pairs, times[large], normalisation)
+        of_pairs = hks_of_pairs(pairs, times[large], normalisation)
         values = values.at[large].set(of_pairs)
         overlap = jnp.min(known_times[large])
         least = work(settings, pencil, times[small])
@@ -188,18 +184,19 @@ def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, va
         raise ValueError(
             'normalisation: "heat-trace" needs the whole spectrum; use "raw", "volume" or "flat", or method="spectral"'
         )
-    return values * heat.normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
+    return values * normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _coarse(estimate: Any, small: np.ndarray) -> list[str]:
     """Return what `truncation` has to say of the grid at some of its times; that k is too small is no matter there."""
     some = eqx.tree_at(
-        lambda e: (e.times, e.tail, e.resolution_bias, e.coarse_fraction),
+        lambda e: (e.times, e.tail, e.resolution_bias, e.lasting_bias, e.coarse_fraction),
         estimate,
         (
             estimate.times[small],
             jnp.zeros(small.size),
             estimate.resolution_bias[small],
+            estimate.lasting_bias[small],
             estimate.coarse_fraction[small],
         ),
     )
@@ -209,19 +206,18 @@ def _coarse(estimate: Any, small: np.ndarray) -> list[str]:
 def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
     """Return how far the two methods are apart at one time, at most, relative to (4πt)^(−d/2).
 
-    NaN where that would take more work than is allowed.
+    NaN where that would take more work than is allowed, or rounding does not allow the tolerance.
     """
     pencil = pairs.pencil
     assert isinstance(pencil, Pencil | MirrorPencil)
-    settings = (
-        plan(pencil, times, tolerance)
-        if pencil.space.dimension == 3
-        else choose_method(pencil, times, "auto", tolerance)
-    )
+    try:
+        settings = least_work(pencil, times, tolerance)
+    except Unattainable:
+        return jnp.full((), jnp.nan, times.dtype)
     if work(settings, pencil, times) > most:
         return jnp.full((), jnp.nan, times.dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)
-        spectral = heat.hks(pairs, times)
+        spectral = hks_of_pairs(pairs, times)
     gap = jnp.abs(spectral - _without(pencil, times, tolerance, settings or "selected-inversion"))
     return jnp.nanmax(gap) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)

@@ -1,33 +1,18 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by Chebyshev polynomials on coloured sources, and its derivative."""
 
-import math
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
-from hks_jax.domain.static_array import StaticArray
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.columns import stencil_outer
+from hks_jax.linear.chebyshev import chebyshev_recurrence
 from hks_jax.spectrum_free.heat_operator import HeatOperator
-
-
-def heat_coefficients(times: Float[Array, " m"], top: float, degree: int) -> Float[Array, "m degree+1"]:
-    """Return the Chebyshev coefficients of exp(−tλ) on 0 ≤ λ ≤ top, by the cosine transform of its samples.
-
-    They are e^(−z) Iₙ(z) (twice that for n > 0, with alternating signs), z = t·top/2; as sums of samples they have
-    derivatives by t without further ado.
-    """
-    samples = degree + 32 + 4 * math.isqrt(degree)  # aliasing brings in coefficients from 2·samples − degree on
-    angles = (np.arange(samples) + 0.5) * (np.pi / samples)
-    weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
-    weights[:, 0] /= 2
-    values = jnp.exp(-times[:, None] * jnp.asarray(top * (1 + np.cos(angles)) / 2, times.dtype))
-    return jnp.matmul(values, jnp.asarray(weights, times.dtype), precision="highest")
+from hks_jax.static_array import StaticArray
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
@@ -36,7 +21,7 @@ def coloured_diagonal(
     columns: int,
     colours: StaticArray,
     operator: HeatOperator,
-    coefficients: Float[Array, "m degree+1"],
+    coefficients: Float[Array, "m terms"],
 ) -> Float[Array, "m *shape"]:
     """Return Σₙ cₙ Tₙ(2A/top − 1) P at the sources, for every row of coefficients; 0 at nodes without a colour.
 
@@ -51,14 +36,13 @@ def coloured_diagonal(
     def block(number: Array, total: Array) -> Array:
         sources = _sources(colours, columns, number, total.dtype)
 
-        def step(n: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            y, before, total = state
-            total = total + _outer(coefficients[:, n], sources, y)
-            return _twice(n, y.dtype) * _scaled(top, products.apply(y), y) - before, y, total
+        def product(y: Array) -> Array:
+            return _scaled(top, products.apply(y), y)
 
-        y = products.solve_mass(sources)
-        y, _, total = jax.lax.fori_loop(0, degree, step, (y, jnp.zeros_like(y), total))
-        return total + _outer(coefficients[:, degree], sources, y)
+        def add(n: Any, y: Array, total: Array) -> Array:
+            return total + _outer(coefficients[:, n], sources, y)
+
+        return chebyshev_recurrence(product, products.solve_mass(sources), degree, total, add)[2]
 
     products = operator.products()
     degree = coefficients.shape[1] - 1
@@ -104,24 +88,19 @@ def _tangent(
     def block(number: Array, total: Array) -> Array:
         sources = _sources(colours, columns, number, total.dtype)
 
-        def read(n: Any, y: Array, dy: Array) -> Array:
-            return _outer(d_coefficients[:, n], sources, y) + _outer(coefficients[:, n], sources, dy)
-
-        def step(n: Array, state: tuple) -> tuple:
-            y, before, dy, d_before, total = state
-            total = total + read(n, y, dy)
+        def product(state: tuple[Array, Array]) -> tuple[Array, Array]:
+            y, dy = state
             image = products.apply(y)
             change = change_of(y, image) + products.apply_stiffness(dy)
-            factor = _twice(n, y.dtype)
-            following = factor * _scaled(top, image, y) - before
-            d_following = factor * _scaled(top, products.solve_mass(change), dy) - d_before
-            return following, y, d_following, dy, total
+            return _scaled(top, image, y), _scaled(top, products.solve_mass(change), dy)
+
+        def add(n: Any, state: tuple[Array, Array], total: Array) -> Array:
+            y, dy = state
+            return total + _outer(d_coefficients[:, n], sources, y) + _outer(coefficients[:, n], sources, dy)
 
         y = products.solve_mass(sources)
-        zero = jnp.zeros_like(y)
-        dy = products.solve_mass(change_of(zero, y))
-        y, _, dy, _, total = jax.lax.fori_loop(0, degree, step, (y, zero, dy, zero, total))
-        return total + read(degree, y, dy)
+        dy = products.solve_mass(change_of(jnp.zeros_like(y), y))
+        return chebyshev_recurrence(product, (y, dy), degree, total, add)[2]
 
     start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
     return jax.lax.fori_loop(0, _blocks(colours, columns), block, start)
@@ -136,9 +115,8 @@ def _cotangent(
     def block(number: Array, total: tuple) -> tuple:
         sources = _sources(colours, columns, number, g.dtype)
 
-        def up(n: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            y, before = state
-            return _twice(n, y.dtype) * _scaled(top, products.apply(y), y) - before, y
+        def product(y: Array) -> Array:
+            return _scaled(top, products.apply(y), y)
 
         def read(y: Array) -> Array:
             return _contract(g, jnp.sum(sources * y, axis=-1))
@@ -149,7 +127,7 @@ def _cotangent(
         def down(i: Array, state: tuple) -> tuple:
             y, after, p, p_after, (of_stiffness, of_mass, of_coefficients) = state
             n = degree - 1 - i
-            factor = _twice(n, y.dtype)
+            factor = jnp.where(n == 0, 1, 2).astype(y.dtype)
             image = products.apply(y)
             weighted = (2 * factor / top) * p
             of_stiffness = of_stiffness + stencil_outer(weighted, y, products.periodic)
@@ -159,8 +137,7 @@ def _cotangent(
             total = of_stiffness, of_mass, of_coefficients
             return factor * _scaled(top, image, y) - after, y, following, p, total
 
-        y = products.solve_mass(sources)
-        after, y = jax.lax.fori_loop(0, degree, up, (y, jnp.zeros_like(y)))
+        after, y, _ = chebyshev_recurrence(product, products.solve_mass(sources), degree)
         of_stiffness, of_mass, of_coefficients = total
         total = of_stiffness, of_mass, of_coefficients.at[:, degree].add(read(after))
         p = products.solve_mass(source(degree))
@@ -175,10 +152,6 @@ def _cotangent(
 def _scaled(top: float, image: Array, y: Array) -> Array:
     """Return Ây, of PKy and y."""
     return (2 / top) * image - y
-
-
-def _twice(n: Array, dtype: Any) -> Array:
-    return jnp.where(n == 0, 1, 2).astype(dtype)
 
 
 def _blocks(colours: StaticArray, columns: int) -> int:

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.fem.columns import stencil, stencil_outer
-from hks_jax.fem.operators import DiagonalOperator, StencilOperator
+from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
+from hks_jax.linear.chebyshev import chebyshev_iteration
+from hks_jax.linear.operators import DiagonalOperator
 
 
 class HeatOperator(eqx.Module):
@@ -63,17 +65,12 @@ class HeatProducts:
         scaled, low = self.operator.inverse_row_sums[..., None], self.operator.low
         if self.operator.lumped:
             return scaled * r
-        middle, half = (1 + low) / 2, (1 - low) / 2
 
-        def step(_: int, state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-            x, r, update, ratio = state
-            r = r - self.apply_mass(update)
-            following = 1 / (2 * middle / half - ratio)
-            update = following * (ratio * update + (2 / half) * scaled * r)
-            return x + update, r, update, following
+        def product(x: Array) -> Array:
+            return scaled * self.apply_mass(x)
 
-        first = scaled * r / middle
-        return jax.lax.fori_loop(1, self.operator.mass_degree, step, (first, r, first, half / middle))[0]
+        one = jnp.ones((), r.dtype)
+        return -chebyshev_iteration(product, scaled * r, low, one, 0.0, self.operator.mass_degree)
 
     def apply(self, x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
         """Return PKx ≈ M⁻¹Kx."""

@@ -1,7 +1,5 @@
 """Bounds on the spectra that polynomials are built for, and on how fast heat travels along an axis."""
 
-import math
-from collections.abc import Callable
 from functools import partial
 from itertools import product
 from typing import NamedTuple
@@ -11,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.fem.operators import DiagonalOperator
+from hks_jax.fem.columns import stencil
 from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.operators import DiagonalOperator
+from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
 from hks_jax.spectrum_free.heat_operator import heat_operator
 
 _STEPS, _MASS_STEPS = 50, 200
-_FAILURE = 1e-6
-_START = 30
-"""How far from uniform the start may be: the root of the condition of D⁻¹M and more."""
 
 
 class Bounds(NamedTuple):
@@ -29,6 +26,8 @@ class Bounds(NamedTuple):
         low: a lower bound on those of D⁻¹M, D the row sums of M; 1 if lumped.
         reach: (d,) per axis, a bound on the eigenvalues of D⁻¹ times the couplings of K across the axis. The discrete
             counterpart of 2 gᵃᵃ/h².
+        across: (d,) per axis, the least β for which the couplings C of M across the axis satisfy −C ⪯ βM; 0 if lumped.
+            It is 1 for a constant metric.
         least_mass: the least entry of D.
         greatest_mass: the greatest.
     """
@@ -36,6 +35,7 @@ class Bounds(NamedTuple):
     top: Float[Array, ""]
     low: Float[Array, ""]
     reach: Float[Array, " d"]
+    across: Float[Array, " d"]
     least_mass: Float[Array, ""]
     greatest_mass: Float[Array, ""]
 
@@ -54,7 +54,7 @@ def mass_bound(pencil: Pencil) -> Float[Array, ""]:
     def rest(x: Array) -> Array:
         return sums * x - products.apply_mass(x)
 
-    greatest = _largest(rest, lambda r: scaled * r, sums, pencil.space.n_dof, _MASS_STEPS)
+    greatest = lanczos_bound(rest, lambda r: scaled * r, sums, pencil.space.n_dof, _MASS_STEPS)
     return jnp.clip(1 - greatest, 1e-3, 0.9)
 
 
@@ -69,44 +69,29 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     d, free = pencil.space.dimension, pencil.space.free
     sums = jnp.where(free, 1 / jnp.where(free, inverse, 1), 0)
     products = operator.products()
-    top = _largest(products.apply_stiffness, products.solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
     sizes = jnp.abs(operator.stiffness) * inverse
-    if operator.lumped:
-        top = jnp.minimum(top, jnp.max(jnp.sum(sizes, axis=0)))
     offsets = np.array(list(product((-1, 0, 1), repeat=d)))
+    measured = operator.stiffness[None]
+    if not operator.lumped:
+        measured = jnp.concatenate([measured, _within_lines(operator.mass, offsets)])
+
+    def largest(matrix: Float[Array, "offsets *shape"]) -> Float[Array, ""]:
+        apply = stencil(matrix, operator.space.periodic)
+        return lanczos_bound(apply, products.solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
+
+    # One after the other: side by side they would be compiled as many times.
+    top, *greatest = jax.lax.map(largest, measured)
+    if operator.lumped:
+        top, across = jnp.minimum(top, gershgorin(operator.stiffness, inverse)), jnp.zeros(d, sums.dtype)
+    else:
+        across = jnp.stack(greatest) - 1
     reach = jnp.stack([jnp.max(jnp.sum(sizes[np.flatnonzero(offsets[:, a])], axis=0)) for a in range(d)])
-    return Bounds(top, low, reach, jnp.min(jnp.where(free, sums, jnp.inf)), jnp.max(sums))
+    return Bounds(top, low, reach, across, jnp.min(jnp.where(free, sums, jnp.inf)), jnp.max(sums))
 
 
-def _largest(
-    apply: Callable[[Array], Array], solve: Callable[[Array], Array], sums: Array, n: int, steps: int
-) -> Float[Array, ""]:
-    """Return an upper bound on the eigenvalues of PB, B and P symmetric and not negative, by Lanczos iteration.
-
-    From a random start the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ but for a probability of
-    1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2): θ/(1 − ε) is returned for the ε that
-    makes this 10⁻⁶. The start is normal in the coordinates of D, not quite those of P, which is allowed for.
-    """
-    r = jnp.sqrt(sums) * jax.random.normal(jax.random.key(0), sums.shape, sums.dtype)
-
-    def step(state: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
-        v, r, size = state
-        z = solve(r)
-        following = jnp.sqrt(jnp.maximum(jnp.vdot(r, z), 0))
-        # The Krylov space may be exhausted: zeros from there on add zeros to the Ritz values.
-        alive = following > 1e-5 * size
-        scale = jnp.where(alive, 1 / jnp.where(alive, following, 1), 0)
-        w, z = scale * r, scale * z
-        image = apply(z)
-        alpha = jnp.vdot(image, z)
-        beta = jnp.where(alive, following, 0)
-        following_r = image - alpha * w - beta * v
-        return (w, following_r, jnp.maximum(size, alpha)), (alpha, beta)
-
-    start = jnp.zeros_like(r), r / jnp.sqrt(jnp.vdot(r, solve(r))), jnp.zeros((), r.dtype)
-    _, (alpha, beta) = jax.lax.scan(step, start, length=steps)
-    matrix = jnp.diag(alpha) + jnp.diag(beta[1:], 1) + jnp.diag(beta[1:], -1)
-    epsilon = (math.log(1.648 * _START * math.sqrt(n) / _FAILURE) / (2 * steps - 1)) ** 2
-    if steps >= n:  # the whole space was seen
-        epsilon = 1e-3
-    return jnp.linalg.eigvalsh(matrix)[-1] / (1 - epsilon)
+# M − C, the couplings within the lines of nodes that cross the axis at right angles, is a diagonal of blocks of M and
+# so not negative, and −C = (M − C) − M ⪯ βM with 1 + β the greatest eigenvalue of M⁻¹(M − C).
+def _within_lines(mass: Float[Array, "offsets *shape"], offsets: np.ndarray) -> Float[Array, "d offsets *shape"]:
+    """Return the M − C of each axis for a consistent mass."""
+    d = offsets.shape[1]
+    return jnp.where((offsets.T == 0).reshape(d, -1, *[1] * d), mass, 0)

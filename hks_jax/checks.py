@@ -1,0 +1,61 @@
+"""Checks of arguments that many functions share."""
+
+import math
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from hks_jax.traced import is_traced
+
+
+def require_number(
+    name: str, value: Any, below: float = math.inf, *, above: float = 0.0, inclusive: bool = False
+) -> None:
+    """Raise ValueError unless a setting is one real number between two limits, exclusive; traced ones pass.
+
+    Args:
+        name: of the argument.
+        value: a number, or an array of no axes.
+        below: the upper limit.
+        above: the lower limit.
+        inclusive: whether the lower limit itself is allowed.
+    """
+    if is_traced(value):
+        return
+    array = np.asarray(value)
+    if array.ndim == 0 and array.dtype.kind in "iuf":
+        number = float(array)
+        if above < number < below or (inclusive and number == above):
+            return
+    got = array if array.ndim == 0 and array.dtype.kind in "biufc" else repr(value)
+    limits = f"{'from' if inclusive else 'above'} {above:g}" + ("" if math.isinf(below) else f" and below {below:g}")
+    raise ValueError(f"{name}: got {got}; expected a finite number {limits}")
+
+
+def require_real(name: str, values: Any) -> None:
+    """Raise ValueError for complex numbers: as real ones they would lose their imaginary part."""
+    if any(np.iscomplexobj(leaf) for leaf in jax.tree.leaves(values)):
+        raise ValueError(
+            f"{name}: got complex numbers; expected real ones. Pass the real part, if the imaginary part is rounding"
+        )
+
+
+def real_array(name: str, values: Any) -> Array:
+    """Return an array as it is if it is floating point, integers in the default precision; see `require_real`."""
+    require_real(name, values)
+    array = jnp.asarray(values)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+
+
+def require_count(name: str, value: Any, least: int = 1) -> None:
+    """Raise ValueError unless a setting is an integer, and not below the least that makes sense."""
+    try:
+        if operator.index(value) >= least:
+            return
+    except TypeError:
+        pass
+    raise ValueError(f"{name}: got {value!r}; expected an integer from {least}")

@@ -1,0 +1,77 @@
+"""The unit sphere and ball in cells of nearly one size: an icosahedron's faces, or the pyramids over them, cut up."""
+
+from itertools import permutations, product
+
+import numpy as np
+from jaxtyping import Float, Int
+
+_CENTRE = 12
+
+
+def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
+    """Return the vertices, on the unit sphere, and the faces."""
+    golden = (1 + np.sqrt(5)) / 2
+    one = [(0, a, b * golden) for a, b in product((-1, 1), repeat=2)]
+    vertices = np.array([np.roll(v, turn) for turn in range(3) for v in one], dtype=float)
+    near = np.linalg.norm(vertices[:, None] - vertices, axis=-1) < 2.1  # its edges have length 2
+    triples = [(i, j, k) for i in range(12) for j in range(i) for k in range(j)]
+    faces = np.array([t for t in triples if near[t[0], t[1]] and near[t[1], t[2]] and near[t[2], t[0]]])
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+
+
+# Kuhn cuts every cube of a lattice into the simplices that one reaches by unit steps, one along each axis in any order.
+# Those within n ≥ x₁ ≥ … ≥ x_d ≥ 0 are a subdivision of this simplex into n^d, and its facets are cut alike wherever
+# they are shared, as into triangles with edges along their own three.
+def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.ndarray, "cells corners"]]:
+    """Return a simplex, subdivided n times: barycentric coordinates times n of the points, and the cells."""
+    lattice = np.indices((n + 1,) * dimension).reshape(dimension, -1).T
+    points = lattice[(np.diff(lattice, axis=1) <= 0).all(axis=1)]
+    strides = (n + 1) ** np.arange(dimension)[::-1]
+    number = np.full((n + 1) ** dimension, -1)
+    number[points @ strides] = np.arange(len(points))
+    cells = []
+    for order in permutations(range(dimension)):
+        path = np.cumsum([np.zeros(dimension, int), *np.eye(dimension, dtype=int)[list(order)]], axis=0)
+        corners = points[:, None] + path
+        inside = (corners <= n).all(axis=(1, 2)) & (np.diff(corners, axis=2) <= 0).all(axis=(1, 2))
+        cells.append(number[corners[inside] @ strides])
+    ends = np.concatenate([np.full((len(points), 1), n), points, np.zeros((len(points), 1), int)], axis=1)
+    return -np.diff(ends, axis=1), np.concatenate(cells)
+
+
+def _glued(
+    simplices: Int[np.ndarray, "s corners"], n: int
+) -> tuple[Int[np.ndarray, "V 13"], Int[np.ndarray, "cells corners"]]:
+    """Subdivide simplices on 13 vertices: how much of each a point has, in n-ths, and the cells."""
+    weights, cells = _kuhn(n, simplices.shape[1] - 1)
+    shares = np.zeros((len(simplices), len(weights), _CENTRE + 1), np.int16)
+    for i, simplex in enumerate(simplices):
+        shares[i][:, simplex] = weights
+    points, number = np.unique(shares.reshape(-1, _CENTRE + 1), axis=0, return_inverse=True)
+    return points, number.reshape(len(simplices), -1)[:, cells].reshape(-1, cells.shape[1])
+
+
+def geodesic_sphere(n: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """Return 10n² + 2 points of the unit sphere and 20n² triangles between them, oriented outward."""
+    corners, faces = _icosahedron()
+    shares, cells = _glued(faces, n)
+    vertices = shares[:, :_CENTRE] @ corners
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, _swapped(cells, vertices[cells])
+
+
+def geodesic_ball(n: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "C 4"]]:
+    """Return points of the unit ball, in n concentric layers about its centre, and 20n³ tetrahedra between them."""
+    corners, faces = _icosahedron()
+    shares, cells = _glued(np.insert(faces, 0, _CENTRE, axis=1), n)
+    vertices = shares[:, :_CENTRE] @ corners
+    length = np.linalg.norm(vertices, axis=1)
+    radius = 1 - shares[:, _CENTRE] / n
+    vertices *= (radius / np.where(length > 0, length, 1))[:, None]
+    return vertices, _swapped(cells, vertices[cells[:, 1:]] - vertices[cells[:, :1]])
+
+
+def _swapped(cells: Int[np.ndarray, "n corners"], frames: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, "n corners"]:
+    """Swap two vertices of the cells whose frame is left-handed."""
+    left = np.linalg.det(frames) < 0
+    return np.where(left[:, None], cells[:, [1, 0, *range(2, cells.shape[1])]], cells)

@@ -1,0 +1,1 @@
+"""Solves on the complement of known eigenvectors, which derivatives need."""

@@ -1,0 +1,126 @@
+"""What solves with K − λᵢM on the complement of known eigenvectors have in common, in NumPy or in JAX.
+
+The derivatives of a truncated spectrum need them. On the M-orthogonal complement of the p lowest eigenvectors K − λᵢM
+is positive definite, and so is K − σM for *every* σ below the next eigenvalue Λ, whatever its sign elsewhere.
+Preconditioned with it, the spectrum of conjugate gradients lies between 1 and (Λ − λᵢ)/(Λ − σ). So the rows are grouped
+by their λᵢ, each group has its own shift σ among them, and a few factorisations bring every row to convergence in a few
+steps. `eigen.host` does so with SciPy's factorisations, `factorised` with those in JAX; `filtered` has a polynomial
+instead.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hks_jax.linear.pencil import SymmetricPencil
+
+Array = Any
+"""NumPy's or JAX's, the same for all arguments and the result."""
+
+SINGULAR = 1e-8
+"""The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
+
+_LEAST = 100
+"""What rounding leaves of a row that should vanish, in units of ε of what the row was; and the finest tolerance."""
+_FACTORISATION = 100
+"""What one factorisation costs, in solves of one row."""
+_MOST_GROUPS = 16
+
+
+def attainable(tolerance: float, dtype: Any) -> float:
+    """Return the tolerance, or what rounded eigenvectors allow if that is more: beyond it is noise."""
+    return max(tolerance, _LEAST * float(np.finfo(dtype).eps))
+
+
+def definite_product(
+    pencil: SymmetricPencil, shifts: Float[Array, " b"], beyond: Float[Array, ""]
+) -> Callable[[Float[Array, "b n"]], tuple[Float[Array, "b n"], Float[Array, " b"]]]:
+    """Return x ↦ (K − λᵢM) xᵢ, with the energy below which an eigenvalue equal to λᵢ is left on the complement."""
+
+    def product(x: Float[Array, "b n"]) -> tuple[Float[Array, "b n"], Float[Array, " b"]]:
+        image = pencil.mass.apply(x)
+        energy = (x * image).sum(axis=1)
+        return pencil.stiffness.apply(x) - shifts[:, None] * image, SINGULAR * beyond * energy
+
+    return product
+
+
+def first_beyond(values: Float[Array, " p"]) -> Float[Array, ""]:
+    """Return an estimate Λ of the first eigenvalue that is left; the last of the known ones is positive."""
+    return values[-1] * (1 + 1 / values.size)
+
+
+# The accuracy asked for is relative to the right-hand sides bᵢ as they were given, before Q = I − MΦΦᵀ took the known
+# eigenvectors out of them. What is left may be rounding alone: along T itself dK and dM are multiples of K and M, so
+# that bᵢ is one of Mφᵢ and Qbᵢ = 0. Relative to itself that noise has no solution, since most of it lies in the span of
+# MΦ, where it was taken out. It is zero. So it is in reverse mode, whose bᵢ are the cotangents of the solutions:
+# where all nodes count alike, for instance, they are multiples of Mφᵢ again.
+#
+# Small rows need fewer digits, or none: their share in what is summed over all rows is small. Where the operator
+# amplifies more, because λᵢ is near Λ, they count for more.
+def wanted_errors(
+    whole: Float[Array, "k n"],
+    left: Float[Array, "k n"],
+    lumped: Float[Array, " n"],
+    values: Float[Array, " p"],
+    tolerance: float,
+    dtype: Any,
+) -> Float[Array, " k"]:
+    """Return the errors to reduce the rows to, in the energy norm, relative to each row's own; infinite for zero.
+
+    Args:
+        whole: the right-hand sides bᵢ.
+        left: what the projection leaves of them, Qbᵢ.
+        lumped: the diagonal of M, for the norm.
+        values: the known eigenvalues; row i belongs to the i-th.
+        tolerance: the accuracy of the largest row.
+        dtype: what the eigenvectors and the rows were rounded to.
+    """
+    xp = values.__array_namespace__()
+    before, after = (xp.sqrt(xp.sum(rows * rows / lumped, axis=1)) for rows in (whole, left))
+    beyond = first_beyond(values)
+    # Where all rows are zero, none is asked for.
+    largest = xp.where(xp.any(before > 0), xp.max(before), 1)
+    share = after / largest * (beyond / (beyond - values[: len(whole)]))
+    noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
+    return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
+
+
+def group_numbers(
+    distance: Float[np.ndarray, " m"], rows: int, tolerance: float, most: int = _MOST_GROUPS
+) -> Int[np.ndarray, " m"]:
+    """Return the group of each distance from Λ, of at most so many groups in geometric progression.
+
+    With s groups of distances that differ by up to a ratio ρ the condition is ρ^(1/2s); s weighs factorisations against
+    the steps for all rows.
+    """
+    ratio = max(distance.max() / distance.min(), 1 + 1e-12)
+
+    def cost(s: int) -> float:
+        root = ratio ** (1 / (4 * s))
+        return s * _FACTORISATION + rows * np.log(2 / tolerance) / np.log((root + 1) / (root - 1))
+
+    count = min(min(range(1, _MOST_GROUPS + 1), key=cost), most)
+    return np.minimum((np.log(distance.max() / distance) / np.log(ratio) * count).astype(int), count - 1)
+
+
+def shifts_between(
+    values: Float[Array, " p"], nearest: Float[Array, " g"], farthest: Float[Array, " g"]
+) -> Float[Array, " g"]:
+    """Return a shift for each group of rows whose distances from Λ lie between the given ones.
+
+    The geometric mean of the two leaves the least condition, √ of their ratio. The shift is the middle of the gap in
+    the spectrum that is nearest to it, so that it is no eigenvalue.
+    """
+    xp = values.__array_namespace__()
+    targets = first_beyond(values) - xp.sqrt(nearest * farthest)
+    below = -0.1 * values[-1]
+    if values.size == 1:
+        return xp.broadcast_to(below, targets.shape)
+    gaps = xp.diff(values)
+    typical = (values[-1] - values[0]) / (values.size - 1)
+    distance = xp.abs(values[:-1] + gaps / 2 - targets[:, None])
+    chosen = xp.argmin(xp.where(gaps >= 0.1 * typical, distance, xp.inf), axis=1)
+    return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, below)

@@ -1,0 +1,119 @@
+"""Solves with K − λᵢM on the complement of known eigenvectors, all in JAX.
+
+The method is that of `hks_jax.eigen.complement.common`: conjugate gradients, preconditioned with a factorisation of
+K − σM for each group of neighbouring eigenvalues. Groups are made by index and not by value, so that shapes are static:
+by Weyl's law eigenvalues are spread evenly enough for that. The factorisations depend on the matrices alone, and serve
+all products with a Jacobian at one point.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hks_jax.eigen.complement.common import (
+    attainable,
+    definite_product,
+    first_beyond,
+    group_numbers,
+    shifts_between,
+    wanted_errors,
+)
+from hks_jax.linear.conjugate_gradients import conjugate_gradients
+from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.multifrontal import Factorisation, factorise
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.products import combine, inner_products
+
+_BLOCK = 32
+"""Rows solved at once."""
+_MEMORY = 5e8
+"""Bytes that factorisations may take together."""
+
+
+class _Groups(NamedTuple):
+    """How rows are grouped; static.
+
+    Attributes:
+        of_block: (blocks,) the group of each block of rows.
+        first: (groups,) the first row of each group.
+        last: (groups,) its last row.
+    """
+
+    of_block: Int[np.ndarray, " blocks"]
+    first: Int[np.ndarray, " groups"]
+    last: Int[np.ndarray, " groups"]
+
+
+def prepare(pencil: SymmetricPencil, values: Float[Array, " p"], k: int, tolerance: float) -> Factorisation:
+    """Factorise K − σM for each group of the first k of p eigenvalues; the results are stacked."""
+    dissection = dissect(pencil.pattern)
+    groups = _group(dissection, values, k, tolerance)
+    beyond = first_beyond(values)
+    shifts = shifts_between(values, beyond - values[groups.last], beyond - values[groups.first])
+    factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
+    return Factorisation(dissection, factors.downward, factors.upward, factors.negative)
+
+
+@partial(jax.jit, static_argnames="tolerance")
+def solve(
+    factors: Factorisation,
+    pencil: SymmetricPencil,
+    values: Float[Array, " p"],
+    vectors: Float[Array, "p n_dof"],
+    rhs: Float[Array, "k n_dof"],
+    tolerance: float,
+) -> Float[Array, "k n_dof"]:
+    """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; rows that do not converge are NaN.
+
+    Args:
+        factors: from `prepare`, for as many rows.
+        pencil: K and M.
+        values: (p,) the lowest eigenvalues, ascending.
+        vectors: (p, n_dof) their M-orthonormal eigenvectors Φ; Q = I − MΦΦᵀ.
+        rhs: (k, n_dof), k ≤ p; row i belongs to λᵢ.
+        tolerance: reduction of the error in the energy norm, relative to the largest row.
+    """
+    k, beyond = rhs.shape[0], first_beyond(values)
+    tolerance = attainable(tolerance, rhs.dtype)
+    images = jax.lax.map(pencil.mass.apply, vectors, batch_size=_BLOCK)
+    left = rhs - combine(inner_products(vectors, rhs), images)
+    wanted = wanted_errors(rhs, left, pencil.mass.diagonal(), values, tolerance, rhs.dtype)
+
+    of_block = _group(factors.dissection, values, k, tolerance).of_block
+    blocks = of_block.size
+    spare = blocks * _BLOCK - k  # rows that fill the last block up, with nothing to solve
+
+    def solve_block(block: tuple[Array, Array, Array, Array]) -> Array:
+        g, shifts, b, wanted = block
+        matrices = jax.tree.map(lambda stacked: stacked[g], (factors.downward, factors.upward, factors.negative))
+        factor = Factorisation(factors.dissection, *matrices)
+
+        def precondition(r: Array) -> Array:
+            z = factor.solve(r)
+            return z - combine(inner_products(images, z), vectors)
+
+        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
+
+    parts = (
+        jnp.asarray(of_block),
+        jnp.pad(values[:k], (0, spare)).reshape(blocks, _BLOCK),
+        jnp.pad(left, ((0, spare), (0, 0))).reshape(blocks, _BLOCK, -1),
+        jnp.pad(wanted, (0, spare), constant_values=jnp.inf).reshape(blocks, _BLOCK),
+    )
+    return jax.lax.map(solve_block, parts).reshape(blocks * _BLOCK, -1)[:k]
+
+
+def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> _Groups:
+    """Group blocks of the rows 0 … k−1 whose distance from Λ, by Weyl's law in 2D, is of one order."""
+    start = np.arange(0, k, _BLOCK)
+    end = np.minimum(start + _BLOCK, k)
+    distance = values.size + 1 - (start + end - 1) / 2
+    entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
+    room = max(int(_MEMORY / (entries * values.dtype.itemsize)), 1)
+    number = group_numbers(distance, k, tolerance, room)
+    _, first, of_block = np.unique(number, return_index=True, return_inverse=True)
+    return _Groups(of_block, start[first], np.append(start[first[1:]], k) - 1)

@@ -1,0 +1,84 @@
+"""Solves with K − λᵢM on the complement of known eigenvectors, matrix-free: conjugate gradients with a polynomial.
+
+The filter of `hks_jax.eigen.filter.damping`, with its sign changed, is the preconditioner; the known eigenvectors are
+taken out after each step, by products of matrices for a block of right-hand sides at once.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hks_jax.eigen.complement.common import attainable, definite_product, first_beyond, wanted_errors
+from hks_jax.eigen.filter.coarsening import finest_level
+from hks_jax.eigen.filter.damping import Band, correction, degree_for, upper_end
+from hks_jax.fem.columns import to_columns, to_rows
+from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.space import GridSpace
+from hks_jax.linear.conjugate_gradients import conjugate_gradients
+from hks_jax.linear.products import combine, inner_products
+
+_GAIN = 20.0
+"""What the preconditioner's polynomial is at λ: more costs more products with K, less more projections."""
+_MOST_DEGREE = 60
+_WIDEST = 0.9
+"""Where the band of the polynomial begins at the latest, as a part of its upper end."""
+
+
+def prepare(pencil: Pencil) -> Float[Array, ""]:
+    """Return the upper end of the spectrum of D⁻¹K."""
+    assert isinstance(pencil.space, GridSpace)
+    return upper_end(finest_level(pencil), pencil.space.periodic)
+
+
+def solve(
+    high: Float[Array, ""],
+    pencil: Pencil,
+    values: Float[Array, " p"],
+    vectors: Float[Array, "p n_dof"],
+    rhs: Float[Array, "k n_dof"],
+    tolerance: float,
+    block: int,
+) -> Float[Array, "k n_dof"]:
+    """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; NaN where it does not converge.
+
+    The tolerance is for the error in the energy norm, relative to the largest row.
+    """
+    space = pencil.space
+    assert isinstance(space, GridSpace)
+    level, periodic = finest_level(pencil), space.periodic
+    k, tolerance, beyond = rhs.shape[0], attainable(tolerance, rhs.dtype), first_beyond(values)
+    # The polynomial is one of D⁻¹K, whose values are the lumped quotients φᵀKφ / φᵀDφ: on coarse grids a fraction of λ.
+    mass = space.restrict(level.lumped)
+    quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=block)
+    band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
+    # Nearer to the band it does not reach its gain, and would no longer be definite.
+    nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
+    quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
+    images = jax.lax.map(pencil.mass.apply, vectors, batch_size=block)
+
+    def without_known(x: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
+        return x - combine(inner_products(images, x), vectors)
+
+    def one_block(args: tuple[Array, Array, Array, Array]) -> Float[Array, "b n_dof"]:
+        shifts, references, b, wanted = args
+        degree = jnp.ceil(jnp.clip(degree_for(band, jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
+
+        def precondition(r: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
+            columns = to_columns(space.extend(r, outside=0.0).reshape(r.shape[0], -1), level.shape)
+            z = correction(level, periodic, band, columns, references, degree)
+            return without_known(-space.restrict(to_rows(z).reshape(-1, *level.shape)))
+
+        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
+
+    left = rhs - combine(inner_products(vectors, rhs), images)
+    wanted = wanted_errors(rhs, left, pencil.mass.diagonal(), values, tolerance, rhs.dtype)
+    count = -(-k // block)
+    spare = count * block - k  # rows that fill the last block up, with nothing to solve
+    parts = (
+        *(jnp.pad(v[:k], (0, spare)).reshape(count, block) for v in (values, quotients)),
+        jnp.pad(left, ((0, spare), (0, 0))).reshape(count, block, -1),
+        jnp.pad(wanted, (0, spare), constant_values=jnp.inf).reshape(count, block),
+    )
+    return jax.lax.map(one_block, parts).reshape(count * block, -1)[:k]

@@ -1,0 +1,1 @@
+"""Subspace iteration by Chebyshev filters, without a factorisation."""

@@ -1,0 +1,141 @@
+"""Coarser grids for a pencil of stencils: every second node of each axis, by Galerkin's principle.
+
+The eigenfunctions of the coarse problem, interpolated, are where an iteration on the fine grid starts.
+"""
+
+from functools import partial
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.fem.colouring import axis_colours
+from hks_jax.fem.columns import stencil_product, to_columns, to_rows
+from hks_jax.fem.operators import StencilOperator
+from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.space import GridSpace
+from hks_jax.linear.operators import DiagonalOperator
+
+_COLUMNS = 16
+"""Columns in one product."""
+
+
+class GridLevel(NamedTuple):
+    """A pencil on one grid, in nodal arrays.
+
+    Attributes:
+        stiffness: (3^d, *shape).
+        mass: (3^d, *shape), or (1, *shape) for a diagonal.
+        lumped: (*shape,) the row sums of the mass; 1 at nodes that are not free.
+        free: (*shape,) nodes that carry a degree of freedom.
+        domain: (*shape,) nodes of the domain: free ones, and those where functions vanish.
+    """
+
+    stiffness: Float[Array, "offsets *shape"]
+    mass: Float[Array, "mass_offsets *shape"]
+    lumped: Float[Array, "*shape"]
+    free: Bool[Array, "*shape"]
+    domain: Bool[Array, "*shape"]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of nodal arrays."""
+        return self.lumped.shape
+
+
+def finest_level(pencil: Pencil) -> GridLevel:
+    """Return the level of a grid's pencil itself."""
+    space, stiffness, mass = pencil.space, pencil.stiffness, pencil.mass
+    assert isinstance(space, GridSpace)
+    assert isinstance(stiffness, StencilOperator)
+    if isinstance(mass, DiagonalOperator):
+        coefficients = space.extend(mass.entries, outside=0.0)[None]
+    else:
+        assert isinstance(mass, StencilOperator)
+        coefficients = mass.coefficients
+    return _level(stiffness.coefficients, coefficients, jnp.asarray(space.free), jnp.asarray(space.domain))
+
+
+def coarsen(level: GridLevel, periodic: tuple[bool, ...]) -> GridLevel:
+    """Return the level on every second node of each axis, its matrices PᵀKP and PᵀMP, P the interpolation."""
+    every_second = (slice(None, None, 2),) * len(periodic)
+    free, domain = level.free[every_second], level.domain[every_second]
+    shape = free.shape
+    colours, of_neighbour = _colouring(shape, periodic)
+    count = int(colours.max()) + 1
+    padded = -(-count // _COLUMNS) * _COLUMNS
+    indicators = (colours.ravel() == np.arange(padded)[:, None]).reshape(-1, _COLUMNS, colours.size)
+
+    def galerkin(coefficients: Array) -> Array:
+        def images(rows: Bool[Array, "b coarse"]) -> Float[Array, "b coarse"]:
+            x = interpolate(to_columns(rows.astype(level.lumped.dtype), shape), level, periodic)
+            y = stencil_product(coefficients, x, periodic)
+            return to_rows(_restrict(y, level, shape, periodic))
+
+        products = jax.lax.map(images, jnp.asarray(indicators)).reshape(padded, *shape)
+        # A node's image under the sum of a colour's basis functions is its coupling to the one of them near by.
+        return jnp.stack(
+            [
+                jnp.where(neighbour >= 0, jnp.take_along_axis(products, np.maximum(neighbour, 0)[None], axis=0)[0], 0)
+                for neighbour in of_neighbour
+            ]
+        )
+
+    return _level(galerkin(level.stiffness), galerkin(level.mass), free, domain)
+
+
+def interpolate(x: Float[Array, "*coarse b"], fine: GridLevel, periodic: tuple[bool, ...]) -> Float[Array, "*shape b"]:
+    """Interpolate from every second node multilinearly; beyond a rim, constantly; zero at nodes that are not free."""
+    every_second = (slice(None, None, 2),) * len(periodic)
+    weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, periodic)
+    x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, periodic)
+    return jnp.where(fine.free[..., None], x / jnp.where(weights > 0, weights, 1), 0)
+
+
+def _restrict(
+    y: Float[Array, "*shape b"], fine: GridLevel, shape: tuple[int, ...], periodic: tuple[bool, ...]
+) -> Float[Array, "*coarse b"]:
+    """Apply the transpose of the interpolation."""
+    coarse = jax.ShapeDtypeStruct((*shape, y.shape[-1]), y.dtype)
+    return jax.linear_transpose(partial(interpolate, fine=fine, periodic=periodic), coarse)(y)[0]
+
+
+def _interpolate(x: Float[Array, "*coarse b"], shape: tuple[int, ...], periodic: tuple[bool, ...]) -> Array:
+    for axis, (n, wraps) in enumerate(zip(shape, periodic, strict=True)):
+        following = jnp.concatenate(
+            [
+                jax.lax.slice_in_dim(x, 1, None, axis=axis),
+                jax.lax.slice_in_dim(x, 0, 1, axis=axis) if wraps else jax.lax.slice_in_dim(x, -1, None, axis=axis),
+            ],
+            axis,
+        )
+        both = jnp.stack([x, (x + following) / 2], axis + 1)
+        merged = both.reshape(*x.shape[:axis], -1, *x.shape[axis + 1 :])
+        x = jax.lax.slice_in_dim(merged, 0, n, axis=axis)
+    return x
+
+
+def _level(stiffness: Array, mass: Array, free: Array, domain: Array) -> GridLevel:
+    return GridLevel(stiffness, mass, jnp.where(free, jnp.sum(mass, axis=0), 1), free, domain)
+
+
+def _colouring(
+    shape: tuple[int, ...], periodic: tuple[bool, ...]
+) -> tuple[Int[np.ndarray, "*shape"], list[Int[np.ndarray, "*shape"]]]:
+    """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none."""
+    axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, periodic, strict=True)]
+    number = np.zeros(shape, int)
+    for axis, colours in enumerate(axes):
+        number = number * (colours.max() + 1) + colours.reshape([-1 if a == axis else 1 for a in range(len(shape))])
+    padded = number
+    for axis, wraps in enumerate(periodic):
+        widths = [(1, 1) if a == axis else (0, 0) for a in range(len(shape))]
+        padded = np.pad(padded, widths, mode="wrap") if wraps else np.pad(padded, widths, constant_values=-1)
+    neighbours = [
+        padded[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))]
+        for start in product((0, 1, 2), repeat=len(shape))
+    ]
+    return number, neighbours

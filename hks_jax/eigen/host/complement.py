@@ -1,0 +1,136 @@
+"""Solves with K − λᵢM on the complement of known eigenvectors, on the host.
+
+Conjugate gradients, preconditioned with SciPy's factorisations of K − σM: the method of
+`hks_jax.eigen.complement.common`.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
+
+import numpy as np
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import SuperLU
+from threadpoolctl import threadpool_limits
+
+from hks_jax.eigen.complement.common import (
+    SINGULAR,
+    first_beyond,
+    group_numbers,
+    shifts_between,
+    wanted_errors,
+)
+from hks_jax.linear.conjugate_gradients import MAX_ITERATIONS
+
+_BLOCK = 16
+"""Columns solved at once: enough for fast products, few enough for the cache."""
+
+
+def solve_complement(
+    K: csc_matrix,
+    M: csc_matrix,
+    values: np.ndarray,
+    vectors: np.ndarray,
+    rhs: np.ndarray,
+    *,
+    factorise: Callable[[csc_matrix], SuperLU],
+    tolerance: float,
+    dtype: np.dtype,
+    report: Callable[[str], None],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0.
+
+    Args:
+        K: stiffness.
+        M: mass.
+        values: (p,) the lowest eigenvalues, ascending.
+        vectors: (p, n) their M-orthonormal eigenvectors Φ; Q = I − MΦΦᵀ.
+        rhs: (k, n), k ≤ p; row i belongs to λᵢ.
+        factorise: factorises a symmetric, possibly indefinite matrix.
+        tolerance: reduction of the error in the energy norm, relative to the largest row.
+        dtype: what eigenvectors and right-hand sides were rounded to before they came here as float64.
+        report: told in words how it goes.
+
+    Returns:
+        x (k, n), and the relative energy errors (k,) that the iteration saw last, in units of the tolerance asked of
+        each row: above 1 it did not converge.
+    """
+    phi = np.ascontiguousarray(vectors.T)
+    m_phi = M @ phi
+    x, errors = np.zeros_like(rhs), np.zeros(len(rhs))
+    left = rhs - (rhs @ phi) @ m_phi.T
+    wanted = wanted_errors(rhs, left, M.diagonal(), values, tolerance, dtype)
+    rhs, beyond = left, float(first_beyond(values))
+    active = np.flatnonzero(np.isfinite(wanted))
+    done = 0
+
+    def solve(block: np.ndarray, factor: SuperLU) -> None:
+        nonlocal done
+        solution, errors[block] = _conjugate_gradients(
+            K, M, values[block], phi, m_phi, rhs[block].T, factor, wanted[block], beyond
+        )
+        x[block] = solution.T
+        done += block.size
+        report(f"derivative: {done} of {active.size} solves")
+
+    # Blocks are solved side by side, each with one BLAS thread: SuperLU's many small BLAS calls do not gain by more.
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
+        for rows, shift in _groups(values, beyond, active, tolerance):
+            blocks = [rows[start : start + _BLOCK] for start in range(0, rows.size, _BLOCK)]
+            list(threads.map(solve, blocks, repeat(factorise(K - shift * M))))
+    return x, errors
+
+
+def _conjugate_gradients(
+    K: csc_matrix,
+    M: csc_matrix,
+    eigenvalues: np.ndarray,
+    phi: np.ndarray,
+    m_phi: np.ndarray,
+    b: np.ndarray,
+    factor: SuperLU,
+    wanted: np.ndarray,
+    beyond: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve a block of columns; return x (n, b) and the errors over the wanted ones (b,)."""
+
+    def precondition(r: np.ndarray) -> np.ndarray:
+        z = factor.solve(r)
+        return z - phi @ (m_phi.T @ z)
+
+    x, errors = np.zeros_like(b), np.zeros(b.shape[1])
+    left = np.arange(b.shape[1])
+    r = np.ascontiguousarray(b)
+    p = z = precondition(r)
+    first = energy = np.einsum("nb,nb->b", r, z)
+    for _ in range(MAX_ITERATIONS):
+        if left.size == 0:
+            break
+        m_p = M @ p
+        a_p = K @ p - m_p * eigenvalues[left]
+        curvature = np.einsum("nb,nb->b", p, a_p)
+        # Where it nearly vanishes, an eigenvalue equal to λᵢ is left on the complement: there is no solution.
+        regular = curvature > SINGULAR * beyond * np.einsum("nb,nb->b", p, m_p)
+        length = energy / np.where(regular, curvature, np.inf)
+        x[:, left] += length * p
+        r = r - length * a_p
+        z = precondition(r)
+        before, energy = energy, np.einsum("nb,nb->b", r, z)
+        errors[left] = np.where(regular, np.sqrt(np.abs(energy) / first[left]) / wanted[left], np.inf)
+        open_ = (errors[left] > 1) & regular
+        p = z + (energy / before) * p
+        if not open_.all():  # go on with the others alone
+            left, r, p, energy = left[open_], r[:, open_], p[:, open_], energy[open_]
+    return x, errors
+
+
+def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: float) -> list[tuple[np.ndarray, float]]:
+    """Split rows into groups of neighbouring eigenvalues, and give each a shift."""
+    if active.size == 0:
+        return []
+    distance = beyond - values[active]
+    number = group_numbers(distance, active.size, tolerance)
+    groups = [number == i for i in np.unique(number)]
+    ends = [np.array([end(distance[group]) for group in groups]) for end in (np.min, np.max)]
+    return [(active[group], float(shift)) for group, shift in zip(groups, shifts_between(values, *ends), strict=True)]

@@ -1,0 +1,150 @@
+"""Large sparse pencils by SciPy's shift-invert Lanczos on the host."""
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
+
+from hks_jax.checks import require_count, require_number
+from hks_jax.eigen.host.matrices import complement_on_host, factorise_on_host, host_matrices, inertia_on_host
+from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.fem.pencil import Pencil
+from hks_jax.traced import is_traced
+
+Found = tuple[np.ndarray, np.ndarray, float]
+
+_ROUNDS = 20
+"""How often to look for missed copies of a multiple eigenvalue; each round finds at least one."""
+
+
+class ShiftInvert(Eigensolver[Pencil]):
+    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M, factorised by SuperLU; float64 on the host.
+
+    That no eigenvalue below the last was missed is checked by the inertia of a second factorisation. Under `jit` and
+    `vmap` it runs through a host callback, one problem at a time; called plainly it can be interrupted, and reports
+    progress.
+
+    Attributes:
+        tolerance: relative residual that counts as converged; ARPACK itself runs to machine precision.
+        max_restarts: implicit restarts before giving up.
+        basis: size of the Lanczos basis, more than k (for derivatives, than 9 + k + k/20); None takes 2k + 20.
+        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
+            below what the eigenvectors' dtype allows.
+        progress: called with short texts such as ``"150 solves"`` while it runs; None is silent.
+    """
+
+    name: ClassVar[str] = "shift-invert"
+    warns: ClassVar[bool] = True
+    tolerance: float = eqx.field(default=1e-8, static=True)
+    max_restarts: int = eqx.field(default=300, static=True)
+    basis: int | None = eqx.field(default=None, static=True)
+    derivative_tolerance: float = eqx.field(default=1e-12, static=True)
+    progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
+
+    def max_pairs(self, n_dof: int) -> int:
+        """Return n_dof − 1: a Lanczos basis must be larger than what is wanted."""
+        return n_dof - 1
+
+    def __check_init__(self) -> None:
+        """Check the settings."""
+        require_number("tolerance", self.tolerance, 1)
+        require_count("max_restarts", self.max_restarts)
+        if self.basis is not None:
+            require_count("basis", self.basis, 2)
+        require_number("derivative_tolerance", self.derivative_tolerance, 1)
+
+    def lowest(self, pencil: Pencil, k: int) -> RawPairs:
+        """Return the k lowest eigenpairs, and the shift at which inertia confirmed them."""
+        n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
+        (data_k, data_m), matrices = host_matrices(pencil)
+
+        def solve(data_k: ArrayLike, data_m: ArrayLike, volume: ArrayLike) -> tuple[np.ndarray, ...]:
+            # The shift keeps K + sM positive definite; Weyl's λ₁ is the scale on which it is small.
+            shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
+            K, M = matrices(data_k, data_m)
+            return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift))
+
+        inputs = (data_k, data_m, pencil.volume)
+        if is_traced(inputs):
+            shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))
+            return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
+        # Where JAX differentiates, `asarray` leaves them NumPy's, and the barrier makes JAX's arrays of them.
+        return jax.lax.optimization_barrier(tuple(map(jnp.asarray, solve(*inputs))))
+
+    def solve_complement(
+        self,
+        prepared: None,
+        pencil: Pencil,
+        values: Float[Array, " p"],
+        vectors: Float[Array, "p n_dof"],
+        rhs: Float[Array, "k n_dof"],
+    ) -> Float[Array, "k n_dof"]:
+        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.common`."""
+        return complement_on_host(pencil, values, vectors, rhs, self.derivative_tolerance, self._report)
+
+    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float) -> Found:
+        n = K.shape[0]
+        nothing = np.full(k, np.nan), np.full((k, n), np.nan), np.nan
+        if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
+            return nothing
+        self._report("factorising")
+        factor = factorise_on_host(K + shift * M)
+        values, vectors = np.empty(0), np.empty((n, 0))
+        solves, wanted = 0, k
+
+        def apply_inverse(x: np.ndarray) -> np.ndarray:
+            nonlocal solves
+            solves += 1
+            if solves % 50 == 0:
+                self._report(f"{solves} solves")
+            y = factor.solve(x)
+            return y - vectors @ (vectors.T @ (M @ y))
+
+        inverse = LinearOperator(K.shape, matvec=apply_inverse, dtype=np.float64)
+        for seed in range(_ROUNDS):
+            start = np.random.default_rng(seed).standard_normal(n)
+            basis = min(n, max(wanted + 1, self.basis or 2 * wanted + 20))
+            try:
+                further, others = eigsh(
+                    K, wanted, M, -shift, OPinv=inverse, v0=start, ncv=basis, maxiter=self.max_restarts
+                )
+            except ArpackNoConvergence as stopped:
+                return _padded(stopped.eigenvalues, stopped.eigenvectors, k, np.nan) if seed == 0 else nothing
+            except ArpackError:
+                return nothing
+            order = np.argsort(np.concatenate([values, further]))[:k]
+            values = np.concatenate([values, further])[order]
+            vectors = np.concatenate([vectors, others], axis=1)[:, order]
+            # Lanczos with single vectors can miss copies of a multiple eigenvalue. By Sylvester's law of inertia the
+            # negative pivots of K − σM count the eigenvalues below σ: look again, past what is found, for the missing.
+            below = values[-1] - 1e-6 * max(values[-1], shift)
+            if below <= 0:  # nothing but constants
+                return _padded(values, vectors, k, max(below, 0.0))
+            negative, sound = inertia_on_host(K, M, below)
+            missing = negative - int((values < below).sum())
+            if not sound or missing <= 0:
+                return _padded(values, vectors, k, below if sound else np.nan)
+            self._report(f"{missing} missed: looking again")
+            wanted = min(missing + 2, n - 1)
+        return nothing
+
+    def _report(self, text: str) -> None:
+        if self.progress is not None:
+            self.progress(text)
+
+
+def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> Found:
+    """Return eigenvalues ascending and eigenvectors as rows, NaN where there are fewer than k."""
+    order, missing = np.argsort(values), k - values.size
+    return (
+        np.pad(values[order], (0, missing), constant_values=np.nan),
+        np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
+        complete_below,
+    )

@@ -1,0 +1,1 @@
+"""Spectrum slicing by block Lanczos on factorisations."""

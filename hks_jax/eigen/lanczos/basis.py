@@ -1,0 +1,115 @@
+"""A growing M-orthonormal basis of many long vectors, kept as rows."""
+
+from itertools import accumulate
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.linear.products import combine, products_with_columns
+
+_PIECE = 128
+"""Rows kept together: vectors are projected on whole pieces, but not on those that are still empty."""
+
+_SMALL = 1e-7
+"""Components up to here are taken away in single precision: what it leaves of them is rounding."""
+
+_NODES = 2048
+"""Degrees of freedom combined at once: what is read and what comes of it stay in the cache."""
+
+
+class Piece(NamedTuple):
+    """Rows of the basis; in single precision too, where that is not their own."""
+
+    rows: Float[Array, "rows n_dof"]
+    single: Float[Array, "rows n_dof"] | None
+
+
+Basis = tuple[Piece, ...]
+
+
+def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
+    """Return a basis of the known vectors, with room for ``size`` rows in all; the others are zero.
+
+    Known vectors and size are multiples of ``block``, which is how many rows are written at once.
+    """
+    step = max(_PIECE // block, 1) * block
+    pieces = []
+    for at in range(0, size, step):
+        rows = known[at : at + step]
+        rows = jnp.pad(rows, ((0, min(step, size - at) - len(rows)), (0, 0)))
+        pieces.append(Piece(rows, None if rows.dtype == jnp.float32 else rows.astype(jnp.float32)))
+    return tuple(pieces)
+
+
+def write(basis: Basis, block: Float[Array, "n_dof b"], row: Int[Array, ""]) -> Basis:
+    """Return the basis with columns as its rows from the given one on, a multiple of b."""
+    # The barrier keeps XLA from transposing anew for each piece.
+    block, written = jax.lax.optimization_barrier(block.T), []
+    for piece, at in zip(basis, _starts(basis), strict=True):
+        size = len(piece.rows)
+        inside, place = (row >= at) & (row < at + size), jnp.clip(row - at, 0, size - len(block))
+        single = None if piece.single is None else _put(piece.single, block, place, inside)
+        written.append(Piece(_put(piece.rows, block, place, inside), single))
+    return tuple(written)
+
+
+# One step of shift-invert Lanczos amplifies what a block has in a converged eigenvector by some ten to a hundred times:
+# what two steps make of rounding is c = VᵀMx of 1e-14 to 1e-9. Its sums need double precision, as rounding is otherwise
+# as large as c itself. To take Vc away does not: single precision leaves 6e-8 c. Where the shift is so near to an
+# eigenvalue that c is not small, V is taken in its own precision.
+def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "c n_dof"]:
+    """Return what columns x, given as Mx, have in the first rows of the basis, as rows: (VᵀMx)ᵀVᵀ."""
+    used = [filled > at for at in _starts(basis)]
+
+    def none(rows: Array, x: Array) -> Float[Array, "rows c"]:
+        return jnp.zeros((len(rows), x.shape[1]), x.dtype)
+
+    products = [
+        jax.lax.cond(filled_piece, products_with_columns, none, piece.rows, images)
+        for filled_piece, piece in zip(used, basis, strict=True)
+    ]
+
+    def taken(pieces: list[Array]) -> Float[Array, "c n_dof"]:
+        dtype = pieces[0].dtype
+        parts = jnp.zeros(images.shape[::-1], dtype)
+        for filled_piece, product, rows in zip(used, products, pieces, strict=True):
+            mix = product.T.astype(dtype)
+            parts = jax.lax.cond(filled_piece, lambda m, r, p: p + combine(m, r), lambda m, r, p: p, mix, rows, parts)
+        return parts.astype(images.dtype)
+
+    whole = [piece.rows for piece in basis]
+    single = [piece.single for piece in basis if piece.single is not None]
+    if not single:
+        return taken(whole)
+    small: Bool[Array, ""] = jnp.max(jnp.abs(jnp.concatenate(products))) < _SMALL
+    return jax.lax.cond(small, lambda: taken(single), lambda: taken(whole))
+
+
+def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
+    """Return many linear combinations of all rows of the basis."""
+    n = basis[0].rows.shape[1]
+    width = min(_NODES, n)
+    mixes = jnp.split(mix, _starts(basis)[1:], axis=1)
+
+    def some(number: Array, found: Float[Array, "q n_dof"]) -> Float[Array, "q n_dof"]:
+        at = jnp.minimum(number * width, n - width)  # the last may overlap the one before
+        parts = [jax.lax.dynamic_slice_in_dim(piece.rows, at, width, axis=1) for piece in basis]
+        sums = sum(map(combine, mixes, parts), jnp.zeros((), mix.dtype))
+        return jax.lax.dynamic_update_slice_in_dim(found, sums, at, axis=1)
+
+    return jax.lax.fori_loop(0, -(-n // width), some, jnp.zeros((len(mix), n), mix.dtype))
+
+
+def _starts(basis: Basis) -> list[int]:
+    """Return the first row of each piece."""
+    return list(accumulate((len(piece.rows) for piece in basis[:-1]), initial=0))
+
+
+def _put(
+    rows: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], place: Int[Array, ""], inside: Bool[Array, ""]
+) -> Float[Array, "rows n_dof"]:
+    """Return rows with the block put in place, or, where it does not belong to them, as they are."""
+    old = jax.lax.dynamic_slice_in_dim(rows, place, len(block))
+    return jax.lax.dynamic_update_slice_in_dim(rows, jnp.where(inside, block.astype(rows.dtype), old), place, axis=0)

@@ -1,0 +1,149 @@
+"""The eigensolver for what can be factorised: spectrum slicing by block Lanczos, certified to miss no eigenvalue."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hks_jax.checks import require_count, require_number
+from hks_jax.compilation import jit_quickly
+from hks_jax.eigen.complement import factorised
+from hks_jax.eigen.lanczos.slicing import cut, search
+from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, crowded, first_state, make_room, unfinished
+from hks_jax.eigen.located import LocatedPencil
+from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.eigen.weyl import weyl
+from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.multifrontal import Factorisation
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.traced import is_traced
+
+SLICE = 170
+"""Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
+
+
+class BlockLanczos(Eigensolver[SymmetricPencil]):
+    """Spectrum slicing: shift-invert block Lanczos on nested-dissection factorisations, all in JAX.
+
+    For grids and meshes, 2D above all (in 3D the factors fill in). The same code runs on CPUs and accelerators, and is
+    traceable whole. Called plainly it can be interrupted, and reports progress, between two slices.
+
+    Attributes:
+        tolerance: relative residual that counts as converged.
+        block: vectors per Lanczos block. Multiplicities may be larger.
+        slice_size: eigenvalues per slice; None chooses.
+        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
+            below what the eigenvectors' dtype allows.
+        progress: called with short texts after each slice; None is silent.
+    """
+
+    name: ClassVar[str] = "block-lanczos"
+    tolerance: float = eqx.field(default=1e-8, static=True)
+    block: int = eqx.field(default=8, static=True)
+    slice_size: int | None = eqx.field(default=None, static=True)
+    derivative_tolerance: float = eqx.field(default=1e-12, static=True)
+    progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
+
+    def __check_init__(self) -> None:
+        """Check the settings."""
+        require_number("tolerance", self.tolerance, 1)
+        require_count("block", self.block)
+        if self.slice_size is not None:
+            require_count("slice_size", self.slice_size)
+        require_number("derivative_tolerance", self.derivative_tolerance, 1)
+
+    def lowest(self, pencil: SymmetricPencil, k: int) -> RawPairs:
+        """Return the k lowest eigenpairs; of a `LocatedPencil`, from its origin upwards."""
+        plan = self.plan(k, min(pencil.n_null, k))
+        state = self.slice(expected(pencil, plan), plan)
+        assert state.vectors is not None
+        return (*_lowest(state.values, state.vectors, k), state.complete_below)
+
+    def prepare_complement(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Factorisation:
+        """Factorise K − σM for each group of neighbouring eigenvalues."""
+        return factorised.prepare(pencil, values, k, self.derivative_tolerance)
+
+    def solve_complement(
+        self,
+        prepared: Factorisation,
+        pencil: SymmetricPencil,
+        values: Float[Array, " p"],
+        vectors: Float[Array, "p n_dof"],
+        rhs: Float[Array, "k n_dof"],
+    ) -> Float[Array, "k n_dof"]:
+        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.factorised`."""
+        return factorised.solve(prepared, pencil, values, vectors, rhs, self.derivative_tolerance)
+
+    def max_pairs(self, n_dof: int) -> int:
+        """Return how many pairs leave room for a Lanczos basis."""
+        return max((n_dof - 16 * self.block) // 4, 0)
+
+    def plan(self, k: int, nulls: int = 0) -> Plan:
+        """Return the sizes of the computation, of whose k eigenvalues some are known to be zero."""
+        slices = max(round(k / (self.slice_size or SLICE)), 1)
+        size = math.ceil(1.06 * k / slices) + 2
+        return Plan(k, self.block, size, 3 * slices + 12, nulls)
+
+    def slice(self, problem: Problem, plan: Plan) -> SlicingState:
+        """Compute the wanted eigenpairs from zero upwards, slice by slice."""
+        dissection = dissect(problem.pencil.pattern)
+        if is_traced(problem):
+            return _slice_traced(problem, dissection, plan, self.tolerance)
+        dissection, state = jax.device_put(dissection), _first_state(problem, plan)
+        while _unfinished(plan, state):
+            factor, searchable, state = cut(problem, dissection, plan, self.tolerance, state)
+            if searchable:
+                state = _make_room(plan, state) if _crowded(plan, state) else state
+                state = search(problem, factor, plan, self.tolerance, state)
+            self._report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
+        return state
+
+    def _report(self, text: str) -> None:
+        if self.progress is not None:
+            self.progress(text)
+
+
+_first_state = jit_quickly(static_argnames="plan")(first_state)
+_make_room = jit_quickly(static_argnames="plan")(make_room)
+_unfinished = jit_quickly(static_argnames="plan")(unfinished)
+_crowded = jit_quickly(static_argnames="plan")(crowded)
+
+
+@jit_quickly(static_argnames="plan")
+def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
+    """Return what to expect of a spectrum: on a domain by Weyl's law, else by what was counted beforehand."""
+    if isinstance(pencil, LocatedPencil):
+        spacing = pencil.spacing
+        return Problem(pencil, pencil.first, spacing, spacing, spacing, pencil.negative)
+    assert isinstance(pencil, Pencil)
+    n, dtype = pencil.space.dimension, pencil.stiffness.dtype
+    first, several, lowest = (
+        weyl(j, pencil.volume, n).astype(dtype) for j in (min(plan.wanted, plan.slice_size) / 2 + 1, plan.slice_size, 1)
+    )
+    return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype), jnp.zeros((), int))
+
+
+def _slice_traced(problem: Problem, dissection: Dissection, plan: Plan, tolerance: float) -> SlicingState:
+    def body(state: SlicingState) -> SlicingState:
+        factor, searchable, state = cut(problem, dissection, plan, tolerance, state)
+        state = jax.lax.cond(searchable & crowded(plan, state), partial(make_room, plan), lambda state: state, state)
+        return jax.lax.cond(searchable, partial(search, problem, factor, plan, tolerance), lambda state: state, state)
+
+    return jax.lax.while_loop(partial(unfinished, plan), body, first_state(problem, plan))
+
+
+@jit_quickly(static_argnames="k")
+def _lowest(
+    values: Float[Array, " capacity"], vectors: Float[Array, "capacity n_dof"], k: int
+) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
+    """Return the lowest known pairs; NaN where there are fewer than k."""
+    order = jnp.argsort(values)[:k]
+    values, vectors = values[order], vectors[order]
+    known = jnp.isfinite(values)
+    return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan)

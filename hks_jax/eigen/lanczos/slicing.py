@@ -1,0 +1,201 @@
+"""Spectrum slicing: the lowest eigenpairs of a pencil, interval by interval, none missed.
+
+Each slice factorises K − σM at a shift σ a little above what is known already. The inertia says how many eigenvalues
+lie below σ; block Lanczos, kept orthogonal to the known eigenvectors near by, finds them and about as many above. What
+converged is known from then on. A last factorisation above the last eigenvalue wanted is the certificate: as many
+eigenvalues as are known lie below it. Few vectors at a time keep orthogonalisation cheap, however many are wanted.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.compilation import jit_quickly
+from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
+from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, steps_for
+from hks_jax.eigen.quality import indistinct, values_and_defects
+from hks_jax.linear.dissection import Dissection
+from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
+
+_ERROR = 0.03
+"""How far the error of solves may reach towards the tolerance of the lowest eigenvalue sought."""
+
+_EXCUSE = 30
+"""How much more than usual rounding may spoil residuals, where nothing converges otherwise."""
+
+_MOVES = 3
+"""How often in a row to move a shift at which the inertia is not to be trusted, before it must do."""
+
+
+def cut(
+    problem: Problem, dissection: Dissection, plan: Plan, tolerance: float, state: SlicingState
+) -> tuple[Factorisation, Bool[Array, ""], SlicingState]:
+    """Factorise at the state's shift; return with it whether to search there, and the state if not."""
+    factor = factorise(dissection, problem.pencil.shifted(state.shift))
+    trial = try_out(factor, problem.pencil, state.shift, state.noise)
+    searchable, following = _consider(problem, factor.negative, trial, plan, tolerance, state._replace(vectors=None))
+    return factor, searchable, following._replace(vectors=state.vectors)
+
+
+@jit_quickly(static_argnames=("plan", "tolerance"))
+def _consider(
+    problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, tolerance: float, state: SlicingState
+) -> tuple[Bool[Array, ""], SlicingState]:
+    """Return whether to search at the state's shift, and the state if not: finished, or with a better shift."""
+    known, below = jnp.sum(state.values < state.shift), negative - problem.negative
+    missing = below - known
+    complete = trial.sound & (missing == 0)
+    finished = complete & (known >= plan.wanted)
+    too_many = trial.sound & (missing > plan.slice_size)
+    lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
+    accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, tolerance, lowest))
+    # Another shift costs a factorisation, refined solves more: they are for where it is no better.
+    moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
+
+    share = plan.slice_size / (2.5 * jnp.maximum(missing, 1).astype(state.shift.dtype))
+    nearer = state.reached + share * (state.shift - state.reached)
+    # 0.7 of the mean distance of eigenvalues leaves an eigenvalue of a part of the domain behind. Upward where all are
+    # known, downward where some are missing.
+    down = state.shift - 0.7 * (state.shift - state.reached) / jnp.maximum(missing, 1).astype(state.shift.dtype)
+    up = state.shift + 0.7 * _spacing(problem, plan, state)
+    beside = jnp.where(jnp.where(trial.sound, missing <= 0, state.known >= plan.wanted), up, down)
+    state = state._replace(
+        slices=state.slices + 1,
+        finished=finished,
+        complete_below=jnp.where(complete, jnp.maximum(state.shift, state.complete_below), state.complete_below),
+        shift=jnp.where(too_many, nearer, jnp.where(moves, beside, state.shift)),
+        below=jnp.where(trial.sound, below, -1),
+        moved=jnp.where(moves, state.moved + 1, 0),
+        passes=jnp.where(accurate, state.passes, 2),
+    )
+    return ~(finished | too_many | moves), state
+
+
+def _needed(problem: Problem, tolerance: float, lowest: Float[Array, ""]) -> Float[Array, ""]:
+    """Return how small residuals ‖Kφ − λMφ‖/‖Mφ‖ must be if the lowest eigenvalue not known yet is to converge."""
+    return jnp.maximum(tolerance * jnp.maximum(lowest, problem.unit), indistinct(problem.pencil, lowest.dtype))
+
+
+def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float, state: SlicingState) -> SlicingState:
+    """Find the eigenpairs around the shift."""
+    assert state.vectors is not None
+    window, shifted = _window(problem, plan, state), ShiftedSolve(factor, state.shift, state.passes)
+    ritz = block_lanczos(problem.pencil, shifted, state.start, window.vectors, plan.steps, window.steps, plan.ritz)
+    interval = window.low, window.high
+    return _accept(problem, plan, tolerance, ritz, interval, state.vectors, state._replace(vectors=None))
+
+
+@jit_quickly(static_argnames="plan")
+def _window(problem: Problem, plan: Plan, state: SlicingState) -> Window:
+    """Return how to search around the state's shift."""
+    assert state.vectors is not None
+    nearest = jnp.argsort(jnp.abs(state.values - state.shift))
+    vectors = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
+    others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest[: plan.window]), jnp.nan, state.values)
+    bottom = jnp.where(problem.negative > 0, 0, -jnp.inf)
+    low = jnp.fmax(jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf), bottom)
+    high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
+    left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
+    # The last slice has fewer eigenvalues to find. More than wanted: the certificate needs a gap above the last.
+    size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2 + 2 * plan.block, plan.slice_size)
+    return Window(vectors, low, high, jnp.minimum(steps_for(plan, size), plan.steps))
+
+
+@jit_quickly(static_argnames=("plan", "tolerance"), donate_argnames="known_vectors")
+def _accept(
+    problem: Problem,
+    plan: Plan,
+    tolerance: float,
+    ritz: tuple[Float[Array, " ritz"], Float[Array, "ritz n_dof"]],
+    interval: tuple[Float[Array, ""], Float[Array, ""]],
+    known_vectors: Float[Array, "capacity n_dof"],
+    state: SlicingState,
+) -> SlicingState:
+    """Take what converged of the Ritz pairs in the interval, and choose the next shift.
+
+    What is known outside that interval may have been found again: nothing out there is taken. The state's eigenvectors
+    come apart from it, and are overwritten.
+    """
+    (theta, vectors), (low, high) = ritz, interval
+    shift, index, dtype = state.shift, jnp.arange(plan.capacity), vectors.dtype
+    near = shift + 1 / theta
+
+    values, residuals = values_and_defects(problem.pencil, vectors)
+    first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
+    scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
+    # Where nothing converged, as on a domain much longer than wide, it is rounding that is worse than usual: the
+    # residuals say so.
+    excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
+    rounding = jnp.minimum(excuse * indistinct(problem.pencil, dtype) / scale, 0.01)
+    converged = (residuals <= jnp.maximum(tolerance, rounding) * scale) & (theta != 0)
+    # Above the first that did not converge, or farther away than those looked at, some are missing.
+    above = near > shift
+    limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
+    reach = shift + 1 / jnp.min(jnp.where(theta != 0, jnp.abs(theta), jnp.inf))
+    end = jnp.minimum(jnp.minimum(limit, reach), high)
+    accepted = converged & (values > low) & (values < end)
+    complete = state.below == jnp.sum(state.values < shift) + jnp.sum(accepted & (values < shift))
+    # What is known is kept out of later searches. If it has parts in the missing eigenvectors, which may be of much
+    # smaller eigenvalues, these do not converge any more: then only what is accurate enough for them is taken.
+    accepted &= complete | (
+        residuals <= excuse * _needed(problem, tolerance, jnp.maximum(state.reached, first_nonzero))
+    )
+
+    order = jnp.argsort(jnp.where(accepted, values, jnp.inf))
+    count = jnp.sum(accepted)
+    new = jnp.where(jnp.arange(plan.ritz) < count, values[order], jnp.inf)
+    all_values = jax.lax.dynamic_update_slice_in_dim(state.values, new, state.known, 0)
+    all_vectors = jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], state.known, 0)
+    known = state.known + count
+    # Between the shift and the end all are known.
+    gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
+
+    # Where some below the shift are missing, go to where the lowest that did not converge seems to be. If there is
+    # none, they are anywhere: a multiplet was found in part. Where nothing converges from the bottom on, go below it:
+    # there the matrix is definite, and its factorisation as accurate as can be.
+    lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
+    seen, stuck = lowest < shift, ~complete & (count == 0)
+    again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)
+    bottom = (state.reached <= 0) & (problem.negative == 0)
+    again = jnp.where(stuck & bottom, -jnp.abs(shift) / jnp.maximum(state.below, 1).astype(dtype), again)
+    leftover = jnp.argsort(jnp.where(above & ~accepted, near, jnp.inf))[: plan.block]
+    noise = 0.01 * jnp.std(vectors) * jnp.roll(state.noise, state.slices, axis=0)
+    state = state._replace(
+        values=all_values,
+        vectors=all_vectors,
+        known=known,
+        reached=jnp.where(
+            complete, jnp.maximum(gapless, state.reached), jnp.where(seen, state.reached, state.complete_below)
+        ),
+        complete_below=jnp.where(complete, jnp.maximum(shift, state.complete_below), state.complete_below),
+        start=vectors[leftover].T + noise,
+        moved=jnp.zeros((), int),
+        passes=jnp.where(complete | stuck, 1, 2),
+        stuck=stuck,
+    )
+    return state._replace(shift=jnp.where(complete, _next_shift(problem, plan, state), again))
+
+
+def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Float[Array, ""]:
+    """Return the mean distance of the last few known eigenvalues; of few, at least what is expected."""
+    few = jnp.minimum(state.known, plan.slice_size)
+    ordered = jnp.sort(state.values)
+    last = ordered[jnp.maximum(state.known - 1, 0)]
+    mean = (last - ordered[state.known - few]) / jnp.maximum(few - 1, 1).astype(last.dtype)
+    return jnp.where(few < plan.block, jnp.fmax(mean, problem.spacing), mean)
+
+
+def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Float[Array, ""]:
+    """Return where to cut next: within the next slice, or in a gap above the last eigenvalue wanted."""
+    ordered, known = jnp.sort(state.values), state.known
+    index = jnp.arange(plan.capacity)
+    spacing = _spacing(problem, plan, state)
+    left = (plan.wanted - jnp.sum(ordered <= state.reached)).astype(ordered.dtype)
+    slices = jnp.ceil(left / plan.slice_size)
+    ahead = jnp.maximum(state.reached, state.complete_below) + spacing * (left / jnp.maximum(slices, 1) / 2 + 1)
+    # The widest gap among the next few is safest, and nothing is known above the last.
+    gaps = jnp.where(index < known - 1, jnp.roll(ordered, -1) - ordered, spacing)
+    last_few = (index >= plan.wanted - 1) & (index < plan.wanted + 7) & (index < known)
+    widest = jnp.argmax(jnp.where(last_few, gaps, -1))
+    certificate = ordered[widest] + gaps[widest] / 2
+    return jnp.where(left > 0, ahead, certificate)

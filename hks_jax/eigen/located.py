@@ -1,0 +1,139 @@
+"""Where the spectrum of any pencil begins, and how dense it is there: by counting eigenvalues below a few shifts."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.compilation import jit_quickly
+from hks_jax.eigen.count import count_once
+from hks_jax.linear.dissection import dissect
+from hks_jax.linear.operators import SparseOperator
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.traced import is_traced
+
+_TRIES = 60
+"""Factorisations before giving up."""
+_JUST_BELOW = 0.625
+"""The distance from zero at which the count of a singular matrix is still accurate, as a power of ε."""
+_NARROW = 8
+"""How many times that distance a bracket is not divided any more."""
+
+
+class LocatedPencil(SymmetricPencil):
+    """K − σ₀M and M, and what inertia says of the spectrum above the origin σ₀.
+
+    Attributes:
+        stiffness: K − σ₀M.
+        mass: M.
+        negative: how many eigenvalues lie below the origin.
+        first: a number above the origin with about as many eigenvalues below it as were asked for.
+        spacing: the mean distance of eigenvalues between the two.
+    """
+
+    negative: Int[Array, ""]
+    first: Float[Array, ""]
+    spacing: Float[Array, ""]
+
+
+def translated(
+    pencil: SymmetricPencil,
+    origin: Float[Array, ""],
+    negative: Int[Array, ""],
+    first: Float[Array, ""],
+    spacing: Float[Array, ""],
+) -> LocatedPencil:
+    """Return the pencil whose eigenvalues are counted from the origin."""
+    stiffness = pencil.stiffness
+    assert isinstance(stiffness, SparseOperator)
+    moved = SparseOperator(pencil.shifted(jax.lax.stop_gradient(origin)), stiffness.pattern)
+    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)))
+
+
+class _Search(NamedTuple):
+    """What is known between two counts.
+
+    Attributes:
+        low: the highest number tried below which there is no eigenvalue; −∞ before there is one.
+        high: the lowest number tried below which there are some; ∞ before there is one.
+        number: how many lie below ``high``.
+        first: the highest number tried with as many below it: far from them, solves are accurate.
+        next: what to try next.
+        tries: counts so far.
+    """
+
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+    number: Int[Array, ""]
+    first: Float[Array, ""]
+    next: Float[Array, ""]
+    tries: Int[Array, ""]
+
+
+def locate(
+    pencil: SymmetricPencil, wanted: int, probes: int
+) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
+    """Return an origin below all eigenvalues, a number above some of them, 1 … 2·wanted, and how many that are.
+
+    A bracket is halved, or divided in proportion to the counts, until there are few enough eigenvalues in it. Each
+    factorisation is tried out on so many random right-hand sides. Where many are equal within rounding there are more.
+    NaN where nothing succeeds.
+    """
+    size, dissection = scale(pencil), dissect(pencil.pattern)
+    tried = jax.random.normal(jax.random.key(0), (pencil.size, probes), size.dtype)
+    traced = is_traced(size)
+    # Step by step, the computations are those of the slices that follow: compiled once for both.
+    dissection = dissection if traced else jax.device_put(dissection)
+    infinite = jnp.full((), jnp.inf, size.dtype)
+    # Just below zero: of a singular K ⪰ 0 there is no eigenvalue below it, and the factorisation is still accurate.
+    least = jnp.asarray(float(jnp.finfo(size.dtype).eps) ** _JUST_BELOW, size.dtype) * size
+    state = _Search(-infinite, infinite, jnp.zeros((), int), infinite, -least, jnp.zeros((), int))
+
+    def step(state: _Search) -> _Search:
+        return _narrowed(state, *count_once(pencil, dissection, state.next, tried), size, wanted, pencil.size)
+
+    if traced:
+        state = jax.lax.while_loop(lambda state: _unfinished(state, wanted, least), step, state)
+    else:
+        while _unfinished(state, wanted, least):
+            state = step(state)
+    known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
+    low, first = (jnp.where(known, end, jnp.nan) for end in (state.low, state.first))
+    return low, first, state.number
+
+
+@partial(jax.jit, static_argnames="wanted")
+def _unfinished(state: _Search, wanted: int, least: Float[Array, ""]) -> Bool[Array, ""]:
+    few = (state.number <= 2 * wanted) | (state.high - state.low <= _NARROW * least)
+    return ~(jnp.isfinite(state.low) & jnp.isfinite(state.high) & few) & (state.tries < _TRIES)
+
+
+@partial(jax.jit, static_argnames=("wanted", "n"))
+def _narrowed(
+    state: _Search, count: Int[Array, ""], sound: Bool[Array, ""], size: Float[Array, ""], wanted: int, n: int
+) -> _Search:
+    """Return what is known after a count, and where to count next."""
+    dtype = size.dtype
+    low = jnp.where(sound & (count == 0), jnp.maximum(state.low, state.next), state.low)
+    lower = sound & (count > 0) & (state.next < state.high)
+    high, number = jnp.where(lower, state.next, state.high), jnp.where(lower, count, state.number)
+    first = jnp.where(lower & (count != state.number), state.next, state.first)
+    share = jnp.clip(wanted / jnp.maximum(number, 1).astype(dtype), 1 / 16, 1 / 2)
+    # Without a lower end go down, without an upper one up; each time four times as far.
+    reach = size * jnp.asarray(4.0, dtype) ** (state.tries - 1).astype(dtype)
+    up = jnp.maximum(low, 0) + reach * wanted / n
+    bracketed = jnp.isfinite(low) & jnp.isfinite(high)
+    following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), -reach, up))
+    # Where the count is not to be trusted, try beside.
+    beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
+    return _Search(low, high, number, first, jnp.where(sound, following, beside), state.tries + 1)
+
+
+@jit_quickly()
+def scale(pencil: SymmetricPencil) -> Float[Array, ""]:
+    """Return the size of the largest eigenvalue, roughly: rows of |K| over the diagonal of M."""
+    data, (rows, _) = pencil.stiffness.triplets()
+    sums = jax.ops.segment_sum(jnp.abs(data), rows, pencil.size)
+    return jnp.max(sums / pencil.mass.diagonal())

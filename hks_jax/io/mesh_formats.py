@@ -1,0 +1,135 @@
+"""Meshes as meshio reads them, and VTK's polygonal data, which meshio leaves out, through VTK; both are optional."""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hks_jax.io.mesh_checks import MeshChecks
+from hks_jax.io.vtk_checks import check_legacy, check_xml
+from hks_jax.io.vtk_image import require_vtk
+from hks_jax.reading import reading
+
+
+class Loaded(NamedTuple):
+    """What is in a file: places, triangles or tetrahedra, and arrays at the vertices."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    cells: Int[np.ndarray, "n corners"]
+    arrays: dict[str, Float[np.ndarray, "V *components"]]
+
+
+_OF_SURFACES, _OF_BOUNDARIES = {"triangle", "quad"}, {"triangle", "quad", "line", "vertex"}
+
+
+def meshio() -> ModuleType:
+    """Import meshio.
+
+    Raises:
+        ImportError: it is not installed; says how to get it.
+    """
+    try:
+        import meshio
+    except ImportError as error:
+        raise ImportError(
+            'reading and writing meshes needs meshio, which is not installed: pip install "hks-jax[mesh]"'
+        ) from error
+    return meshio
+
+
+def through_meshio(name: str) -> Loaded:
+    """Load triangles or tetrahedra through meshio."""
+    suffix = Path(name).suffix.lower()
+    library = meshio()
+    # Overflow is of a text's letters, which it takes for a number of triangles first.
+    with reading(name, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
+        # The format's own reader: meshio.read ends the process where it cannot read a file.
+        checks = MeshChecks(Path(name))
+        read = getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(name)
+        checks.compare(read)
+        points = np.asarray(read.points, np.float64)
+        tetrahedra = [_corners(block.data, 4) for block in read.cells if block.type == "tetra"]
+        triangles = [_triangles(block.data) for block in read.cells if block.type in _OF_SURFACES]
+        arrays = _real_arrays(read.point_data, len(points))
+    others = {block.type for block in read.cells} - _OF_BOUNDARIES - {"tetra"}
+    if others:
+        raise ValueError(
+            f"{name}: has {', '.join(sorted(others))} cells; expected triangles (or quadrilaterals), or tetrahedra"
+        )
+    blocks = tetrahedra or triangles
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or not blocks:
+        raise ValueError(f"{name}: has no triangles and no tetrahedra; expected a mesh in two or three dimensions")
+    flat = np.zeros((len(points), 3 - points.shape[1]))
+    return Loaded(np.concatenate([points, flat], axis=1), np.concatenate(blocks).astype(np.int64), arrays)
+
+
+def polygonal(name: str) -> Loaded:
+    """Load polygonal data through VTK, its polygons cut into triangles."""
+    require_vtk()
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    legacy = name.lower().endswith(".vtk")
+    errors: list[str] = []
+    with reading(name, "readable polygonal data"):
+        if legacy:
+            check_legacy(Path(name))
+        else:
+            check_xml(Path(name), "PolyData")
+        reader = vtkPolyDataReader() if legacy else vtkXMLPolyDataReader()
+        reader.AddObserver("ErrorEvent", lambda source, event: errors.append(event))
+        reader.SetFileName(name)
+        reader.Update()
+        whole = reader.GetOutput()
+        if errors:
+            raise ValueError("VTK finds errors in it")
+        # VTK reads what lies at an index without a look at whether it is one.
+        for cells in (whole.GetPolys(), whole.GetStrips()):
+            corners = np.asarray(vtk_to_numpy(cells.GetConnectivityArray()), np.int64)
+            ends = np.asarray(vtk_to_numpy(cells.GetOffsetsArray()), np.int64)
+            if corners.size and not 0 <= corners.min() <= corners.max() < whole.GetNumberOfPoints():
+                raise ValueError(f"a polygon has the corner {corners.max()} of {whole.GetNumberOfPoints()} points")
+            if ends.size and (ends[0] != 0 or ends[-1] != corners.size or (np.diff(ends) < 3).any()):
+                raise ValueError("the polygons' offsets do not ascend from none to all corners, three or more each")
+    triangles = vtkTriangleFilter()
+    triangles.PassLinesOff()
+    triangles.PassVertsOff()
+    triangles.SetInputData(whole)
+    triangles.Update()
+    surface = triangles.GetOutput()
+    if not surface.GetNumberOfPolys():
+        raise ValueError(f"{name}: VTK finds no triangles in it; expected polygonal data, whole")
+    points = np.asarray(vtk_to_numpy(surface.GetPoints().GetData()), np.float64)
+    faces = np.asarray(vtk_to_numpy(surface.GetPolys().GetConnectivityArray()), np.int64)
+    data = whole.GetPointData()
+    named = {data.GetArrayName(i): data.GetArray(i) for i in range(data.GetNumberOfArrays())}
+    arrays = {key: vtk_to_numpy(values) for key, values in named.items() if key and values is not None}
+    return Loaded(points, faces.reshape(-1, 3), _real_arrays(arrays, len(points)))
+
+
+def _real_arrays(named: dict[str, Any], n_points: int) -> dict[str, Float[np.ndarray, "V *components"]]:
+    """Return the arrays of real numbers that have a row for each point, but for the tags that Gmsh's files have."""
+    arrays = {key: np.asarray(values) for key, values in named.items() if not key.startswith("gmsh:")}
+    return {
+        key: values.astype(np.result_type(values.dtype, np.float32))
+        for key, values in arrays.items()
+        if values.ndim and len(values) == n_points and values.dtype.kind in "fiub"
+    }
+
+
+def _corners(cells: Int[np.ndarray, "n corners"], corners: int) -> Int[np.ndarray, "n corners"]:
+    if cells.ndim != 2 or cells.shape[1] != corners:
+        raise ValueError(f"cells of {corners} corners with the shape {cells.shape}")
+    return cells
+
+
+def _triangles(cells: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "m 3"]:
+    if cells.ndim != 2 or cells.shape[1] not in (3, 4):
+        raise ValueError(f"triangles or quadrilaterals of shape {cells.shape}")
+    if cells.shape[1] == 3:
+        return cells
+    return np.stack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]], axis=1).reshape(-1, 3)

@@ -1,0 +1,1 @@
+"""Linear algebra of symmetric matrices that knows no domain."""

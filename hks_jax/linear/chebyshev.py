@@ -1,0 +1,80 @@
+"""Chebyshev polynomials of a matrix, by its products with vectors alone."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+def chebyshev_recurrence(
+    product: Callable[[Any], Any],
+    x: Any,
+    degree: int,
+    total: Any = (),
+    add: Callable[[Any, Any, Any], Any] = lambda n, y, total: total,
+) -> tuple[Any, Any, Any]:
+    """Go through yₙ = Tₙ(A)x for n = 0, …, degree: y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁.
+
+    Args:
+        product: y ↦ Ay, the spectrum of A within [−1, 1].
+        x: an array, or a tree of arrays.
+        degree: at least 1; static.
+        total: what is to be gathered on the way.
+        add: (n, yₙ, total) ↦ the total with the term of yₙ.
+
+    Returns:
+        y of the degree, the one before, and the total.
+    """
+
+    def step(n: Array, state: tuple) -> tuple:
+        y, before, total = state
+        total = add(n, y, total)
+        factor = jnp.where(n == 0, 1, 2)
+        following = jax.tree.map(lambda image, y: factor.astype(y.dtype) * image - y, product(y), before)
+        return following, y, total
+
+    y, before, total = jax.lax.fori_loop(0, degree, step, (x, jax.tree.map(jnp.zeros_like, x), total))
+    return y, before, add(degree, y, total)
+
+
+# The three-term recurrence of p in s(z) = (z − c)/e, c and e the interval's centre and half width, for z_j = q_j(A) w,
+# everything divided by p_j(ζ), whose ratios are σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}):
+#
+#     z_{j+1} = (2σ_j/e) ((A − c) z_j + w) − σ_j σ_{j−1} z_{j−1},    z_0 = 0,   z_1 = (σ_0/e) w,   σ_0 = 1/s(ζ).
+#
+# `chebyshev_recurrence` would overflow where ζ is far from the interval, and has p(A), not q(A).
+def chebyshev_iteration(
+    product: Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]],
+    w: Float[Array, "*shape b"],
+    low: Float[Array, ""],
+    high: Float[Array, ""],
+    value: Float[Array, "*b"] | float,
+    degree: Int[Array, ""] | int,
+) -> Float[Array, "*shape b"]:
+    """Return q(A)w, where q(z) = (p(z)/p(ζ) − 1)/(z − ζ) and p is the Chebyshev polynomial of [low, high].
+
+    −q(A)w is what Chebyshev iteration makes of (A − ζ)x = w for a matrix A with its spectrum in the interval: the
+    residual is p(A)w/p(ζ).
+
+    Args:
+        product: z ↦ Az.
+        w: columns.
+        low: of the interval.
+        high: likewise.
+        value: ζ, outside the interval; a number for each column, or one for all.
+        degree: of p.
+    """
+    centre, half = (high + low) / 2, (high - low) / 2
+    s = (value - centre) / half
+
+    def step(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        before, z, ratio = state
+        following = 1 / (2 * s - ratio)
+        grown = product(z) - centre.astype(w.dtype) * z + w
+        after = (2 * following / half).astype(w.dtype) * grown - (following * ratio).astype(w.dtype) * before
+        return z, after, following
+
+    first = jnp.zeros_like(w), (1 / (s * half)).astype(w.dtype) * w, 1 / s
+    return jax.lax.fori_loop(1, degree, step, first)[1]

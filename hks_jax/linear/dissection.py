@@ -1,0 +1,154 @@
+"""Nested dissection: in which order to eliminate a sparse matrix' rows, and what each elimination touches.
+
+A separator leaves two halves of the graph that the matrix does not couple; separators separate the halves, and so on
+down to small cells. Eliminated from the cells up to the first separator, all fronts of a level are independent and
+nearly of one size: padded to the largest, a level is one batch of dense blocks.
+
+A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10 (1973).
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from hks_jax.linear.bisection import within_groups
+from hks_jax.linear.pattern import Pattern
+
+
+class Level(NamedTuple):
+    """The fronts of one level: each eliminates its own s nodes, and is coupled to r boundary nodes eliminated later.
+
+    Where a front has fewer, indices are padded with the first number that is out of range.
+
+    Attributes:
+        own: (fronts, s) the degrees of freedom eliminated.
+        boundary: (fronts, r) the places of the boundary nodes among the (fronts, s + r) nodes of the level above.
+        children: (2, fronts, s + r) the places of the front's nodes among the (fronts, r) boundary nodes of the level
+            below: those of the first child, and those of the second. Empty for cells.
+    """
+
+    own: Int[np.ndarray, "fronts s"]
+    boundary: Int[np.ndarray, "fronts r"]
+    children: Int[np.ndarray, "two fronts s_plus_r"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(fronts, s + r, s): that of the blocks which hold the columns of the own nodes."""
+        fronts, s = self.own.shape
+        return fronts, s + self.boundary.shape[1], s
+
+
+class Dissection(NamedTuple):
+    """The elimination tree.
+
+    Attributes:
+        levels: from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1.
+        order: (n_dof,) the place of each degree of freedom among the levels' own nodes, concatenated.
+        entries: (m,) the matrix entries, as indices into the array of entries.
+        places: (m,) their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column,
+            unless its row is eliminated before.
+        padding: (p,) the places of the diagonal entries that belong to no node.
+    """
+
+    levels: tuple[Level, ...]
+    order: Int[np.ndarray, " n_dof"]
+    entries: Int[np.ndarray, " m"]
+    places: Int[np.ndarray, " m"]
+    padding: Int[np.ndarray, " p"]
+
+
+@lru_cache(maxsize=16)
+def dissect(pattern: Pattern) -> Dissection:
+    """Return the elimination tree of a matrix with this pattern.
+
+    Raises:
+        ValueError: more entries in the factors than an index can count.
+    """
+    entries, rows, cols = pattern.places()
+    n = pattern.size
+    level, front, depth = pattern.bisect()
+    own, slot = _own_nodes(level, front, depth)
+    boundaries = _boundaries(level, front, depth, rows, cols)
+    ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
+    # One at least, of nothing but padding where no front is coupled to another: the first level has no parent.
+    width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
+    # For each boundary node of a level, its front and its place in the parent: among its own nodes, or its boundary.
+    placed = [(keys // n, slot[keys % n]) for keys in boundaries]
+    for below, (at, place) in enumerate(placed[1:]):
+        nodes = boundaries[below + 1] % n
+        inherited = level[nodes] < below
+        entry = np.searchsorted(boundaries[below], at[inherited] // 2 * n + nodes[inherited])
+        place[inherited] = own[below].shape[1] + ranks[below][entry]
+    levels = []
+    for number, (nodes, rank, r) in enumerate(zip(own, ranks, width, strict=True)):
+        fronts, s = nodes.shape
+        boundary, children = np.zeros((fronts, r), int), np.zeros((2, fronts, 0), int)
+        if number > 0:
+            at, place = placed[number]
+            size = own[number - 1].shape[1] + width[number - 1]
+            boundary = np.full((fronts, r), fronts // 2 * size)
+            boundary[at, rank] = at // 2 * size + place
+        if number < depth - 1:
+            at, place = placed[number + 1]
+            children = np.full((2, fronts, s + r), 2 * fronts * width[number + 1])
+            children[at % 2, at // 2, place] = at * width[number + 1] + ranks[number + 1]
+        levels.append(Level(*(field.astype(np.int32) for field in (nodes, boundary, children))))
+    order = np.empty(n + 1, int)
+    order[np.concatenate([nodes.ravel() for nodes in own])] = np.arange(sum(nodes.size for nodes in own))
+
+    _, height, stride = shapes = np.array([level.shape for level in levels]).T
+    start = np.append(0, np.cumsum(np.prod(shapes, axis=0)))
+    if start[-1] > np.iinfo(np.int32).max:
+        raise ValueError(f"matrix: got {n} rows, whose factors have {start[-1]} entries; expected fewer than 2^31")
+    mine = np.flatnonzero(level[rows] <= level[cols])
+    rows, cols = rows[mine], cols[mine]
+    place = slot[rows]
+    outside = np.flatnonzero(level[rows] < level[cols])
+    eliminated = level[cols[outside]]
+    for number in range(1, depth):
+        above = outside[eliminated == number]
+        key = front[cols[above]] * n + rows[above]
+        place[above] = stride[number] + ranks[number][np.searchsorted(boundaries[number], key)]
+    column = (start[level] + front * (height * stride)[level] + slot).astype(np.int32)
+    places = column[cols] + stride.astype(np.int32)[level[cols]] * place
+    padding = [
+        first + q * h * s + j * (s + 1)
+        for first, h, s, nodes in zip(start[:-1], height, stride, own, strict=True)
+        for q, j in [np.nonzero(nodes == n)]
+    ]
+    fields = order[:n], entries[mine], places, np.concatenate(padding)
+    return Dissection(tuple(levels), *(field.astype(np.int32) for field in fields))
+
+
+def _own_nodes(level: np.ndarray, front: np.ndarray, depth: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return for each level the nodes of its fronts, (fronts, s), and the place of every node in its front."""
+    n, own, slot = level.size, [], np.zeros(level.size, np.int32)
+    for number in range(depth):
+        nodes = np.flatnonzero(level == number)
+        nodes = nodes[np.argsort(front[nodes], kind="stable")]
+        slot[nodes] = within_groups(np.bincount(front[nodes]))
+        table = np.full((1 << number, int(slot[nodes].max(initial=0)) + 1), n)
+        table[front[nodes], slot[nodes]] = nodes
+        own.append(table)
+    return own, slot
+
+
+def _boundaries(
+    level: np.ndarray, front: np.ndarray, depth: int, rows: np.ndarray, cols: np.ndarray
+) -> list[np.ndarray]:
+    """Return for each level the boundary nodes of its fronts as sorted keys front·n + node.
+
+    They are what the front's own nodes are coupled to above it, and what it inherits from its children's boundaries.
+    """
+    n, keys, boundaries = level.size, np.empty(0, int), []
+    above = level[cols] < level[rows]
+    rows, cols = rows[above], cols[above]
+    for number in reversed(range(depth)):
+        inherited = keys // n // 2 * n + keys % n
+        own = level[rows] == number
+        keys = np.sort(np.concatenate([inherited[level[keys % n] < number], front[rows[own]] * n + cols[own]]))
+        keys = keys[np.append(True, keys[1:] > keys[:-1])[: keys.size]]  # np.unique hashes, which takes far longer
+        boundaries.append(keys)
+    return boundaries[::-1]

@@ -1,0 +1,81 @@
+"""Linear maps within rules of derivatives, which have such rules themselves: for second derivatives in any order."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+LinearMap = Callable[[Any, Any, Any], Any]
+"""f(at, constants, x), linear in x; all are pytrees of arrays."""
+Derivative = Callable[[Any, Any, Any, Any], Any]
+"""f(at, change of at, constants, x), bilinear in the change and in x."""
+
+
+# In reverse mode JAX replaces a function that has a custom rule by its body, as soon as the function is linear in an
+# unknown tangent; an outer derivative then differentiates that body. A linear solve is left as it is. With F x = y
+# and its transpose, the system
+#
+#     ⎡ 0   I ⎤ ⎡u⎤   ⎡b⎤             ⎡ 0   F ⎤
+#     ⎣ I  −S ⎦ ⎣v⎦ = ⎣c⎦,        S = ⎣ Fᵀ  0 ⎦,
+#
+# is symmetric, and its solution is v = b, u = c + S b: F x stands in u for b = (0, x) and c = 0. JAX differentiates
+# the system, which is S, and that has a rule. As S is symmetric, reverse mode solves the same system.
+def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: Any, x: Any) -> Any:
+    """Return ``function(at, constants, x)``, whose derivative with respect to ``at`` is ``derivative``, in any mode.
+
+    Derivatives with respect to the constants are taken to be zero.
+    """
+
+    x = jax.tree.map(jnp.asarray, x)  # tangents of users may be numbers
+
+    def swap(y: Any, x: Any) -> tuple[Any, Any]:
+        forward = _forward(function, derivative, at, constants, x)
+        return forward, _backward(function, derivative, at, constants, x, y)
+
+    # JAX transposes a solve all of whose right-hand side depends on what is linearised: x, or `at`.
+    def zeros(like: Any, tree: Any) -> Any:
+        empty = [jnp.ravel(leaf)[:0].astype(float) for leaf in jax.tree.leaves(tree)]
+        nothing = jnp.sum(jnp.concatenate(empty))
+        return jax.tree.map(lambda leaf: jnp.full(leaf.shape, nothing, leaf.dtype), like)
+
+    def system(unknowns: tuple[Any, Any]) -> tuple[Any, Any]:
+        u, v = unknowns
+        return jax.tree.map(jnp.add, v, zeros(v, at)), jax.tree.map(jnp.subtract, u, swap(*v))
+
+    def solve(_: Any, right: tuple[Any, Any]) -> tuple[Any, Any]:
+        b, c = right
+        return jax.tree.map(jnp.add, c, swap(*b)), b
+
+    y = zeros(jax.eval_shape(function, at, constants, x), x)
+    right = (y, jax.tree.map(jnp.add, x, zeros(x, x))), (y, zeros(x, x))
+    (result, _), _ = jax.lax.custom_linear_solve(system, right, solve, symmetric=True)
+    return result
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _forward(function: LinearMap, derivative: Derivative, at: Any, constants: Any, x: Any) -> Any:
+    return function(at, constants, x)
+
+
+@_forward.defjvp
+def _forward_jvp(function: LinearMap, derivative: Derivative, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    (at, constants, x), (change, _, d_x) = primals, tangents
+    tangent = jax.tree.map(jnp.add, derivative(at, change, constants, x), function(at, constants, d_x))
+    return _forward(function, derivative, at, constants, x), tangent
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _backward(function: LinearMap, derivative: Derivative, at: Any, constants: Any, like: Any, y: Any) -> Any:
+    """Return the transpose applied to y; ``like`` is of the form of x."""
+    return jax.linear_transpose(partial(function, at, constants), like)(y)[0]
+
+
+@_backward.defjvp
+def _backward_jvp(function: LinearMap, derivative: Derivative, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    (at, constants, like, y), (change, _, _, d_y) = primals, tangents
+    (of_derivative,) = jax.linear_transpose(partial(derivative, at, change, constants), like)(y)
+    (of_function,) = jax.linear_transpose(partial(function, at, constants), like)(d_y)
+    tangent = jax.tree.map(jnp.add, of_derivative, of_function)
+    return _backward(function, derivative, at, constants, like, y), tangent

@@ -1,0 +1,168 @@
+"""Functions f(A) of dense symmetric matrices, with derivatives that are exact at eigenvalues of any multiplicity."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hks_jax.linear.divided_differences import divided_difference, second_divided_difference
+from hks_jax.linear.linear_map import linear_map
+from hks_jax.linear.not_differentiable import not_differentiable
+from hks_jax.linear.standard_form import checked_standard_form, transposed_solve
+
+Matrix = Float[Array, "n n"]
+Function = Callable[[Any, Any, Array], Array]
+"""f(parameters, others, x): parameters is a pytree of real arrays, others one of others; elementwise in x."""
+
+
+def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:
+    """Compute f(A) = V f(Λ) Vᵀ of a dense symmetric matrix A = VΛVᵀ, differentiably.
+
+    With B it is V f(Λ) Vᵀ = f(B⁻¹A) B⁻¹ of the pencil: AV = BVΛ and VᵀBV = I. So f(λ) = 1 gives B⁻¹, f(λ) = 1/λ gives
+    A⁻¹, f(λ) = e^(−tλ) the heat kernel.
+
+    First and second derivatives with respect to A, B and what f closes over, forward and reverse in any order, are
+    exact where eigenvalues are equal, and accurate where they are close: nothing is divided by a small difference.
+    `jax.vmap` over parameters of f computes eigenpairs once. Third derivatives raise an error.
+
+    Time is O(n³), most of it that of the eigenpairs, and memory O(n²); a gradient takes about as much again. Second
+    derivatives are for small matrices: they evaluate f'' 89 times for each of n³ triples of eigenvalues.
+
+    Args:
+        A: (n, n), symmetric, float32 or float64. Derivatives are those with respect to its symmetric part.
+        f: maps one eigenvalue, a scalar, to a real scalar, in JAX's operations. It is evaluated between the eigenvalues
+            too. First derivatives take f', second ones f''; f need not be smooth where there is no eigenvalue, so that
+            ``lambda x: x < c`` gives the projector on the eigenvectors below c.
+        B: (n, n), symmetric positive definite; None: the identity.
+
+    Returns:
+        (n, n), symmetric. NaN where f is, such as the logarithm of a negative eigenvalue.
+
+    Raises:
+        ValueError: f does not return a real scalar; what `eigh` raises.
+        NotImplementedError: third derivatives.
+    """
+    a, factor = checked_standard_form(A, B)
+    elementwise, parameters, others = _with_parameters(f, a)
+    value = _function(elementwise, parameters, others, a)[0]
+    if factor is None:
+        return value
+    value = transposed_solve(factor, transposed_solve(factor, value).T)
+    return (value + value.T) / 2
+
+
+def _with_parameters(f: Callable[[Array], Any], like: Matrix) -> tuple[Function, Any, Any]:
+    """Return f as a function of the real numbers that it closes over, of other arrays, and of x, elementwise in x."""
+    one = jax.ShapeDtypeStruct((), like.dtype)
+    out = jax.eval_shape(f, one)
+    if not hasattr(out, "shape") or out.shape != () or jnp.issubdtype(out.dtype, jnp.complexfloating):
+        got = f"{out.dtype}{list(out.shape)}" if hasattr(out, "shape") else f"{out}"
+        raise ValueError(
+            f"f: returned {got} for one eigenvalue; expected a real scalar. For several functions at once use jax.vmap "
+            "over their parameters"
+        )
+    converted = eqx.filter_closure_convert(lambda x: jnp.asarray(f(x)).astype(like.dtype), one)
+    arrays, static = eqx.partition(converted, eqx.is_array)
+    parameters, others = eqx.partition(jax.tree.map(jnp.asarray, arrays), eqx.is_inexact_array)
+
+    def elementwise(parameters: Any, others: Any, x: Array) -> Array:
+        return jax.vmap(eqx.combine(parameters, others, static))(x.ravel()).reshape(x.shape)
+
+    return elementwise, parameters, others
+
+
+def _along(f: Function, parameters: Any, others: Any, change: Any) -> Callable[[Array], Array]:
+    """Return the derivative of f along a change of its parameters."""
+    return lambda x: jax.jvp(lambda p: f(p, others, x), (parameters,), (change,))[1]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _function(f: Function, parameters: Any, others: Any, a: Matrix) -> tuple[Matrix, Float[Array, " n"], Matrix]:
+    """Return f(A), and the eigenvalues and eigenvectors of A as constants."""
+    values, vectors = jnp.linalg.eigh(a, symmetrize_input=False)
+    return _compose(vectors, jnp.diag(f(parameters, others, values))), values, vectors
+
+
+# Of A = VΛVᵀ, Ȧ and Ä being two directions, G = VᵀȦV and H = VᵀÄV, the derivatives are (Daleckii and Krein 1965)
+#
+#     ḟ(A) = V ([f]∘G) Vᵀ,    [f]ᵢⱼ = f[λᵢ, λⱼ],
+#     f̈(A) = V S Vᵀ,    Sᵢₖ = Σⱼ f[λᵢ, λⱼ, λₖ] (Gᵢⱼ Hⱼₖ + Hᵢⱼ Gⱼₖ),
+#
+# with divided differences of f, which are smooth where eigenvalues meet. Nothing in them depends on which eigenvectors
+# stand for a multiple eigenvalue; yet differentiating the first one, term by term, would not give the second, as Λ and
+# V have no derivatives there. So each has a rule of its own, and the eigenpairs count as constants in both.
+#
+# When parameters of f change too, with ∂f and ∂'f for their two changes, the derivatives are
+#
+#     V ([f]∘G + ∂f(Λ)) Vᵀ    and    V (S + [∂f]∘H + [∂'f]∘G + ∂∂'f(Λ)) Vᵀ.
+@_function.defjvp
+def _function_jvp(f: Function, primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    (parameters, others, a), (d_parameters, _, d_a) = primals, tangents
+    value, values, vectors = _function(f, parameters, others, a)
+    table = _table(partial(f, parameters, others), values)
+    constants, change = (others, values, vectors, jax.lax.stop_gradient(table)), (d_parameters, d_a)
+    tangent = linear_map(partial(_first, f), partial(_second, f), (parameters, a), constants, change)
+    return (value, values, vectors), (tangent, jnp.zeros_like(values), jnp.zeros_like(vectors))
+
+
+_THIRD = "third derivatives of matrix functions are not implemented: first and second ones are"
+
+
+def _first(f: Function, at: Any, constants: Any, change: Any) -> Matrix:
+    """Return the derivative of f(A) along a change of (parameters, A)."""
+    (parameters, _), (others, values, vectors, table) = not_differentiable(_THIRD, at), constants
+    d_parameters, d_a = change
+    along = _along(f, parameters, others, d_parameters)
+    return _compose(vectors, table * _into(vectors, d_a) + jnp.diag(along(values)))
+
+
+def _second(f: Function, at: Any, one: Any, constants: Any, two: Any) -> Matrix:
+    """Return the second derivative of f(A) along two changes of (parameters, A)."""
+    (parameters, _), (others, values, vectors, table) = not_differentiable(_THIRD, at), constants
+    (d_one, a_one), (d_two, a_two) = one, two
+    g, h = _into(vectors, a_one), _into(vectors, a_two)
+    along_one, along_two = (_table_along(f, parameters, others, values, d) for d in (d_one, d_two))
+    both = jax.jvp(lambda p: _along(f, p, others, d_one)(values), (parameters,), (d_two,))[1]
+    inner = along_one * h + along_two * g + jnp.diag(both)
+    return _compose(vectors, inner + _mixed(partial(f, parameters, others), values, table, g, h))
+
+
+def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
+    """Return [f], the divided differences of all pairs."""
+    return divided_difference(f, jnp.minimum(values[:, None], values), jnp.maximum(values[:, None], values))
+
+
+def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:
+    """Return [∂f], linear in the change: whether a mean or a quotient is taken depends on f alone."""
+    return jax.jvp(lambda p: _table(partial(f, p, others), values), (parameters,), (change,))[1]
+
+
+def _mixed(f: Callable[[Array], Array], values: Float[Array, " n"], table: Matrix, g: Matrix, h: Matrix) -> Matrix:
+    """Return Σⱼ f[λᵢ, λⱼ, λₖ] (Gᵢⱼ Hⱼₖ + Hᵢⱼ Gⱼₖ)."""
+    n, scale = len(values), jnp.max(jnp.abs(table))
+    i, k = jnp.arange(n)[:, None], jnp.arange(n)
+
+    @jax.checkpoint  # reverse mode would keep n³ numbers
+    def add(total: Matrix, j: Array) -> tuple[Matrix, None]:
+        low, high = jnp.minimum(jnp.minimum(i, k), j), jnp.maximum(jnp.maximum(i, k), j)
+        middle = i + j + k - low - high
+        below, above = table[low, middle], table[middle, high]
+        weights = second_divided_difference(f, values[low], values[middle], values[high], below, above, scale)
+        return total + weights * (jnp.outer(g[:, j], h[j]) + jnp.outer(h[:, j], g[j])), None
+
+    return jax.lax.scan(add, jnp.zeros_like(g), jnp.arange(n))[0]
+
+
+def _into(vectors: Matrix, a: Matrix) -> Matrix:
+    """Return VᵀAV."""
+    return jnp.matmul(jnp.matmul(vectors.T, a, precision="highest"), vectors, precision="highest")
+
+
+def _compose(vectors: Matrix, inner: Matrix) -> Matrix:
+    """Return the symmetric part of V X Vᵀ."""
+    full = jnp.matmul(jnp.matmul(vectors, inner, precision="highest"), vectors.T, precision="highest")
+    return (full + full.T) / 2

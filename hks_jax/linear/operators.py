@@ -1,0 +1,182 @@
+"""Symmetric linear operators: a matrix by its entries at the places of a pattern, or by its diagonal."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Inexact, Int
+from scipy.sparse import coo_matrix, csc_matrix
+
+from hks_jax.compilation import jit_quickly
+from hks_jax.linear.pattern import Pattern, SparsePattern
+
+Places = tuple[np.ndarray, np.ndarray]
+OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
+
+
+class Operator(eqx.Module):
+    """A symmetric matrix, applied without being formed."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """The number of rows, n_dof."""
+
+    @abstractmethod
+    def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
+        """Apply the operator along the last axis."""
+
+    @abstractmethod
+    def of_columns(self) -> OfColumns:
+        """Return the product with a block of columns; for products in a loop, call this outside."""
+
+    @abstractmethod
+    def triplets(self) -> tuple[Float[Array, " nnz"], Places]:
+        """Return the entries and their static (rows, columns)."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n_dof, n_dof)."""
+        return (self.size, self.size)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The dtype of the entries."""
+        return jax.tree.leaves(self)[0].dtype
+
+    def diagonal(self) -> Float[Array, " n_dof"]:
+        """Return the main diagonal."""
+        data, (rows, cols) = self.triplets()
+        on = np.flatnonzero(rows == cols)
+        return jnp.zeros(self.size, data.dtype).at[rows[on]].add(data[on])
+
+    def __matmul__(self, x: Float[Array, "n_dof *m"]) -> Float[Array, "n_dof *m"]:
+        """Multiply a vector (n_dof,) or a block of columns (n_dof, m)."""
+        if x.ndim not in (1, 2) or x.shape[0] != self.size:
+            raise ValueError(f"@: got an array of shape {x.shape}; expected ({self.size},) or ({self.size}, m)")
+        return self.apply(x.T).T
+
+    def to_dense(self) -> Float[Array, "n_dof n_dof"]:
+        """Return the full matrix."""
+        data, (rows, cols) = self.triplets()
+        return _scattered(data, rows, cols, self.shape)
+
+    def to_scipy(self) -> csc_matrix:
+        """Return the matrix as SciPy CSC, on the host."""
+        data, places = self.triplets()
+        return coo_matrix((np.asarray(data), places), shape=self.shape).tocsc()
+
+
+@partial(jax.jit, static_argnames="shape")
+def _scattered(
+    data: Float[Array, " nnz"],
+    rows: Int[np.ndarray | Array, " nnz"],
+    cols: Int[np.ndarray | Array, " nnz"],
+    shape: tuple[int, int],
+) -> Float[Array, "rows cols"]:
+    return jnp.zeros(shape, data.dtype).at[rows, cols].add(data)
+
+
+class PatternedOperator(Operator):
+    """A matrix with entries at the places of a pattern, which can be factorised."""
+
+    @property
+    @abstractmethod
+    def pattern(self) -> Pattern:
+        """Where the entries are; static."""
+
+    @abstractmethod
+    def flat(self) -> Float[Array, " m"]:
+        """Return the array of entries into which the pattern's places point."""
+
+    @property
+    def size(self) -> int:
+        """The number of rows, n_dof."""
+        return self.pattern.size
+
+
+class SparseOperator(PatternedOperator):
+    """A matrix with any pattern.
+
+    Attributes:
+        entries: (m,) in the order of the pattern.
+        structure: the pattern; static.
+    """
+
+    entries: Float[Array, " m"]
+    structure: SparsePattern = eqx.field(static=True)
+
+    @property
+    def pattern(self) -> SparsePattern:
+        """Where the entries are; static."""
+        return self.structure
+
+    def flat(self) -> Float[Array, " m"]:
+        """Return the entries."""
+        return self.entries
+
+    def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
+        """Apply the operator along the last axis."""
+        columns = jnp.moveaxis(x, -1, 0).reshape(self.size, -1)
+        return jnp.moveaxis(self.of_columns()(columns).reshape(self.size, *x.shape[:-1]), 0, -1)
+
+    def of_columns(self) -> OfColumns:
+        """Return the product with a block of columns."""
+        table, pattern = self.pattern.table, self.pattern
+        ordered = self.entries.at[table.entries].get(mode="fill", fill_value=0, wrap_negative_indices=False)
+
+        def product(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+            y = jnp.zeros((), x.dtype)
+            for entries, cols in zip(ordered, table.cols, strict=True):
+                y = y + entries[:, None] * x.at[cols].get(mode="promise_in_bounds")
+            if table.others.size:
+                rows, cols = pattern.rows[table.others], pattern.cols[table.others]
+                terms = self.entries[table.others, None] * x[cols]
+                y = y + jax.ops.segment_sum(terms, rows, pattern.size, indices_are_sorted=True)
+            return y
+
+        return product
+
+    def triplets(self) -> tuple[Float[Array, " nnz"], Places]:
+        """Return the entries and their static (rows, columns)."""
+        return self.entries, (self.pattern.rows, self.pattern.cols)
+
+
+class DiagonalOperator(Operator):
+    """A diagonal matrix, such as the lumped mass."""
+
+    entries: Float[Array, " n_dof"]
+
+    @property
+    def size(self) -> int:
+        """The number of rows, n_dof."""
+        return self.entries.shape[0]
+
+    def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
+        """Apply the operator along the last axis."""
+        return self.entries * x
+
+    def of_columns(self) -> OfColumns:
+        """Return the product with a block of columns."""
+        return lambda x: self.entries[:, None] * x
+
+    def triplets(self) -> tuple[Float[Array, " nnz"], Places]:
+        """Return the entries and their static (rows, columns)."""
+        index = np.arange(self.size)
+        return self.entries, (index, index)
+
+
+@jit_quickly()
+def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, ""]) -> Inexact[Array, " m"]:
+    """Return the entries of K − σM at the places of K's pattern, which has those of M; σ may be complex."""
+    dtype = np.result_type(stiffness.dtype, shift.dtype)
+    entries = stiffness.flat().astype(dtype)
+    if isinstance(mass, PatternedOperator):
+        assert mass.pattern == stiffness.pattern
+        return entries - shift * mass.flat().astype(dtype)
+    change = -shift * mass.diagonal().astype(dtype)
+    return entries.at[stiffness.pattern.diagonal()].add(change, unique_indices=True)

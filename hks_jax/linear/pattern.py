@@ -1,0 +1,108 @@
+"""Where a sparse symmetric matrix has entries: what a factorisation and products need to know before any number."""
+
+from abc import abstractmethod
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from hks_jax.linear.bisection import Parts, bisect_graph
+from hks_jax.static_array import StaticArray
+
+
+class Pattern:
+    """The places at which a symmetric matrix may have entries. Static and hashable.
+
+    Attributes:
+        size: the number of rows.
+    """
+
+    size: int
+
+    @abstractmethod
+    def places(self) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+        """Return for each place its index into the array of entries, its row, and its column."""
+
+    @abstractmethod
+    def diagonal(self) -> Int[np.ndarray, " n"]:
+        """Return the indices of the diagonal entries."""
+
+    @abstractmethod
+    def bisect(self) -> Parts:
+        """Return how to cut the matrix' graph for nested dissection."""
+
+
+class Ellpack(NamedTuple):
+    """The places of a matrix in a table of columns that are as long as it has rows, and those beyond its width.
+
+    Attributes:
+        entries: (width, n) indices into the entries; out of range where a row has fewer.
+        cols: (width, n) their columns.
+        others: (m,) the places of the entries that are left.
+    """
+
+    entries: Int[np.ndarray, "width n"]
+    cols: Int[np.ndarray, "width n"]
+    others: Int[np.ndarray, " m"]
+
+
+_SCATTERED = 3
+"""What an entry outside the table costs in a product, in entries of the table."""
+
+
+@jax.tree_util.register_static
+class SparsePattern(Pattern):
+    """Any symmetric pattern with a full diagonal, its entries in the order of rows, and of columns within a row."""
+
+    def __init__(self, size: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> None:
+        self.size = size
+        self._rows, self._cols = StaticArray(rows, np.int32), StaticArray(cols, np.int32)
+
+    @property
+    def rows(self) -> Int[np.ndarray, " m"]:
+        """The row of each entry."""
+        return self._rows.value
+
+    @property
+    def cols(self) -> Int[np.ndarray, " m"]:
+        """The column of each entry."""
+        return self._cols.value
+
+    def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return for each place its index into the array of entries, its row, and its column."""
+        return np.arange(self.rows.size, dtype=np.int32), self.rows, self.cols
+
+    def diagonal(self) -> Int[np.ndarray, " n"]:
+        """Return the indices of the diagonal entries."""
+        return np.flatnonzero(self.rows == self.cols)
+
+    def bisect(self) -> Parts:
+        """Return how to cut the matrix' graph."""
+        return bisect_graph(self.size, self.rows, self.cols)
+
+    @cached_property
+    def table(self) -> Ellpack:
+        """The places as a table, as wide as makes products fastest: a few long rows do not widen it."""
+        counts = np.bincount(self.rows, minlength=self.size)
+        start = np.cumsum(counts) - counts
+        longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # rows with more than 0, 1, … entries
+        left = np.cumsum(longer[::-1])[::-1]  # entries beyond a width of 0, 1, …
+        left = np.append(left, 0)
+        width = int(np.argmin(np.arange(left.size) * self.size + _SCATTERED * left))
+        slot = np.arange(width)[:, None]
+        valid = slot < counts
+        entries = np.where(valid, start + slot, self.rows.size)
+        cols = np.where(valid, self.cols[np.where(valid, entries, 0)], 0)
+        others = np.flatnonzero(np.arange(self.rows.size) - start[self.rows] >= width)
+        return Ellpack(entries.astype(np.int32), cols.astype(np.int32), others.astype(np.int32))
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (
+            isinstance(other, SparsePattern)
+            and (self.size, self._rows, self._cols) == (other.size, other._rows, other._cols)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.size, self._rows, self._cols))

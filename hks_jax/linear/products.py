@@ -1,0 +1,44 @@
+"""Products of blocks of vectors, as XLA computes them fastest."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Inexact
+
+
+def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
+    """Return the inner products.
+
+    XLA's CPU kernels for a long contraction are many times faster with the large factor on the left: the barrier keeps
+    XLA from turning the product round.
+    """
+    return jax.lax.optimization_barrier(jnp.matmul(basis, columns, precision="highest"))
+
+
+def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
+    """Return the inner products with rows, as what comes after takes them fastest: the small factor on the left."""
+    return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
+
+
+def combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array, "q n"]:
+    """Return linear combinations of the basis."""
+    return jnp.matmul(mix, basis, precision="highest")
+
+
+def batched(x: Inexact[Array, "m i j"], y: Inexact[Array, "m j k"]) -> Inexact[Array, "m i k"]:
+    """Return the products of two batches of matrices."""
+    return jnp.matmul(x, y, precision="highest")
+
+
+def transposed(x: Inexact[Array, "m i j"]) -> Inexact[Array, "m j i"]:
+    """Return the transposes of a batch of matrices."""
+    return jnp.swapaxes(x, 1, 2)
+
+
+def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
+    """Return the inner products of columns."""
+    return jnp.matmul(x.T, y, precision="highest")
+
+
+def times(x: Float[Array, "n b"], mix: Float[Array, "b c"]) -> Float[Array, "n c"]:
+    """Return linear combinations of columns."""
+    return jnp.matmul(x, mix, precision="highest")

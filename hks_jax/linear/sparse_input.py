@@ -1,0 +1,181 @@
+"""What users have as sparse matrices, as operators with one symmetric pattern."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.sparse import BCOO, BCSR
+from jaxtyping import Array, Float, Int
+from scipy.sparse import coo_matrix, issparse
+
+from hks_jax.checks import real_array
+from hks_jax.linear.operators import DiagonalOperator, Operator, SparseOperator
+from hks_jax.linear.pattern import SparsePattern
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.traced import is_traced
+
+_ROUNDING = 1000
+"""By how many units of rounding of the largest entry a matrix may differ from its transpose."""
+
+
+class _Entries(NamedTuple):
+    """A matrix by its entries, of which those at one place add up."""
+
+    values: Float[Array, " m"]
+    rows: Int[np.ndarray, " m"]
+    cols: Int[np.ndarray, " m"]
+    size: int
+
+
+def sparse_pencil(K: Any, M: Any = None) -> SymmetricPencil:
+    """Return a pair of matrices as a pencil with one pattern, that of either matrix and of its transpose.
+
+    The entries of the operators are what K and M have as numbers; of an entry and the one across the diagonal it is the
+    mean that counts, in derivatives too.
+
+    Args:
+        K: symmetric (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data may be
+            traced, and whose indices may not), an operator of this package, or a full array; or a pencil, without M.
+        M: symmetric, positive definite, likewise; or its diagonal (n,); None is the identity. Its pattern may be
+            another one.
+
+    Returns:
+        The pencil: ``.stiffness`` is a `SparseOperator`, ``.mass`` one with the same pattern or diagonal.
+
+    Raises:
+        ValueError: matrices that are not square or of different sizes, complex, NaN or infinite, or unsymmetric (by how
+            much, and where); a diagonal M with an entry that is not positive; traced indices.
+    """
+    if isinstance(K, SymmetricPencil):
+        if M is not None:
+            raise ValueError("M: a pencil has its mass already; leave it out")
+        if isinstance(K.stiffness, SparseOperator):
+            return K
+        K, M = K.stiffness, K.mass
+    stiffness = _entries("K", K)
+    n = stiffness.size
+    diagonal, mass = _diagonal(M, n, stiffness.values.dtype), None
+    if diagonal is None:
+        mass = _entries("M", M)
+        if mass.size != n:
+            raise ValueError(f"M: got shape {(mass.size, mass.size)}; expected that of K, {(n, n)}")
+        if (mass.rows == mass.cols).all():
+            index = jnp.asarray(mass.rows)
+            diagonal = jnp.zeros(n, mass.values.dtype).at[index].add(mass.values)
+    if diagonal is not None:
+        _check_diagonal(diagonal)
+        pattern = _pattern(n, stiffness)
+        return SymmetricPencil(_operator(pattern, stiffness), DiagonalOperator(diagonal))
+    assert mass is not None
+    pattern = _pattern(n, stiffness, mass)
+    return SymmetricPencil(_operator(pattern, stiffness), _operator(pattern, mass))
+
+
+def _entries(name: str, matrix: Any) -> _Entries:
+    """Return the entries of a square matrix, checked where they are not traced."""
+    if isinstance(matrix, BCSR):
+        matrix = matrix.to_bcoo()
+    if isinstance(matrix, BCOO):
+        entries = _of_bcoo(name, matrix)
+    elif isinstance(matrix, Operator):
+        values, (rows, cols) = matrix.triplets()
+        entries = _Entries(values, rows, cols, matrix.size)
+    elif issparse(matrix):
+        _check_square(name, matrix.shape)
+        held = matrix.tocoo()
+        held.sum_duplicates()
+        entries = _Entries(real_array(name, held.data), held.row, held.col, held.shape[0])
+    else:
+        array = real_array(name, matrix)
+        _check_square(name, array.shape)
+        if is_traced(array):
+            rows, cols = np.divmod(np.arange(array.size), array.shape[0])
+        else:
+            rows, cols = np.nonzero(np.asarray(array))
+        entries = _Entries(array[rows, cols], rows, cols, array.shape[0])
+    if not is_traced(entries.values):
+        _check_symmetric(name, entries)
+    return entries
+
+
+def _of_bcoo(name: str, matrix: BCOO) -> _Entries:
+    if matrix.n_batch or matrix.n_dense:
+        raise ValueError(f"{name}: got a BCOO with batch or dense axes; expected none (use jax.vmap over its data)")
+    _check_square(name, matrix.shape)
+    if is_traced(matrix.indices):
+        raise ValueError(
+            f"{name}: its indices are traced, and the pattern must be known. Make them a JAX array outside jax.jit and "
+            "build the matrix from it inside, or make the pencil outside with `sparse_pencil` and hand it over"
+        )
+    rows, cols = np.asarray(matrix.indices).T
+    valid = (rows < matrix.shape[0]) & (cols < matrix.shape[1])  # others are padding
+    return _Entries(real_array(name, matrix.data)[np.flatnonzero(valid)], rows[valid], cols[valid], matrix.shape[0])
+
+
+def _diagonal(M: Any, n: int, dtype: np.dtype) -> Array | None:
+    """Return the diagonal of a mass that is given as such, or is the identity."""
+    if M is None:
+        return jnp.ones(n, dtype)
+    if isinstance(M, DiagonalOperator):
+        M = M.entries
+    if issparse(M) or isinstance(M, BCOO | BCSR | Operator) or np.ndim(M) != 1:
+        return None
+    entries = real_array("M", M)
+    if entries.shape != (n,):
+        raise ValueError(f"M: got a diagonal of shape {entries.shape}; expected {(n,)}")
+    return entries
+
+
+def _check_square(name: str, shape: tuple[int, ...]) -> None:
+    if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
+        raise ValueError(f"{name}: got shape {tuple(shape)}; expected a square matrix (n, n)")
+
+
+def _check_diagonal(diagonal: Array) -> None:
+    if not is_traced(diagonal):
+        wrong = np.flatnonzero(~(np.asarray(diagonal) > 0))
+        if wrong.size:
+            raise ValueError(
+                f"M: {wrong.size} of its {diagonal.size} diagonal entries are not positive (the first is "
+                f"{float(diagonal[wrong[0]]):.6g}, of row {wrong[0]}); a mass must be positive definite"
+            )
+
+
+def _check_symmetric(name: str, matrix: _Entries) -> None:
+    values = np.asarray(matrix.values)
+    wrong = int((~np.isfinite(values)).sum())
+    if wrong:
+        raise ValueError(f"{name}: {wrong} of {values.size} entries are NaN or infinite")
+    held = coo_matrix((values, (matrix.rows, matrix.cols)), shape=(matrix.size, matrix.size)).tocsr()
+    difference = abs(held - held.T).tocoo()
+    largest = float(np.max(np.abs(values), initial=0))
+    if difference.nnz and difference.data.max() > _ROUNDING * np.finfo(values.dtype).eps * largest:
+        at = int(np.argmax(difference.data))
+        i, j = int(difference.row[at]), int(difference.col[at])
+        raise ValueError(
+            f"{name}: not symmetric: entry ({i}, {j}) is {held[i, j]:.6g}, and entry ({j}, {i}) is {held[j, i]:.6g}. "
+            f"If that is what you mean, pass ({name} + {name}.T) / 2"
+        )
+
+
+def _pattern(n: int, *matrices: _Entries) -> SparsePattern:
+    """Return the places of all matrices, of their transposes, and the diagonal."""
+    keys = [rows.astype(np.int64) * n + cols for m in matrices for rows, cols in ((m.rows, m.cols), (m.cols, m.rows))]
+    places = np.unique(np.concatenate([*keys, np.arange(n) * (n + 1)]))
+    return SparsePattern(n, places // n, places % n)
+
+
+def _operator(pattern: SparsePattern, matrix: _Entries) -> SparseOperator:
+    """Return the symmetric part of a matrix: half of each entry, and half of it across the diagonal."""
+    n = pattern.size
+    places = pattern.rows.astype(np.int64) * n + pattern.cols
+    rows, cols = matrix.rows.astype(np.int64), matrix.cols.astype(np.int64)
+    one, other = np.searchsorted(places, rows * n + cols), np.searchsorted(places, cols * n + rows)
+    entries = jnp.zeros(places.size, matrix.values.dtype)
+    half = matrix.values / 2
+    return SparseOperator(jax.jit(_add)(entries, one, other, half), pattern)
+
+
+def _add(entries: Array, one: Array, other: Array, half: Array) -> Array:
+    return entries.at[one].add(half).at[other].add(half)

@@ -1,0 +1,96 @@
+"""The inverses of a batch of symmetric indefinite matrices together with their inertia."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hks_jax.linear.products import batched, transposed
+
+Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
+
+_BLOCK = 32
+_SMALL, _LARGE = 32, 256
+
+
+def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+    """Return the inverses, and for each matrix numbers of which as many are negative as eigenvalues.
+
+    Pivots smaller than ``least`` are replaced by it, with their sign; where it is zero, the inverse of a singular
+    matrix is not finite. On CPUs by LAPACK's eigenvalues, elsewhere by elimination, which takes far fewer of the
+    operations that are slow there.
+    """
+    return jax.lax.platform_dependent(matrices, least, cpu=by_eigenvalues, default=by_elimination)
+
+
+def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+    """Invert the eigenvalues; of the many small matrices and the few large ones, those of two halves.
+
+    Each halving takes a quarter of the time.
+    """
+    n = matrices.shape[1]
+    if n <= _SMALL // 2 or _SMALL < n <= _LARGE:
+        vectors, values = jax.lax.linalg.eigh(matrices, symmetrize_input=False)
+        values = _away_from_zero(values, least[:, None])
+        return batched(vectors / values[:, None, :], transposed(vectors)), values
+    half = n // 2
+    first, values = by_eigenvalues(matrices[:, :half, :half], least)
+    coupling = batched(matrices[:, half:, :half], first)
+    schur = matrices[:, half:, half:] - batched(coupling, matrices[:, :half, half:])
+    last, others = by_eigenvalues((schur + transposed(schur)) / 2, least)
+    beside = -batched(last, coupling)
+    first = first - batched(transposed(coupling), beside)
+    whole = jnp.block([[first, transposed(beside)], [beside, last]])
+    return whole, jnp.concatenate([values, others], axis=1)
+
+
+def by_elimination(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+    """Sweep the matrices block by block.
+
+    Sweeping a block P of A turns it into −P⁻¹, and the rest into the Schur complement of P; once all blocks are swept,
+    A has become −A⁻¹. By Sylvester's law of inertia as many of the pivots are negative as eigenvalues of A.
+    """
+    m, n, _ = matrices.shape
+    size = min(n, _BLOCK)
+    whole = -(-n // size) * size
+    a = jnp.broadcast_to(jnp.eye(whole, dtype=matrices.dtype), (m, whole, whole)).at[:, :n, :n].set(matrices)
+
+    def sweep(number: Array, state: Inverses) -> Inverses:
+        a, pivots = state
+        at = number * size
+        rows = jax.lax.dynamic_slice_in_dim(a, at, size, axis=1)
+        inverses, of_block = _sweep_rows(jax.lax.dynamic_slice_in_dim(rows, at, size, axis=2), least)
+        scaled = batched(inverses, rows)
+        a = a - batched(transposed(rows), scaled)
+        a = jax.lax.dynamic_update_slice_in_dim(a, scaled, at, axis=1)
+        a = jax.lax.dynamic_update_slice_in_dim(a, transposed(scaled), at, axis=2)
+        a = jax.lax.dynamic_update_slice(a, -inverses, (0, at, at))
+        return a, jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
+
+    a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
+    return -a[:, :n, :n], pivots[:, :n]
+
+
+def _sweep_rows(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+    """Sweep one row at a time, always the one with the largest diagonal entry left; return with them the pivots."""
+    m, n, _ = matrices.shape
+    index = jnp.arange(n)
+
+    def sweep(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        a, swept, pivots = state
+        diagonal = jnp.diagonal(a, axis1=1, axis2=2)
+        chosen = index == jnp.argmax(jnp.where(swept, -1, jnp.abs(diagonal)), axis=1)[:, None]
+        column = jnp.sum(jnp.where(chosen[:, None, :], a, 0), axis=2)
+        pivot = _away_from_zero(jnp.sum(jnp.where(chosen, diagonal, 0), axis=1), least)[:, None]
+        row = jnp.where(chosen, -1, column) / pivot
+        a = a - jnp.where(chosen, 0, column)[:, :, None] * row[:, None, :]
+        a = jnp.where(chosen[:, :, None], row[:, None, :], jnp.where(chosen[:, None, :], row[:, :, None], a))
+        return a, swept | chosen, jnp.where(chosen, pivot, pivots)
+
+    state = matrices, jnp.zeros((m, n), bool), jnp.zeros((m, n), matrices.dtype)
+    a, _, pivots = jax.lax.fori_loop(0, n, sweep, state)
+    return -a, pivots
+
+
+def _away_from_zero(pivots: Float[Array, "*m"], least: Float[Array, "*#m"]) -> Float[Array, "*m"]:
+    """Return the pivots, of which none is smaller than the least allowed."""
+    return jnp.where(jnp.abs(pivots) < least, jnp.where(pivots < 0, -least, least), pivots)

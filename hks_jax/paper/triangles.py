@@ -1,0 +1,128 @@
+"""Whether edge lengths in the metric violate the triangle inequality, as the paper says of discrete exterior calculus.
+
+The grid's cells are cut by their diagonals, and every edge has a length in the metric by one of the rules `LENGTHS`.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hks_jax.atomic import atomic_path
+from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, figure3_fields, figure4_fields
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.phantom import phantom
+from hks_jax.domain.tensor_checks import MetricChoice
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.paper.figure5 import INDICES
+
+QUICK, FULL = ((51,), (50, 100)), ((201,), (50, 100, 200, 400))  # nodes per axis of the figures' fields, of the torus
+COARSE = 11
+
+Tensors = Float[np.ndarray, "n 2 2"]
+Vectors = Float[np.ndarray, "n 2"]
+
+
+def _norm(tensors: Tensors, edges: Vectors) -> Float[np.ndarray, " n"]:
+    return np.sqrt(np.einsum("ni,nij,nj->n", edges, tensors, edges))
+
+
+def _integrated(a: Tensors, b: Tensors, edges: Vectors) -> Float[np.ndarray, " n"]:
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    s = (1 + nodes) / 2
+    return np.sum([w / 2 * _norm((1 - r) * a + r * b, edges) for r, w in zip(s, weights, strict=True)], axis=0)
+
+
+LENGTHS: dict[str, Callable[[Tensors, Tensors, Vectors], Float[np.ndarray, " n"]]] = {
+    "midpoint": lambda a, b, edges: _norm((a + b) / 2, edges),
+    "mean of the ends": lambda a, b, edges: (_norm(a, edges) + _norm(b, edges)) / 2,
+    "integrated": _integrated,
+}
+"""The length of an edge from the tensors at its ends, which are interpolated linearly in between."""
+
+
+class Count(NamedTuple):
+    """What is wrong with the edge lengths of a triangulated grid.
+
+    Attributes:
+        triangles: how many triangles there are.
+        violating: how many have a side longer than the other two together.
+        vertices: how many vertices there are.
+        no_area: how many have a dual cell, by circumcentres, of no positive area; violating triangles left out.
+    """
+
+    triangles: int
+    violating: int
+    vertices: int
+    no_area: int
+
+
+def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
+    """Triangulate the grid of a field, measure all edges by a rule, and count what is wrong."""
+    grid, (faces, places) = field.grid, _triangles(field.grid, periodic)
+    tensors = np.asarray(field.tensors, dtype=np.float64).reshape(-1, 2, 2)
+    sides = []
+    for i in range(3):  # opposite to corner i
+        j, k = (i + 1) % 3, (i + 2) % 3
+        sides.append(LENGTHS[rule](tensors[faces[:, j]], tensors[faces[:, k]], places[:, k] - places[:, j]))
+    lengths = np.stack(sides, axis=1)
+    violating = 2 * lengths.max(axis=1) > lengths.sum(axis=1)
+    squared, half = lengths[~violating] ** 2, lengths[~violating].sum(axis=1, keepdims=True) / 2
+    area = np.sqrt(half[:, 0] * np.prod(half - lengths[~violating], axis=1))
+    # The dual cell has (b² cot B + c² cot C)/8 of a triangle at corner A, and cot A = (b² + c² − a²)/4·area.
+    weighted = squared * (squared.sum(axis=1, keepdims=True) - 2 * squared) / (4 * area[:, None])
+    cells = np.zeros(len(tensors))
+    np.add.at(cells, faces[~violating], (weighted.sum(axis=1, keepdims=True) - weighted) / 8)
+    inside = grid.inside.ravel()
+    return Count(len(faces), int(violating.sum()), int(inside.sum()), int((cells[inside] <= 0).sum()))
+
+
+def _triangles(grid: Grid, periodic: bool) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3 2"]]:
+    """Return the corners' nodes and places: two triangles for each cell whose nodes are all inside."""
+    cells = np.argwhere(np.ones(grid.shape if periodic else [n - 1 for n in grid.shape], dtype=bool))
+    steps = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
+    corners = cells[:, None, None] + steps
+    nodes = np.ravel_multi_index(tuple(np.moveaxis(corners % grid.shape, -1, 0)), grid.shape)
+    kept = grid.inside.ravel()[nodes].all(axis=(1, 2))
+    return nodes[kept].reshape(-1, 3), (corners[kept] * np.asarray(grid.spacing)).reshape(-1, 3, 2)
+
+
+def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
+    """Return the paper's fields, and a phantom of a brain, with their names and whether they are periodic."""
+    of_figures, of_torus = FULL if full else QUICK
+    found: list[tuple[str, TensorField, bool]] = []
+    for n in (COARSE, *of_figures):
+        found += [(f"Fig. 3, {name}, {n}²", field, False) for name, field in figure3_fields(n).items()]
+        found += [(f"Fig. 4, {name}, {n}²", field, False) for name, field in figure4_fields(n).items()]
+        found += [(f"Fig. 5, index {i}, {n}²", degenerate_point_field(float(i), n), False) for i in INDICES]
+    found += [(f"bumpy torus, {n}²", bumpy_torus_field(n), True) for n in of_torus]
+    tensors, mask, spacing = phantom()
+    metrics: dict[str, MetricChoice] = {"T = D": "tensor", "g = D⁻¹": "inverse"}
+    for name, metric in metrics.items():
+        field = TensorField.from_diffusion(Grid(mask.shape, spacing, mask=mask, components="largest"), tensors, metric)
+        found.append((f"phantom of a brain, {name}", field, False))
+    return found
+
+
+def triangles(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
+    """Write ``triangles.md``."""
+    echo("triangles: edge lengths in the metric, on the paper's fields")
+    lines = [
+        "# Edge lengths in the metric, and the triangle inequality",
+        "",
+        "Triangles that violate it, of all, by the rule for an edge's length; and vertices whose circumcentric dual",
+        "cell has no positive area (lengths by the midpoint).",
+        "",
+        f"| field | triangles | {' | '.join(LENGTHS)} | vertices | without area |",
+        "| --- |" + " ---: |" * (len(LENGTHS) + 3),
+    ]
+    for name, field, periodic in fields(full):
+        counts = [count(field, rule, periodic) for rule in LENGTHS]
+        wrong = " | ".join(str(c.violating) for c in counts)
+        lines.append(f"| {name} | {counts[0].triangles} | {wrong} | {counts[0].vertices} | {counts[0].no_area} |")
+    path = output / "triangles.md"
+    with atomic_path(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return [path]

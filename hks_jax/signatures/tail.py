@@ -1,0 +1,91 @@
+"""What lies beyond the last eigenpair: the share of a signature that a truncated sum leaves out, by Weyl's law."""
+
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import erfc, gammaincc, gammaln
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
+from scipy.special import gammainccinv
+
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.signatures.filters import Derivative, Heat
+from hks_jax.signatures.spectral import spectral_diagonal
+from hks_jax.signatures.times import checked_times, require_pairs
+
+_LEAST_EXPONENT, _GREATEST_EXPONENT = 0.5, 8.0
+"""Between a strip, which is a line to all eigenfunctions that were computed, and a corner of Dirichlet sides in 3D."""
+
+
+# If N(λ) = N(Λ) (λ/Λ)^a, what lies beyond Λ is
+#
+#     ∫_Λ^∞ e^(−λt) dN = N(Λ) a (Λt)^(−a) ∫_Λt^∞ e^(−x) x^(a−1) dx = N(Λ) Γ(a + 1) (Λt)^(−a) Q(a, Λt),
+#
+# Q the regularised upper incomplete gamma function; and all of it is N(Λ) Γ(a + 1) (Λt)^(−a), so that Q is the share.
+def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return ∫ e^(−λt) dN over λ > Λ, with N(λ) = count · (λ/Λ)^exponent and x = Λt."""
+    return count * jnp.exp(gammaln(exponent + 1) - exponent * jnp.log(x)) * gammaincc(exponent, x)
+
+
+# By parts Γ(a + 1) Q(a, x) = a (x^(a−1) e^(−x) + Γ(a) Q(a − 1, x)), with Q(0, x) = 0 and Q(½, x) = erfc √x: closed
+# forms for d = 2 and 3, which compile in a fifth of the time that the general one takes.
+def beyond_by_weyl(count: Float[Array, ""], dimension: int, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return `beyond` for Weyl's exponent d/2, d = 2 or 3."""
+    if dimension == 2:
+        return count * jnp.exp(-x) / x
+    return 1.5 * count * (jnp.exp(-x) + math.sqrt(math.pi) / 2 * erfc(jnp.sqrt(x)) / jnp.sqrt(x)) / x
+
+
+def resolving(share: float, dimension: int) -> float:
+    """Return the Λt from which on no more than this share of the heat trace lies beyond Λ, by Weyl's law."""
+    return float(gammainccinv(dimension / 2, share))
+
+
+def truncation_map(
+    pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n_times"]
+) -> Float[Array, "n_times *shape"]:
+    """Estimate, node by node, what part of the heat kernel signature lies beyond the k pairs.
+
+    `truncation` estimates the mean over the domain; beside a Dirichlet side, in its corners, or where the tensors vary
+    from node to node, a single node can lack several times as much. Here Weyl's law is local: the function
+    N(λ, x) = Σ φᵢ(x)² over λᵢ < λ is taken for N(Λ, x) (λ/Λ)^a(x), Λ the first eigenvalue beyond the k. The constant
+    N(Λ, x) and the exponent a(x) come from the pairs, the latter from the mean of λ at the node, which is Λ a/(a + 1):
+    about d/2 inside and at natural sides, d/2 + 1 at a Dirichlet side.
+
+    An estimate, not a bound. Against all pairs of small grids (2D and 3D, flat, smooth and rough tensors, every
+    boundary, from 28 pairs to a third of all) the largest share of a node was 0.25 to 2 times the largest estimate
+    where the mean was above 0.1 %, and up to 3 times at a mean of 1e-6. Where the mean was 1 % the largest share was
+    1.1 to 4 times that without Dirichlet sides, and 3 to 20 times beside them.
+
+    Args:
+        pairs: from `eigenpairs`.
+        times: (n_times,) positive, in (metric length)².
+
+    Returns:
+        (n_times, *shape), 0 … 1, relative to what all pairs would give; NaN outside the mask, 0 at Dirichlet nodes and
+        where all pairs were computed. Constant to derivatives.
+
+    Raises:
+        ValueError: times that are not positive and finite.
+    """
+    dtype = require_pairs(pairs).eigenvalues.dtype
+    return _map(*jax.lax.stop_gradient((pairs, checked_times("times", times, dtype))))
+
+
+@jax.jit
+def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
+    dtype = at.dtype
+    complete, axes = jnp.isinf(pairs.next_eigenvalue), (1,) * len(pairs.space.node_shape)
+    following = jnp.where(complete, 1, pairs.next_eigenvalue)
+    at_zero = jnp.zeros(1, dtype)
+    count = spectral_diagonal(pairs, Heat(at_zero))[0]
+    # The derivative of exp(−λt) by t at 0 is −λ.
+    moment = -spectral_diagonal(pairs, Derivative(Heat(at_zero), Heat(jnp.ones(1, dtype))))[0]
+    mean = moment / jnp.where(count > 0, count * following, 1)
+    exponent = jnp.clip(mean / jnp.maximum(1 - mean, 1e-3), _LEAST_EXPONENT, _GREATEST_EXPONENT)
+    left = beyond(count, exponent, following * at.reshape(-1, *axes))
+    kept = spectral_diagonal(pairs, Heat(at))
+    share = left / jnp.where(count > 0, left + kept, 1)
+    return jnp.where(complete & ~jnp.isnan(share), 0, share)

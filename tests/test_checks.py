@@ -1,0 +1,154 @@
+"""Settings out of range and complex numbers are refused by name, wherever they enter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from annotations import unchecked
+
+import hks_jax as hj
+from hks_jax.checks import require_count, require_number
+from hks_jax.inverse import H1, Prior, TotalVariation
+from hks_jax.inverse.gauss_newton import GaussNewton
+from hks_jax.io import find_invalid, repair_tensors
+from hks_jax.io.volume import TensorVolume
+
+GRID = hj.Grid((4, 5))
+FIELD = hj.TensorField(GRID, np.broadcast_to(np.eye(2), (4, 5, 2, 2)))
+SOLVERS = (hj.Dense, hj.ShiftInvert, hj.BlockLanczos, hj.ChebyshevFilter)
+VOLUME = TensorVolume(np.broadcast_to(np.eye(2), (4, 5, 2, 2)), (1.0, 1.0), (0.0, 0.0))
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.fixture(autouse=True)
+def as_users_call():
+    """Almost every value here contradicts an annotation."""
+    with unchecked():
+        yield
+
+
+def pairs():
+    return hj.eigenpairs(FIELD, 5)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -1e-8, 0, 1, 1e-3 + 1j, "1e-8", None, True, [1e-8]])
+def test_tolerances_of_solvers(value):
+    for solver in SOLVERS:
+        with pytest.raises(ValueError, match=r"^tolerance: got .*; expected a finite number above 0 and below 1"):
+            solver(tolerance=value)
+    for solver in SOLVERS[1:]:
+        with pytest.raises(ValueError, match=r"^derivative_tolerance: got "):
+            solver(derivative_tolerance=value)
+
+
+@pytest.mark.parametrize("value", [0, -3, 0.5, 2.0, NAN, "8", 1j])
+@pytest.mark.parametrize(
+    ("solver", "name"),
+    [
+        (hj.BlockLanczos, "block"),
+        (hj.BlockLanczos, "slice_size"),
+        (hj.ChebyshevFilter, "block"),
+        (hj.ChebyshevFilter, "max_rounds"),
+        (hj.ShiftInvert, "max_restarts"),
+        (hj.ShiftInvert, "basis"),
+    ],
+)
+def test_counts_of_solvers(solver, name, value):
+    with pytest.raises(ValueError, match=f"^{name}: got .*; expected an integer from [12]$"):
+        solver(**{name: value})
+
+
+OTHERS = {
+    "tolerance of hks": ("tolerance", lambda v: hj.hks(pairs(), [1.0], method="spectrum-free", tolerance=v)),
+    "tolerance of hks_auto": ("tolerance", lambda v: hj.hks_auto(pairs(), [1.0], tolerance=v)),
+    "tolerance of hks_spectrum_free": (
+        "tolerance",
+        lambda v: hj.hks_spectrum_free(FIELD, [1.0], method="selected-inversion", tolerance=v),
+    ),
+    "tolerance of colouring": ("tolerance", lambda v: hj.colouring(FIELD, [0.1], tolerance=v)),
+    "memory": ("memory", lambda v: hj.colouring(FIELD, [0.1], memory=v)),
+    "slack": ("slack", lambda v: hj.colouring(FIELD, [0.1], slack=v)),
+    "spare": ("spare", lambda v: hj.ChebyshevFilter(spare=v)),
+    "tolerance of fit_metric": ("tolerance", lambda v: fit(tolerance=v)),
+    "noise": ("noise", lambda v: fit(noise=v)),
+    "spread": ("spread", lambda v: fit(spread=v)),
+    "smoothness": ("smoothness", lambda v: fit(smoothness=v)),
+    "tolerance of GaussNewton": ("tolerance", lambda v: GaussNewton(tolerance=v)),
+    "damping": ("damping", lambda v: GaussNewton(damping=v)),
+    "growth": ("growth", lambda v: GaussNewton(growth=v)),
+    "inner_tolerance": ("inner_tolerance", lambda v: GaussNewton(inner_tolerance=v)),
+    "weight of H1": ("weight", H1),
+    "weight of Prior": ("weight", lambda v: Prior(v, FIELD)),
+    "weight of TotalVariation": ("weight", lambda v: TotalVariation(v)),
+    "epsilon": ("epsilon", lambda v: TotalVariation(1.0, v)),
+    "floor of repair": ("floor", lambda v: repair_tensors(VOLUME, "clip", v)),
+    "sigma of wks": ("sigma", lambda v: hj.wks(pairs(), [1.0], v)),
+}
+
+
+def fit(**settings):
+    return hj.fit_metric(np.ones((1, *GRID.shape)), [1.0], FIELD, **settings)
+
+
+@pytest.mark.parametrize("case", OTHERS)
+@pytest.mark.parametrize("value", [NAN, INF, -1.0])
+def test_other_settings(case, value):
+    name, call = OTHERS[case]
+    with pytest.raises(ValueError, match=f"^{name}: got {value}; expected a finite number"):
+        call(value)
+
+
+def test_limits_that_may_be_any_finite_number():
+    for call in (lambda v: find_invalid(VOLUME, v), lambda v: hj.count_eigenvalues(FIELD, v)):
+        with pytest.raises(ValueError, match="got nan; expected a finite number"):
+            call(NAN)
+    with pytest.raises(ValueError, match="values: got nan; expected eigenvalues, finite and not negative"):
+        hj.weyl_count(pairs(), [1.0, NAN])
+
+
+def test_what_is_right_passes():
+    for value in (1e-8, np.float32(1e-3), jnp.asarray(1e-3), np.array(0.5)):
+        require_number("x", value, 1)
+    require_number("x", 0, inclusive=True)
+    require_number("x", -3, above=-INF)
+    jax.jit(lambda x: require_number("x", x))(-1.0)  # traced: not known
+    require_count("x", np.int64(3))
+
+
+VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+FACES = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
+TENSORS = np.broadcast_to(np.eye(2), (4, 5, 2, 2)) * (1 + 0.5j)
+NODAL = np.ones((4, 5)) + 1j
+
+COMPLEX = {
+    "tensors": lambda: hj.TensorField(GRID, TENSORS),
+    "tensors of lists": lambda: hj.TensorField(hj.Grid((2, 2)), [[[[1, 0], [0, 1 + 1j]]] * 2] * 2),
+    "tensors under jit": lambda: jax.jit(lambda T: hj.TensorField(GRID, T).tensors)(TENSORS),
+    "D": lambda: hj.TensorField.from_diffusion(GRID, TENSORS, "inverse"),
+    "fn": lambda: hj.TensorField.from_function(lambda x: jax.lax.complex(jnp.eye(2), x[0] * jnp.eye(2)), GRID),
+    "tensors of a volume": lambda: TensorVolume(TENSORS, (1.0, 1.0), (0.0, 0.0)),
+    "vertices": lambda: hj.SurfaceMesh(VERTICES * (1 + 1j), FACES),
+    "metric": lambda: hj.SurfaceMesh(VERTICES, FACES, TENSORS[0, :4]),
+    "tensors in space": lambda: hj.SurfaceMesh.from_tensors(VERTICES, FACES, np.ones((4, 3, 3)) * 1j, "tensor"),
+    "spacing": lambda: hj.Grid((4, 5), spacing=np.array([1, 1 + 1j])),
+    "origin": lambda: hj.Grid((4, 5), origin=1j),
+    "times": lambda: hj.hks(pairs(), [1 + 1j]),
+    "times of a fit": lambda: hj.fit_metric(np.ones((1, 4, 5)), [1 + 1j], FIELD),
+    "target": lambda: hj.fit_metric(NODAL[None], [1.0], FIELD),
+    "weights": lambda: hj.fit_metric(np.ones((1, 4, 5)), [1.0], FIELD, weights=NODAL),
+    "functions": lambda: hj.heat_flow(pairs(), [1.0], NODAL),
+    "functions of a scale space": lambda: hj.gaussian_scale_space(FIELD, [1.0], NODAL),
+    "f": lambda: hj.laplace_beltrami(FIELD, NODAL),
+    "f as a function": lambda: hj.laplace_beltrami(
+        hj.TensorField.from_function(lambda x: jnp.eye(2), GRID), lambda x: 1j
+    ),
+    "energies": lambda: hj.wks(pairs(), [1 + 1j], 0.5),
+    "parameters": lambda: hj.spectral_signature(pairs(), lambda t, x: jnp.exp(-t * x), [1j]),
+    "values": lambda: hj.weyl_count(pairs(), [1j]),
+}
+
+
+@pytest.mark.parametrize("case", COMPLEX)
+def test_complex_numbers_are_refused(case):
+    with pytest.raises(ValueError, match=f"^{case.split()[0]}: got complex numbers; expected real ones"):
+        COMPLEX[case]()

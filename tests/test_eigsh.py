@@ -1,0 +1,219 @@
+"""Eigenpairs of sparse matrices that are none of ours."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+from jax.experimental.sparse import BCOO, BCSR
+from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
+from skfem.helpers import dot
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+import hks_jax as hj
+
+SOLVER = hj.BlockLanczos(block=4)
+
+
+def graph_laplacian(components: int, n: int) -> sp.csr_matrix:
+    """The Laplacian of random graphs, n vertices each, and a star of which the hub has n − 1 neighbours."""
+    blocks = []
+    for seed in range(components):
+        hits = sp.random(n, n, 5 / n, random_state=seed) + sp.eye(n, k=1)
+        graph = ((hits + hits.T) > 0).astype(float)
+        graph.setdiag(0)
+        blocks.append(sp.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph)
+    star = sp.lil_matrix((n, n))
+    star[0, 1:] = star[1:, 0] = -1
+    star.setdiag([n - 1] + [1] * (n - 1))
+    return sp.block_diag([*blocks, star]).tocsr()
+
+
+def elastic_body() -> tuple[sp.csr_matrix, sp.csr_matrix]:
+    """Stiffness and mass of a free elastic box: six rigid modes."""
+    mesh = MeshTet.init_tensor(*(np.linspace(0, length, m) for length, m in ((2.0, 7), (1.0, 4), (1.1, 5))))
+    basis = Basis(mesh, ElementVector(ElementTetP1()))
+    mass = BilinearForm(lambda u, v, _: dot(u, v)).assemble(basis)
+    return linear_elasticity(*lame_parameters(1.0, 0.3)).assemble(basis).tocsr(), mass.tocsr()
+
+
+def indefinite(n: int) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+    """A random indefinite K, and a positive definite M with another pattern."""
+    rng = np.random.default_rng(7)
+    K = sp.random(n, n, 2.5 / n, random_state=0)
+    L = sp.random(n, n, 1 / n, random_state=1)
+    return ((K + K.T) / 2 + sp.diags(rng.standard_normal(n))).tocsr(), (
+        L @ L.T + sp.diags(rng.uniform(1, 2, n))
+    ).tocsr()
+
+
+CASES = {
+    "six rigid modes": lambda: elastic_body(),
+    "components": lambda: (graph_laplacian(3, 120), None),
+    "indefinite": lambda: indefinite(500),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def problem(request):
+    K, M = CASES[request.param]()
+    dense = sp.eye(K.shape[0]) if M is None else M
+    return K, M, scipy.linalg.eigh(K.toarray(), dense.toarray(), eigvals_only=True)
+
+
+def check(pairs, K, M, exact):
+    """The right eigenvalues, M-orthonormal eigenvectors, all converged and certified."""
+    spread = np.ptp(exact)
+    np.testing.assert_allclose(pairs.eigenvalues, exact, atol=1e-8 * spread)
+    vectors = np.asarray(pairs.vectors)
+    weighted = vectors if M is None else (M @ vectors.T).T
+    np.testing.assert_allclose(vectors @ weighted.T, np.eye(pairs.k), atol=1e-7)
+    defect = (K @ vectors.T).T - np.asarray(pairs.eigenvalues)[:, None] * weighted
+    assert np.linalg.norm(defect, axis=1).max() < 1e-6 * spread
+    assert pairs.converged.all()
+    assert pairs.complete_below >= pairs.eigenvalues[-1]
+    assert pairs.result == hj.RESULTS.successful
+
+
+@pytest.mark.parametrize("solver", [None, SOLVER])
+def test_the_lowest_of_any_pencil(problem, solver):
+    K, M, spectrum = problem
+    k = 20
+    while spectrum[k] - spectrum[k - 1] < 1e-3 * (spectrum[k] - spectrum[0]):
+        k += 1
+    check(hj.eigsh(K, M, k, solver=solver), K, M, spectrum[:k])
+
+
+@pytest.mark.parametrize("solver", [None, SOLVER])
+def test_all_in_an_interval(problem, solver):
+    K, M, spectrum = problem
+    gaps = np.flatnonzero(np.diff(spectrum) > 1e-4 * np.ptp(spectrum))
+    middle = len(spectrum) // 3
+    first, last = gaps[gaps > middle][0], gaps[gaps > middle + 30][0]
+    ends = [(spectrum[i] + spectrum[i + 1]) / 2 for i in (first, last)]
+    check(hj.eigsh(K, M, interval=tuple(ends), solver=solver), K, M, spectrum[first + 1 : last + 1])
+
+
+def test_an_interval_without_eigenvalues():
+    pairs = hj.eigsh(sp.diags([1.0, 2.0, 5.0]).tocsr(), interval=(3.0, 4.0))
+    assert pairs.k == 0
+    assert pairs.result == hj.RESULTS.successful
+
+
+def test_every_form_of_a_matrix():
+    K, M = indefinite(200)
+    reference = hj.eigsh(K, M, 5).eigenvalues
+    coo = K.tocoo()
+    coo = coo.row, coo.col, coo.data
+    bcoo = BCOO((jnp.asarray(coo[2]), jnp.stack([jnp.asarray(coo[0]), jnp.asarray(coo[1])], axis=1)), shape=K.shape)
+    pencil = hj.sparse_pencil(K, M)
+    for given in (K.toarray(), K.tocsc(), bcoo, BCSR.from_bcoo(bcoo.sort_indices()), pencil.stiffness):
+        np.testing.assert_allclose(hj.eigsh(given, M, 5).eigenvalues, reference, atol=1e-12)
+    np.testing.assert_allclose(hj.eigsh(pencil, k=5).eigenvalues, reference, atol=1e-12)
+    field = hj.TensorField(hj.Grid((14, 16), 0.1), np.broadcast_to(np.eye(2), (14, 16, 2, 2)))
+    grid = hj.assemble(field)
+    of_grid = hj.eigsh(grid, k=5, solver=SOLVER), hj.eigsh(grid.stiffness, grid.mass, 5)
+    for pairs in of_grid:
+        np.testing.assert_allclose(pairs.eigenvalues, hj.eigenpairs(field, 5).eigenvalues, atol=1e-9)
+    ones = hj.eigsh(K, k=5).eigenvalues
+    for identity in (np.ones(200), sp.eye(200), np.eye(200)):
+        np.testing.assert_allclose(hj.eigsh(K, identity, 5).eigenvalues, ones, atol=1e-12)
+
+
+def loss(pencil, k, weights, solver=SOLVER):
+    """What does not depend on the basis of the last multiple eigenvalue, if k does not cut it."""
+    pairs = hj.eigsh(pencil, k=k, solver=solver)
+    return jnp.sum(pairs.eigenvalues) + jnp.sum(jnp.sum(pairs.vectors**2, axis=0) * weights)
+
+
+def directions(pencil, rng):
+    """Symmetric changes of the entries of K and M."""
+    n, pattern = pencil.size, pencil.pattern
+    at = sp.coo_matrix((rng.standard_normal(pattern.rows.size), (pattern.rows, pattern.cols)), shape=(n, n)).tocsr()
+    change = np.asarray(((at + at.T) / 2)[pattern.rows, pattern.cols]).ravel()
+    for name in ("stiffness", "mass"):
+        yield eqx.tree_at(
+            lambda p, name=name: getattr(p, name).entries, jax.tree.map(jnp.zeros_like, pencil), jnp.asarray(change)
+        )
+
+
+def lattice(n: int) -> sp.csr_matrix:
+    """The Laplacian of a torus of n × n vertices, whose eigenvalues come in groups of four."""
+    ring = sp.lil_matrix(2 * sp.eye(n) - sp.eye(n, k=1) - sp.eye(n, k=-1))
+    ring[0, -1] = ring[-1, 0] = -1
+    return (sp.kron(ring, sp.eye(n)) + sp.kron(sp.eye(n), ring)).tocsr()
+
+
+SIMPLE = pytest.param(lambda: indefinite(300), 12, marks=pytest.mark.slow)
+MULTIPLE = (lambda: (lattice(18), sp.eye(324)), 9)
+
+
+@pytest.mark.parametrize(("matrices", "k"), [SIMPLE, MULTIPLE])
+def test_gradients_at_simple_and_multiple_eigenvalues(rng, matrices, k):
+    K, M = matrices()
+    if M.nnz == K.shape[0]:  # with a pattern of its own, to be changed
+        M = M + 1e-3 * abs(K)
+    pencil, weights = hj.sparse_pencil(K, M), jnp.asarray(rng.standard_normal(K.shape[0]))
+    run = jax.jit(jax.value_and_grad(lambda pencil: loss(pencil, k, weights)))
+    gradient = run(pencil)[1]
+    h = 2e-5
+    for change in directions(pencil, rng):
+        along = sum(jnp.vdot(g, c) for g, c in zip(jax.tree.leaves(gradient), jax.tree.leaves(change), strict=True))
+        ends = [run(jax.tree.map(lambda p, c, s=s: p + s * h * c, pencil, change))[0] for s in (-1, 1)]
+        np.testing.assert_allclose(along, (ends[1] - ends[0]) / (2 * h), rtol=1e-6, atol=2e-6)
+
+
+@pytest.mark.slow
+def test_forward_mode_traced_and_batched(rng):
+    pencil, weights = hj.sparse_pencil(*indefinite(300)), jnp.asarray(rng.standard_normal(300))
+    run = jax.jit(lambda pencil: loss(pencil, 12, weights))
+    change = next(directions(pencil, rng))
+    value, along = jax.jvp(run, (pencil,), (change,))
+    np.testing.assert_allclose(value, loss(pencil, 12, weights), rtol=1e-10)
+    ends = [run(jax.tree.map(lambda p, c, h=h: p + h * c, pencil, change)) for h in (-2e-5, 2e-5)]
+    np.testing.assert_allclose(along, (ends[1] - ends[0]) / 4e-5, rtol=1e-6, atol=2e-6)
+    several = pencil.stiffness.entries * jnp.asarray([[1.0], [1.1]])
+    batch = jax.vmap(lambda entries: run(eqx.tree_at(lambda p: p.stiffness.entries, pencil, entries)))(several)
+    np.testing.assert_allclose(batch[0], value, rtol=1e-10)
+    np.testing.assert_allclose(batch[1], run(eqx.tree_at(lambda p: p.stiffness.entries, pencil, several[1])), rtol=1e-8)
+
+
+def test_an_interval_has_no_derivative():
+    pencil = hj.sparse_pencil(sp.diags(np.arange(1.0, 9)).tocsr())
+    with pytest.raises(NotImplementedError, match="interval"):
+        jax.grad(lambda p: jnp.sum(hj.eigsh(p, interval=(2.5, 4.5), k=2).eigenvalues), allow_int=True)(pencil)
+
+
+def test_what_is_refused():
+    K, M = indefinite(60)
+    skewed = K.tolil()
+    skewed[3, 5] = 0.3
+    with pytest.raises(ValueError, match=r"K: not symmetric: entry \((3, 5|5, 3)\)"):
+        hj.eigsh(skewed, M, 3)
+    with pytest.raises(ValueError, match=r"M: got shape \(59, 59\); expected that of K, \(60, 60\)"):
+        hj.eigsh(K, sp.eye(59).tocsr() + sp.eye(59, k=1) + sp.eye(59, k=-1), 3)
+    with pytest.raises(ValueError, match=r"M: it has \d+ negative eigenvalue"):
+        hj.eigsh(M, K, 3)
+    with pytest.raises(ValueError, match="M: 1 of its 60 diagonal entries are not positive"):
+        hj.eigsh(K, np.append(np.ones(59), 0.0), 3)
+    with pytest.raises(ValueError, match=r"K: 1 of .* entries are NaN"):
+        hj.eigsh(sp.diags([1.0, np.nan, 2.0]).tocsr(), k=1)
+    with pytest.raises(ValueError, match="K: got complex"):
+        hj.eigsh(K * 1j, k=1)
+    with pytest.raises(ValueError, match="k: got 61; expected at most 60"):
+        hj.eigsh(K, M, 61)
+    with pytest.raises(ValueError, match="k: not given"):
+        hj.eigsh(K, M)
+    with pytest.raises(ValueError, match="interval: got \\(1, 1\\)"):
+        hj.eigsh(K, M, interval=(1.0, 1.0))
+    with pytest.raises(ValueError, match="interval: got 2, which cannot be told from an eigenvalue"):
+        hj.eigsh(sp.diags([1.0, 2.0, 5.0]).tocsr(), interval=(2.0, 4.0))
+    with pytest.raises(ValueError, match="K: its indices are traced"):
+        jax.jit(lambda m: hj.eigsh(m, k=1).eigenvalues)(BCOO.fromdense(jnp.eye(3)))
+
+
+def test_a_cut_multiple_eigenvalue_is_told():
+    with pytest.warns(hj.AccuracyWarning, match=r"k = 3 cuts a multiple eigenvalue: its last 2"):
+        hj.eigsh(lattice(12), k=3)
