@@ -57,6 +57,10 @@ def test_a_batch_shared_out_is_the_batch(found):
     assert found["batch"] < 1e-14
 
 
+def test_batches_for_lapack_on_all_devices_at_once(found):
+    assert found["inverses"] < 1e-12
+
+
 def check_eigenpairs(errors):
     assert errors["converged"]
     assert errors["eigenvalues"] < 1e-13

@@ -20,6 +20,7 @@ from fields import random_spd
 import hks_jax as hj
 from hks_jax.devices import Slabs, heat_columns, map_fields
 from hks_jax.fem.columns import stencil_product
+from hks_jax.linear.lapack import at_once_or_in_turn
 
 warnings.simplefilter("error")
 jax.config.update("jax_enable_x64", True)
@@ -96,6 +97,16 @@ def batch(mesh):
     return difference(got, expected)
 
 
+def inverses(mesh):
+    """Batches of inverses by LAPACK on every device at once: without care they wait for one another for ever."""
+    matrices = RNG.normal(size=(mesh.size, 40, 12, 12)) + 12 * np.eye(12)
+
+    def inverse_of_inverse(batch):
+        return at_once_or_in_turn(jnp.linalg.inv, at_once_or_in_turn(jnp.linalg.inv, batch))
+
+    return difference(map_fields(inverse_of_inverse, matrices, mesh), matrices)
+
+
 def eigenpairs(mesh, shape, k, block):
     """The same eigenvalues and spectral projections as on one device, and as from a dense solver."""
     x = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij"))
@@ -154,6 +165,7 @@ def main():
         ]
         found["heat"] = heat(mesh)
         found["batch"] = batch(mesh)
+        found["inverses"] = inverses(mesh)
         found["eigenpairs"] = eigenpairs(mesh, (19, 17), 7, 2)
     else:
         found["halo"] = [halo(mesh, (9, 4), (True, False), gradient=False)]

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from hks_jax.linear.dissection import Dissection
+from hks_jax.linear.lapack import at_once_or_in_turn
 from hks_jax.linear.multifrontal import eliminate, gather_symmetric, taken
 from hks_jax.linear.products import batched, transposed
 
@@ -79,7 +80,7 @@ def inversion_cost(dissection: Dissection) -> Cost:
 
 @jax.custom_jvp
 def _inverses(matrices: Inexact[Array, "m n n"]) -> Inexact[Array, "m n n"]:
-    return jnp.linalg.inv(matrices)
+    return at_once_or_in_turn(jnp.linalg.inv, matrices)
 
 
 @_inverses.defjvp

@@ -1,9 +1,12 @@
 """The inverses of a batch of symmetric indefinite matrices together with their inertia."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.linear.lapack import at_once_or_in_turn
 from hks_jax.linear.products import batched, transposed
 
 Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
@@ -29,7 +32,8 @@ def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -
     """
     n = matrices.shape[1]
     if n <= _SMALL // 2 or _SMALL < n <= _LARGE:
-        vectors, values = jax.lax.linalg.eigh(matrices, symmetrize_input=False)
+        eigh = partial(jax.lax.linalg.eigh, symmetrize_input=False)
+        vectors, values = at_once_or_in_turn(eigh, matrices)
         values = _away_from_zero(values, least[:, None])
         return batched(vectors / values[:, None, :], transposed(vectors)), values
     half = n // 2
