@@ -28,8 +28,10 @@ from hks_jax.linear.multifrontal import Factorisation, factorise
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products
 
-_BLOCK = 32
+_BLOCK = 16
 """Rows solved at once."""
+_WINDOW = 64
+"""Eigenvectors next to a shift that every step takes out."""
 _MEMORY = 5e8
 """Bytes that factorisations may take together."""
 
@@ -77,7 +79,7 @@ def solve(
         rhs: (k, n_dof), k ≤ p; row i belongs to λᵢ.
         tolerance: reduction of the error in the energy norm, relative to the largest row.
     """
-    k, beyond = rhs.shape[0], first_beyond(values)
+    k, beyond, window = rhs.shape[0], first_beyond(values), min(_WINDOW, values.size)
     tolerance = attainable(tolerance, rhs.dtype)
     images = jax.lax.map(pencil.mass.apply, vectors, batch_size=_BLOCK)
     left = rhs - combine(inner_products(vectors, rhs), images)
@@ -92,11 +94,17 @@ def solve(
         matrices = jax.tree.map(lambda stacked: stacked[g], (factors.downward, factors.upward, factors.negative))
         factor = Factorisation(factors.dissection, *matrices)
 
+        nearest = jnp.clip(factor.negative - window // 2, 0, values.size - window)
+        near, near_images = (jax.lax.dynamic_slice_in_dim(x, nearest, window) for x in (vectors, images))
+
+        # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
+        # next to σ alone, which is why no others are taken out before the end.
         def precondition(r: Array) -> Array:
             z = factor.solve(r)
-            return z - combine(inner_products(images, z), vectors)
+            return z - combine(inner_products(near_images, z), near)
 
-        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
+        x = conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
+        return x - combine(inner_products(images, x), vectors)
 
     parts = (
         jnp.asarray(of_block),

@@ -47,7 +47,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     tolerance: float = eqx.field(default=1e-8, static=True)
     block: int = eqx.field(default=8, static=True)
     slice_size: int | None = eqx.field(default=None, static=True)
-    derivative_tolerance: float = eqx.field(default=1e-12, static=True)
+    derivative_tolerance: float = eqx.field(default=1e-9, static=True)
     progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.compilation import jit_quickly
@@ -68,8 +69,8 @@ def block_lanczos(
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
-    Neighbouring blocks are kept orthogonal by the recurrence, and two at a time by one pass against the whole basis,
-    which reads it from memory half as often and leaves it M-orthonormal to rounding. The steps are a loop of XLA's.
+    Neighbouring blocks are kept orthogonal by the recurrence, and in double precision two at a time by one pass against
+    the whole basis, which reads it from memory half as often and leaves it M-orthonormal to rounding. The steps are a loop of XLA's.
 
     Args:
         pencil: K and M.
@@ -147,7 +148,8 @@ def _advance(
             block, onward = block - parts[:b].T, onward - parts[b:].T
             return block, onward - times(block, gram(image, onward))
 
-        block, onward = jax.lax.cond(number % 2 == 1, project, lambda block, onward: (block, onward), block, onward)
+        now = (number + 1) % _every(block.dtype) == 0
+        block, onward = jax.lax.cond(now, project, lambda block, onward: (block, onward), block, onward)
         following, its_image, coupling = _orthonormal(mass, onward)
         return _Recurrence(
             write(state.basis, block, row),
@@ -157,6 +159,15 @@ def _advance(
         )
 
     return jax.lax.fori_loop(first, last, step, state)
+
+
+def _every(dtype: np.dtype) -> int:
+    """Return after how many steps to project on the whole basis.
+
+    Next to the shift an eigenvalue's θ may be a thousand times as large as the others, and what rounding leaves of its
+    eigenvector in a block grows as much in a step: in single precision there is room for one.
+    """
+    return 2 if jnp.finfo(dtype).bits == 64 else 1
 
 
 def _recur(blocks: _Blocks, x: Float[Array, "n_dof b"]) -> tuple[Float[Array, "b b"], Float[Array, "n_dof b"]]:
