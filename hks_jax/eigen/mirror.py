@@ -1,4 +1,4 @@
-"""The mixed problems of a reflected domain, their spectra merged into one."""
+"""The problems of a doubled domain, reflected or glued along its rim, their spectra merged into one."""
 
 import math
 from functools import partial
@@ -58,7 +58,7 @@ def solve_mirror(
 def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
     values = jnp.concatenate([pairs.eigenvalues for pairs in solved])
     lowest = jnp.argsort(values)[: k + extra]
-    # An eigenfunction of the reflected domain has unit norm there, hence 1/√2^m of it here.
+    # An eigenfunction of the doubled domain has unit norm there, hence 1/√2^m of it here.
     vectors = jnp.concatenate(
         [pencil.space.restrict(pairs.space.extend(pairs.vectors, outside=0.0)) for pairs in solved]
     ) / math.sqrt(len(solved))
