@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from hks_jax.cli.job import Result
 from hks_jax.domain.grid import Grid
+from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io.volume import TensorVolume
 from hks_jax.plot import middle_node, new_figure, number_text, save_figure, scalar_image, volume_panels
 from hks_jax.plot.images import colour_range
@@ -119,7 +120,8 @@ def _colours(result: Result) -> str:
 
 def _undisturbed(result: Result, inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
     """Mark the nodes whose values the colours span: under "mean" the rim's are like all others."""
-    return inside if result.report["settings"]["boundary"] == "mean" else away_from_rim(inside)
+    rim = normalise_boundary(result.report["settings"]["boundary"], inside.ndim)[-1]
+    return inside if "mean" in rim else away_from_rim(inside)
 
 
 def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) -> tuple[int, ...]:

@@ -43,7 +43,7 @@ def rim_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarr
         beside = np.pad(beside, before, mode="wrap" if wraps else "edge")  # beyond a side all is as before it
     for start in product((0, 1), repeat=elements.ndim):
         count += beside[tuple(slice(s, s + n) for s, n in zip(start, count.shape, strict=True))]
-    return (0 < count) & (count < 2**elements.ndim)
+    return (count > 0) & (count < 2**elements.ndim)
 
 
 def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> tuple[Int[np.ndarray, "*shape"], int]:

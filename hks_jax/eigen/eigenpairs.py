@@ -56,8 +56,7 @@ class Eigenpairs(eqx.Module):
         converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
         kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was
             dropped or completed: then signatures leave out the last pairs, those that are not kept.
-        part: (k,) under "mirror" and "mean", which of the mixed problems a pair comes from (0: the Neumann problem); else
-            0.
+        part: (k,) under "mirror" and "mean", which of the problems a pair comes from (0: the Neumann problem); else 0.
         next_eigenvalue: the first eigenvalue not kept; infinite if there is none. Constant to derivatives.
         complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
             because all were computed. NaN where there is none. Constant to derivatives.

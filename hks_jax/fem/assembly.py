@@ -61,9 +61,7 @@ def assemble(
         raise ValueError(f'mass: got {mass!r}; expected "consistent" or "lumped"')
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
-            raise ValueError(
-                f"boundary: got {boundary!r}; a mesh takes one of {', '.join(map(repr, MESH_BOUNDARIES))}"
-            )
+            raise ValueError(f"boundary: got {boundary!r}; a mesh takes one of {', '.join(map(repr, MESH_BOUNDARIES))}")
         conditions = ("neumann", "dirichlet") if boundary == "mean" else (boundary,)
         return _joined([_assemble_mesh(domain, mesh_space(domain.triangulation, each), mass) for each in conditions])
     if not isinstance(domain, TensorField):

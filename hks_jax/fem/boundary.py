@@ -34,7 +34,7 @@ def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, .
     """
     if isinstance(boundary, str):
         everywhere = _WHOLE_RIM.get(boundary)
-        entries = (everywhere or boundary,) * dimension + (everywhere or "neumann",)
+        entries: tuple[str | Sides, ...] = (everywhere or boundary,) * dimension + (everywhere or "neumann",)
     elif not isinstance(boundary, tuple | list) or len(boundary) not in (dimension, dimension + 1):
         raise ValueError(
             f"boundary: got {boundary!r}; expected one name, or a tuple of {dimension}, one per axis, "
