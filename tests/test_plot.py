@@ -428,14 +428,14 @@ def test_sensitivity_refuses_what_it_cannot_draw():
 
 
 def test_colours_reach_as_far_above_their_centre_as_below():
-    grid = hj.Grid((2, 3))
+    grid = Grid((2, 3))
     values = np.array([[0.9, 1.0, 1.1], [1.0, 1.4, np.nan]])
-    ax = plot.new_figure().subplots()
-    image = plot.scalar_image(ax, values, grid, centre=1.0)
+    ax = new_figure(3, 3).subplots()
+    image = scalar_image(ax, values, grid, centre=1.0)
     assert image.get_clim() == pytest.approx((0.6, 1.4))
     assert image.get_cmap().name == "RdBu_r"
-    image = plot.scalar_image(ax, values, grid, centre=1.0, vmax=1.2, cmap="viridis")
+    image = scalar_image(ax, values, grid, centre=1.0, vmax=1.2, cmap="viridis")
     assert image.get_clim() == pytest.approx((0.6, 1.2))
     assert image.get_cmap().name == "viridis"
-    figure = plot.hks_panels(np.stack([values, 1 + 2 * (values - 1)]), [1.0, 2.0], grid, centre=1.0, shared_range=True)
+    figure = hks_panels(np.stack([values, 1 + 2 * (values - 1)]), [1.0, 2.0], grid, centre=1.0, shared_range=True)
     assert figure.axes[0].images[0].get_clim() == pytest.approx((0.2, 1.8))
