@@ -64,11 +64,11 @@ def draw(
     aspect = min(max(inside.shape[1] * spacing[1] / (inside.shape[0] * spacing[0]), 0.3), 3.0)
     figure = new_figure(columns * 3.3, rows * (2.4 * aspect + 0.4) + 0.4 * bool(title))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    deep = _undisturbed(result, inside)
+    deep, span = _coloured(result, inside)
     for i, (ax, image, text) in enumerate(zip(panels, values, titles, strict=False)):
         grey = first is not None and i == 0
         low, high = colour_range(
-            image[inside if grey else deep], (0.01, 0.96) if grey else SPAN, centre=None if grey else _centre(result)
+            image[inside if grey else deep], (0.01, 0.96) if grey else span, centre=None if grey else _centre(result)
         )
         constant = high - low <= 2e-6 * abs(high)  # the colours of rounding errors would say nothing
         vmin, vmax = (None, None) if constant else (low, high)
@@ -95,13 +95,13 @@ def draw_volume(result: Result, path: Path, through: tuple[int, int, int] | None
     assert isinstance(volume, TensorVolume)
     node = middle_node(inside) if through is None else _nearest(inside, through)
     grid, box = cropped(volume, inside)
-    deep = _undisturbed(result, inside)
+    deep, span = _coloured(result, inside)
     volume_panels(
         result.values[:, *box],
         result.times,
         grid,
         node=[i - part.start for i, part in zip(node, box, strict=True)],
-        limits=[colour_range(values[deep], SPAN, centre=_centre(result)) for values in result.values],
+        limits=[colour_range(values[deep], span, centre=_centre(result)) for values in result.values],
         cmap=_colours(result),
         length_unit="mm" if volume.affine is not None else "",
         label=LABELS[result.report["settings"]["normalisation"]],
@@ -118,10 +118,13 @@ def _colours(result: Result) -> str:
     return "viridis" if _centre(result) is None else "RdBu_r"
 
 
-def _undisturbed(result: Result, inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes whose values the colours span: under "mean" the rim's are like all others."""
+def _coloured(
+    result: Result, inside: Bool[np.ndarray, "*shape"]
+) -> tuple[Bool[np.ndarray, "*shape"], tuple[float, float]]:
+    """Return which nodes' values the colours span, and from which quantile to which."""
     rim = normalise_boundary(result.report["settings"]["boundary"], inside.ndim)[-1]
-    return inside if "mean" in rim else away_from_rim(inside)
+    # Under "mean" the rim is like all else, but for its corners.
+    return (inside, (0.01, 0.99)) if "mean" in rim else (away_from_rim(inside), SPAN)
 
 
 def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) -> tuple[int, ...]:
