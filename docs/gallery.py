@@ -156,6 +156,52 @@ def influence() -> Figure:
     return figure
 
 
+def around_one() -> Figure:
+    """4πt·HKS around 1, which it is where the metric is flat: with the rim of a mask above, without it below."""
+    field = brain_like()
+    times = np.array([0.4, 1.5, 6.0]) * 1e5
+    pairs = hj.eigenpairs(field, 600, "mean")
+    mean = hj.hks(pairs, times, "flat")
+    natural = mean * (1 + hj.boundary_influence(pairs, times))
+    figure = plot.new_figure(8.4, 6.2)
+    for row, name, values in zip(figure.subplots(2, 3), ("neumann", "mean"), (natural, mean), strict=True):
+        for ax, t, image in zip(row, times, values, strict=True):
+            plot.scalar_image(ax, image, field.grid, vmin=0.6, vmax=1.4, centre=1.0)
+            ax.set_title(f"{name}, $t$ = {plot.number_text(t)} s", fontsize="medium")
+            ax.set_axis_off()
+    return figure
+
+
+def rim_errors() -> Figure:
+    """The error at the rim of flat domains: of natural and Dirichlet conditions, and of their mean."""
+    n = 41
+    x, y = np.meshgrid(*[np.linspace(-1, 1, n)] * 2, indexing="ij")
+    radius = np.hypot(x, y)
+    domains = {
+        "disc": (radius <= 0.9, "mean"),
+        "annulus": ((radius <= 0.95) & (radius >= 0.35), "mean"),
+        "ellipse": ((x / 0.95) ** 2 + (y / 0.6) ** 2 <= 1, "mean"),
+        "half a square, periodic in y": (x <= 0, ("mean", "periodic")),
+    }
+    times = np.linspace(0.075, 0.4, 14) ** 2
+    figure = plot.new_figure(9.6, 2.8)
+    for ax, (name, (mask, boundary)) in zip(figure.subplots(1, 4, sharey=True), domains.items(), strict=True):
+        grid = hj.Grid((n, n), 2 / (n - 1), -1.0, mask=mask)
+        pairs = hj.eigenpairs(hj.TensorField(grid, np.broadcast_to(np.eye(2), (n, n, 2, 2))), 350, boundary)
+        mean, influence = hj.hks(pairs, times, "flat"), hj.boundary_influence(pairs, times)
+        rim = pairs.space.domain & ~pairs.pencil.parts[1].space.free
+        curves = {"neumann": mean * (1 + influence), "dirichlet": mean * (1 - influence), "mean": mean}
+        for (label, values), style in zip(curves.items(), ("C3-", "C0-", "k-"), strict=True):
+            ax.plot(np.sqrt(times), np.sqrt(np.mean((values[:, rim] - 1) ** 2, axis=1)), style, label=label)
+        if name == "disc":
+            ax.plot(np.sqrt(times), np.sqrt(np.pi * times) / 4 / 0.9, "k:", label=r"$\sqrt{\pi t}\,/\,4R$")
+        ax.set_title(name, fontsize="medium")
+        ax.set_xlabel(r"$\sqrt{t}$")
+    figure.axes[0].set_ylabel(r"rms of $4\pi t\,$HKS − 1 on the rim")
+    figure.axes[3].legend(handles=figure.axes[0].lines, loc="center right", fontsize="small")
+    return figure
+
+
 def rows() -> Figure:
     """The signature over t beside the trace and the anisotropy, smoothed by Gaussians or by heat flow in the metric."""
     field = hj.examples.figure3_fields(41)["T³"]
@@ -258,6 +304,8 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
     "Curves at points": curves,
     "Spectra and Weyl's law": weyl,
     "The boundary's influence": influence,
+    "Around 1, without the rim": around_one,
+    "What is left at a rim": rim_errors,
     "Beside Gaussian smoothing and heat flow": rows,
     "Volumes": volume,
     "Surfaces of equal value": surfaces,

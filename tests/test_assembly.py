@@ -186,8 +186,11 @@ def test_assembly_batches_like_a_loop(rng):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"boundary": "robin"}, "boundary: got 'robin'; expected one of 'neumann', 'dirichlet', 'periodic', 'mirror'"),
-        ({"boundary": ("neumann",) * 3}, r"boundary: got .* expected one name, or a tuple of 2"),
+        (
+            {"boundary": "robin"},
+            "boundary: got 'robin'; expected one of 'neumann', 'dirichlet', 'mean', 'periodic', 'mirror'",
+        ),
+        ({"boundary": ("neumann",) * 4}, r"boundary: got .* expected one name, or a tuple of 2"),
         ({"boundary": (("neumann", "periodic"), "neumann")}, "bind both sides"),
         ({"boundary": None}, "boundary: got None; expected one name"),
         ({"boundary": (("neumann",) * 3, "neumann")}, r"boundary: got .* for one axis; expected a name or a pair"),

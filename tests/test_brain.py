@@ -70,3 +70,20 @@ def test_ventricles_hold_less_heat_than_the_tissue_around_them(plane, pairs):
     tissue = deep & (diffusivity < 1.2e-3)
     assert ventricles.sum() > 50
     assert np.median(values[ventricles & deep]) < 0.8 * np.median(values[tissue])
+
+
+@pytest.mark.slow
+def test_the_mean_shows_the_tissue_up_to_the_rim(plane):
+    field = hj.TensorField.from_diffusion(plane.grid(), plane.tensors.astype(np.float64), "inverse")
+    diffusivity = np.median(np.trace(plane.tensors, axis1=-2, axis2=-1)[plane.mask] / 2)
+    pairs = hj.eigenpairs(field, 160, "mean", "shift-invert")
+    times = [14.0**2 / diffusivity]  # √(Dt) = 14 mm
+    mean = np.asarray(hj.hks(pairs, times, "flat"))[0]
+    natural = mean * (1 + np.asarray(hj.boundary_influence(pairs, times))[0])
+    rim = pairs.space.domain & ~pairs.pencil.parts[1].space.free
+    assert np.median(natural[rim]) > 2
+    assert 0.9 < np.median(mean[rim]) < 1.3
+    assert np.nanpercentile(natural, 98) > 2.2
+    low, high = np.nanpercentile(mean, [2, 98])
+    assert 0.7 < low < 0.85
+    assert 1.1 < high < 1.3

@@ -221,6 +221,7 @@ def test_bad_voxels_are_refused_before_anything_is_computed(nifti, tmp_path, cap
     "extra",
     [
         ["--boundary", "dirichlet:neumann,neumann", "--solver", "dense"],
+        ["--boundary", "mean", "--normalisation", "flat"],
         ["--solver", "shift-invert", "--normalisation", "heat-trace"],
         ["--metric", "adjugate", "--erode", "1", "--interpolation", "log-euclidean"],
         ["--dtype", "float32", "--times", "auto:3"],
@@ -237,7 +238,12 @@ def test_options_reach_the_computation(npz, tmp_path, extra):
         trace = np.exp(-read["times"][:, None] * read["eigenvalues"]).sum(1)
         assert trace.shape == (len(report["times"]),)
     for option, value in zip(extra[::2], extra[1::2], strict=True):
-        if option == "--boundary":
+        if (option, value) == ("--boundary", "mean"):
+            assert settings["boundary"] == "mean"
+            assert not any("no effect" in warning for warning in report["warnings"])
+            field = hj.TensorField(hj.Grid(SHAPE, (0.5, 0.25), mask=disc()), metric())
+            assert pairs["last"] == pytest.approx(float(hj.eigenpairs(field, 10, "mean").eigenvalues[-1]), rel=1e-9)
+        elif option == "--boundary":
             assert settings["boundary"] == [["dirichlet", "neumann"], "neumann"]
             assert any("no effect at the low side of x" in warning for warning in report["warnings"])
         elif option == "--times":
@@ -371,7 +377,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
         (["--slice", "14"], ["--slice", "such as z=14"]),
         (["--slice", "z=1"], ["slice", "only volumes can be sliced"]),
         (["--boundary", "robin"], ["boundary: got 'robin'", "'neumann'"]),
-        (["--boundary", "neumann,neumann,neumann"], ["expected one name, or a tuple of 2"]),
+        (["--boundary", "neumann,neumann,neumann,neumann"], ["expected one name, or a tuple of 2"]),
         (["--metric", "euclid"], ["--metric", "invalid choice", "inverse"]),
         (["--order", "fsl"], ["order", "npz holds whole matrices"]),
         (["--erode", "40"], ["leaves nothing"]),
@@ -502,6 +508,7 @@ def test_parsing():
     assert parse_times(["auto:9"]) == Times((), 9)
     assert parse_times(["3,1", "2"]) == Times((1.0, 2.0, 3.0), 0)
     assert parse_boundary("mirror") == "mirror"
+    assert parse_boundary("mean,periodic,neumann") == ("mean", "periodic", "neumann")
     assert parse_boundary("neumann,periodic") == ("neumann", "periodic")
     assert parse_boundary("neumann:dirichlet,periodic") == (("neumann", "dirichlet"), "periodic")
     assert parse_boundary("neumann:dirichlet") == (("neumann", "dirichlet"),)

@@ -210,7 +210,7 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     refused("--metric: choose what the tensors at the vertices stand for", "--array", "D")
     refused("--array: got 'E'; the arrays at the vertices are D", "--array", "E", "--metric", "tensor")
     refused("--slice: it is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
-    refused("--boundary: got 'mirror'; a mesh takes neumann or dirichlet", "--boundary", "mirror")
+    refused("--boundary: got 'mirror'; a mesh takes one of neumann, dirichlet, mean", "--boundary", "mirror")
     refused("--array: 'D' has 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
 
 

@@ -425,3 +425,17 @@ def test_sensitivity_refuses_what_it_cannot_draw():
         sensitivity(ax, Grid((6, 6)), np.zeros((6, 6)))
     with pytest.raises(ValueError, match="gradient: 36 of 36 tensors drawn are NaN or infinite"):
         sensitivity(ax, Grid((6, 6)), np.full((6, 6, 2, 2), np.nan), every=1)
+
+
+def test_colours_reach_as_far_above_their_centre_as_below():
+    grid = Grid((2, 3))
+    values = np.array([[0.9, 1.0, 1.1], [1.0, 1.4, np.nan]])
+    ax = new_figure(3, 3).subplots()
+    image = scalar_image(ax, values, grid, centre=1.0)
+    assert image.get_clim() == pytest.approx((0.6, 1.4))
+    assert image.get_cmap().name == "RdBu_r"
+    image = scalar_image(ax, values, grid, centre=1.0, vmax=1.2, cmap="viridis")
+    assert image.get_clim() == pytest.approx((0.6, 1.2))
+    assert image.get_cmap().name == "viridis"
+    figure = hks_panels(np.stack([values, 1 + 2 * (values - 1)]), [1.0, 2.0], grid, centre=1.0, shared_range=True)
+    assert figure.axes[0].images[0].get_clim() == pytest.approx((0.2, 1.8))

@@ -52,8 +52,10 @@ def add_eigenpair_arguments(parser: argparse.ArgumentParser) -> None:
         type=parse_boundary,
         default="neumann",
         metavar="B",
-        help="neumann (default), dirichlet, periodic or mirror; one for all axes, or one per axis as in "
-        "neumann,periodic; low:high for the two sides, as in neumann:dirichlet,neumann",
+        help="neumann (default); mean, of Neumann and Dirichlet, under which the rim of a mask hardly shows; "
+        "dirichlet, dirichlet-rim (the rim of a mask, too), periodic or mirror; one for all axes, or one per axis as "
+        "in neumann,periodic, and then one for the rim of a mask; low:high for the two sides, as in "
+        "neumann:dirichlet,neumann",
     )
     add(
         "-k",

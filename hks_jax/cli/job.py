@@ -173,12 +173,18 @@ def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) 
 def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
     """Say which conditions have no effect, because the mask does not reach the side of the grid that they are for."""
     found = []
-    for axis, (name, conditions) in enumerate(zip("xyz", normalise_boundary(boundary, inside.ndim), strict=False)):
+    *axes, rim = normalise_boundary(boundary, inside.ndim)
+    on_rim = {
+        "neumann": 'the mask\'s own rim is natural (Neumann); "dirichlet-rim" and "mean" take it in',
+        "dirichlet": 'the mask\'s own rim has "dirichlet"',
+        "mean": 'the mask\'s own rim has "mean"',
+    }[rim[0]]
+    for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False)):
         for index, condition in zip((0, -1), conditions, strict=True):
-            if condition != "neumann" and not np.take(inside, index, axis).any():
+            if condition not in ("neumann", rim[0]) and not np.take(inside, index, axis).any():
                 found.append(
                     f'boundary: "{condition}" has no effect at the {"low" if index == 0 else "high"} side of {name}, '
-                    "which the mask does not reach; the mask's own rim is always natural (Neumann)"
+                    f"which the mask does not reach; {on_rim}"
                 )
     return found
 

@@ -13,6 +13,7 @@ from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import read_mesh, read_mesh_arrays
 from hks_jax.io.mesh import WRITTEN
 from hks_jax.io.provenance import digest
@@ -43,8 +44,8 @@ def check_options(args: argparse.Namespace) -> None:
     for name, default in _OF_GRIDS.items():
         if getattr(args, name) != default:
             raise ValueError(f"--{name.replace('_', '-')}: it is for tensors on a grid; leave it out for a mesh")
-    if args.boundary not in ("neumann", "dirichlet"):
-        raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes neumann or dirichlet")
+    if args.boundary not in MESH_BOUNDARIES:
+        raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes one of {', '.join(MESH_BOUNDARIES)}")
     if args.array is None:
         for name, default in _OF_TENSORS.items():
             if getattr(args, name) != default:

@@ -10,8 +10,10 @@ from scipy import ndimage
 
 from hks_jax.cli.job import Result
 from hks_jax.domain.grid import Grid
+from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io.volume import TensorVolume
 from hks_jax.plot import middle_node, new_figure, number_text, save_figure, scalar_image, volume_panels
+from hks_jax.plot.images import colour_range
 
 SPAN = (0.002, 0.998)
 """The quantiles, away from the boundary, that the colours span."""
@@ -36,7 +38,8 @@ def draw(
 ) -> None:
     """Draw the signature of a slice, one image per time with its own colours.
 
-    The colours span the values away from the boundary; arrows at a colour bar's ends say that some lie beyond.
+    The colours span the values away from the boundary; arrows at a colour bar's ends say that some lie beyond. Under
+    "flat" normalisation they diverge from 1, which the signature is where the metric is flat.
 
     Args:
         result: what to draw.
@@ -61,14 +64,16 @@ def draw(
     aspect = min(max(inside.shape[1] * spacing[1] / (inside.shape[0] * spacing[0]), 0.3), 3.0)
     figure = new_figure(columns * 3.3, rows * (2.4 * aspect + 0.4) + 0.4 * bool(title))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    deep = away_from_rim(inside)
+    deep, span = _coloured(result, inside)
     for i, (ax, image, text) in enumerate(zip(panels, values, titles, strict=False)):
         grey = first is not None and i == 0
-        low, high = np.quantile(image[inside if grey else deep], (0.01, 0.96) if grey else SPAN)
-        constant = high - low <= 1e-6 * abs(high)  # the colours of rounding errors would say nothing
-        vmin, vmax = (None, None) if constant else (float(low), float(high))
+        low, high = colour_range(
+            image[inside if grey else deep], (0.01, 0.96) if grey else span, centre=None if grey else _centre(result)
+        )
+        constant = high - low <= 2e-6 * abs(high)  # the colours of rounding errors would say nothing
+        vmin, vmax = (None, None) if constant else (low, high)
         image = np.where(inside, image, np.nan)
-        scalar_image(ax, image, grid, cmap="gray" if grey else "viridis", vmin=vmin, vmax=vmax)
+        scalar_image(ax, image, grid, cmap="gray" if grey else _colours(result), vmin=vmin, vmax=vmax)
         ax.set_title(text, fontsize="medium")
         ax.set_axis_off()
     for ax in panels[len(values) :]:
@@ -90,17 +95,36 @@ def draw_volume(result: Result, path: Path, through: tuple[int, int, int] | None
     assert isinstance(volume, TensorVolume)
     node = middle_node(inside) if through is None else _nearest(inside, through)
     grid, box = cropped(volume, inside)
-    deep = away_from_rim(inside)
+    deep, span = _coloured(result, inside)
     volume_panels(
         result.values[:, *box],
         result.times,
         grid,
         node=[i - part.start for i, part in zip(node, box, strict=True)],
-        limits=[tuple(np.quantile(values[deep], SPAN).tolist()) for values in result.values],
+        limits=[colour_range(values[deep], span, centre=_centre(result)) for values in result.values],
+        cmap=_colours(result),
         length_unit="mm" if volume.affine is not None else "",
         label=LABELS[result.report["settings"]["normalisation"]],
         path=path,
     )
+
+
+def _centre(result: Result) -> float | None:
+    """Return the value of the middle colour, if there is one that means something."""
+    return 1.0 if result.report["settings"]["normalisation"] == "flat" else None
+
+
+def _colours(result: Result) -> str:
+    return "viridis" if _centre(result) is None else "RdBu_r"
+
+
+def _coloured(
+    result: Result, inside: Bool[np.ndarray, "*shape"]
+) -> tuple[Bool[np.ndarray, "*shape"], tuple[float, float]]:
+    """Return which nodes' values the colours span, and from which quantile to which."""
+    rim = normalise_boundary(result.report["settings"]["boundary"], inside.ndim)[-1]
+    # Under "mean" the rim is like all else, but for its corners.
+    return (inside, (0.01, 0.99)) if "mean" in rim else (away_from_rim(inside), SPAN)
 
 
 def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) -> tuple[int, ...]:

@@ -34,6 +34,18 @@ def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.n
     return nodes
 
 
+def rim_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
+    """Mark the nodes on the rim of a mask: those that lack an element which the grid itself has."""
+    count = np.zeros([n + (not wraps) for n, wraps in zip(elements.shape, periodic, strict=True)], dtype=int)
+    beside = elements
+    for axis, wraps in enumerate(periodic):
+        before = [(1, int(not wraps)) if a == axis else (0, 0) for a in range(elements.ndim)]
+        beside = np.pad(beside, before, mode="wrap" if wraps else "edge")  # beyond a side all is as before it
+    for start in product((0, 1), repeat=elements.ndim):
+        count += beside[tuple(slice(s, s + n) for s, n in zip(start, count.shape, strict=True))]
+    return (count > 0) & (count < 2**elements.ndim)
+
+
 def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> tuple[Int[np.ndarray, "*shape"], int]:
     """Label the connected components of the domain: two nodes are neighbours when they share an element.
 

@@ -48,14 +48,15 @@ class Eigenpairs(eqx.Module):
 
     Attributes:
         eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for the constant of each natural component.
-        vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the reflected domain under "mirror").
+        vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the doubled domain under "mirror"
+            and "mean", that is 1/√2 of it here, for each doubling).
         frame: (k, n_dof) the same numbers; only their derivative differs. It leaves out the rotations of the
             eigenfunctions among themselves, which are singular at multiple eigenvalues and of no use to signatures.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁).
         converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
         kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was
             dropped or completed: then signatures leave out the last pairs, those that are not kept.
-        part: (k,) under "mirror", which of the mixed problems a pair comes from; else 0.
+        part: (k,) under "mirror" and "mean", which of the problems a pair comes from (0: the Neumann problem); else 0.
         next_eigenvalue: the first eigenvalue not kept; infinite if there is none. Constant to derivatives.
         complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
             because all were computed. NaN where there is none. Constant to derivatives.

@@ -1,4 +1,4 @@
-"""The mixed problems of a reflected domain, their spectra merged into one."""
+"""The problems of a doubled domain, reflected or glued along its rim, their spectra merged into one."""
 
 import math
 from functools import partial
@@ -22,14 +22,15 @@ def solve_mirror(
 ) -> Eigenpairs:
     """Solve the mixed problems and return the k + extra lowest pairs of all.
 
-    How many come from each part is not known beforehand. Where values are concrete, ask for a fair share with a margin
-    and double it wherever the merged spectrum could still miss a pair; traced, ask every part for all.
+    How many come from each part is not known beforehand. Where values are concrete, ask for what Weyl's law says, with
+    a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask every part for all.
     """
     parts, total = pencil.parts, k + extra
     limits = [min(total, part.space.n_dof) for part in parts]
-    share = math.ceil(total / len(parts)) + 2 * math.isqrt(total) + 4
     traced = is_traced(jax.lax.stop_gradient(pencil))
-    wanted = limits if traced else [min(limit, share) for limit in limits]
+    wanted = (
+        limits if traced else [min(limit, share) for limit, share in zip(limits, _shares(pencil, total), strict=True)]
+    )
     # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
     solvers = [
         solver if limit <= solver.max_pairs(part.space.n_dof) else Dense(solver.tolerance)
@@ -54,11 +55,23 @@ def solve_mirror(
     return _merge(pencil, tuple(solved), k, extra, name)
 
 
+# Weyl's law with h for the spacing and n for the nodes: N(λ) = n hᵈ λ^(d/2) / c, and a rim of r nodes that is Dirichlet
+# and not natural takes away r h^(d−1) λ^((d−1)/2) / c′, c = 4π and c′ = 2π in 2D, 6π² and 8π in 3D.
+def _shares(pencil: MirrorPencil, total: int) -> list[int]:
+    """Return about how many of the lowest pairs come from each part, and some more."""
+    d, sizes = pencil.space.dimension, [part.space.n_dof for part in pencil.parts]
+    mean = sum(sizes) / len(sizes)
+    share, margin = total / len(sizes), 2 * math.isqrt(total) + 4
+    wave = (share / mean * (4 * math.pi if d == 2 else 6 * math.pi**2)) ** (1 / d)  # √λ h
+    per_node = wave ** (d - 1) / (2 * math.pi if d == 2 else 8 * math.pi)
+    return [max(math.ceil(share + (size - mean) * per_node), 0) + margin for size in sizes]
+
+
 @partial(jax.jit, static_argnames=("k", "extra", "name"))
 def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
     values = jnp.concatenate([pairs.eigenvalues for pairs in solved])
     lowest = jnp.argsort(values)[: k + extra]
-    # An eigenfunction of the reflected domain has unit norm there, hence 1/√2^m of it here.
+    # An eigenfunction of the doubled domain has unit norm there, hence 1/√2^m of it here.
     vectors = jnp.concatenate(
         [pencil.space.restrict(pairs.space.extend(pairs.vectors, outside=0.0)) for pairs in solved]
     ) / math.sqrt(len(solved))

@@ -14,7 +14,7 @@ from hks_jax.domain import spd
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.boundary import BoundarySpec, mirror_problems, normalise_boundary
+from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.fem.elements import at_quadrature, element_matrices, simplex_element, tensor_product_element
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
@@ -24,6 +24,7 @@ from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperat
 from hks_jax.linear.pattern import SparsePattern
 
 MassKind = Literal["consistent", "lumped"]
+MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
 
 
 def assemble(
@@ -38,17 +39,20 @@ def assemble(
     Args:
         domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
         boundary: ``"neumann"`` (natural), ``"dirichlet"`` (φ = 0: these nodes are eliminated), ``"periodic"`` (node n
-            is node 0: an axis of n nodes has the period n·h) or ``"mirror"`` (the domain reflected on every side); one
-            name for all axes or one per axis, where a pair (low, high) of the first two tells the sides apart. They
-            act on the sides of the grid; the rim of a mask is always natural. A mesh takes ``"neumann"`` or
-            ``"dirichlet"``, which act on its boundary.
+            is node 0: an axis of n nodes has the period n·h), ``"mirror"`` (the domain reflected on every side) or
+            ``"mean"`` (two copies of the domain, glued along all of the rim); one name for all axes or one per axis,
+            where a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"`` tells the sides apart. The rim of
+            a mask is natural, but under ``"mean"``, and under ``"dirichlet-rim"``, which is Dirichlet on all sides and
+            there; or as one more entry says, after those of the axes: ``("periodic", "periodic", "dirichlet")``. A mesh
+            takes ``"neumann"``, ``"dirichlet"`` or ``"mean"``, which act on its boundary.
         mass: ``"consistent"`` or ``"lumped"`` (row sums; diagonal).
 
     Returns:
-        The pencil (stiffness, mass); with ``"mirror"`` the `MirrorPencil` of the mixed problems that make it up.
+        The pencil (stiffness, mass); with ``"mirror"`` and ``"mean"`` the `MirrorPencil` of the problems that make it
+        up.
 
     Raises:
-        ValueError: an unknown boundary or mass, a domain without elements or free nodes.
+        ValueError: an unknown boundary or mass, a domain without elements or free nodes; ``"mean"`` without a rim.
 
     Warns:
         AccuracyWarning: a Dirichlet condition that no node of the domain feels.
@@ -56,23 +60,35 @@ def assemble(
     if mass not in ("consistent", "lumped"):
         raise ValueError(f'mass: got {mass!r}; expected "consistent" or "lumped"')
     if isinstance(domain, SimplicialMesh):
-        if boundary not in ("neumann", "dirichlet"):
-            raise ValueError(f'boundary: got {boundary!r}; a mesh takes "neumann" or "dirichlet"')
-        return _assemble_mesh(domain, mesh_space(domain.triangulation, boundary), mass)
+        if boundary not in MESH_BOUNDARIES:
+            raise ValueError(f"boundary: got {boundary!r}; a mesh takes one of {', '.join(map(repr, MESH_BOUNDARIES))}")
+        conditions = ("neumann", "dirichlet") if boundary == "mean" else (boundary,)
+        return _joined([_assemble_mesh(domain, mesh_space(domain.triangulation, each), mass) for each in conditions])
     if not isinstance(domain, TensorField):
         raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
     if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
         raise ValueError("domain: got a batch of tensor fields; expected one. Map over the batch with jax.vmap")
     sides = normalise_boundary(boundary, domain.grid.dimension)
-    problems = mirror_problems(sides)
+    problems = doubled_problems(sides)
     pencils = [_assemble_grid(domain, grid_space(domain.grid, problem), mass) for problem in problems]
     space = pencils[0].space
     if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
-        warn_of_accuracy(
-            f'boundary: got {boundary!r}, but "dirichlet" acts on the sides of the grid, which the mask does not '
-            "reach. The mask's own rim is natural",
+        where = (
+            'acts on the sides of the grid, which the mask does not reach. "dirichlet-rim" takes in the mask\'s own rim'
+            if sides[-1] == ("neumann", "neumann")
+            else "acts nowhere: there is no mask whose rim it could hold on"
         )
-    return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))
+        warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
+    return _joined(pencils)
+
+
+def _joined(pencils: list[Pencil]) -> Pencil | MirrorPencil:
+    """Return the pencil, or the problems that make up a doubled domain."""
+    if len(pencils) == 1:
+        return pencils[0]
+    if pencils[0].space.n_dof == pencils[-1].space.n_dof:
+        raise ValueError('boundary: got "mean", but the domain has no rim: leave it out')
+    return MirrorPencil(tuple(pencils))
 
 
 def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Pencil:

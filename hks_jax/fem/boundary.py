@@ -1,4 +1,4 @@
-"""Boundary conditions per axis and side; the mirror as a set of mixed problems; reflected strips."""
+"""Boundary conditions per axis and side, and on the rim of a mask; doubled domains as sets of problems; strips."""
 
 from itertools import product
 from types import EllipsisType
@@ -16,49 +16,81 @@ Sides: TypeAlias = tuple[Side, Side]
 """The conditions at the low and the high side of one axis."""
 BoundarySpec: TypeAlias = str | tuple[str | Sides, ...]
 
-_CONDITIONS = ("neumann", "dirichlet", "periodic", "mirror")
+_SIDE_BY_SIDE = ("neumann", "dirichlet", "mean")
+_CONDITIONS = (*_SIDE_BY_SIDE, "periodic", "mirror")
+_WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
+"""Names that, given alone, hold on the rim of a mask, too, and what they mean there."""
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
-    """Return the (low, high) conditions of every axis.
+    """Return the (low, high) conditions of every axis and, last, the condition on the rim of a mask, twice.
 
     Args:
-        boundary: ``"neumann"``, ``"dirichlet"``, ``"periodic"`` or ``"mirror"``; or a tuple with one entry per
-            axis, each one of these names or a pair (low, high) of ``"neumann"`` and ``"dirichlet"``.
+        boundary: ``"neumann"``, ``"dirichlet"``, ``"mean"``, ``"periodic"``, ``"mirror"`` or ``"dirichlet-rim"``; or a
+            tuple with one entry per axis, each one of these names but the last, or a pair (low, high) of the first
+            three. One more entry, the first three again, is for the rim of a mask. Without it that rim is natural, or
+            has the mean where an axis has it.
         dimension: the number of axes.
     """
-    entries = (boundary,) * dimension if isinstance(boundary, str) else boundary
-    if not isinstance(entries, tuple | list) or len(entries) != dimension:
-        raise ValueError(f"boundary: got {boundary!r}; expected one name, or a tuple of {dimension}, one per axis")
-    sides = []
-    for entry in entries:
-        pair = (entry, entry) if isinstance(entry, str) else entry
-        if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise ValueError(f"boundary: got {entry!r} for one axis; expected a name or a pair (low, high)")
-        low, high = pair
-        unknown = [name for name in pair if name not in _CONDITIONS]
-        if unknown:
-            raise ValueError(f"boundary: got {unknown[0]!r}; expected one of {', '.join(map(repr, _CONDITIONS))}")
-        if low != high and not {low, high} <= {"neumann", "dirichlet"}:
-            raise ValueError(
-                f'boundary: got {entry!r} for one axis; "periodic" and "mirror" bind both sides of an axis'
-            )
-        sides.append((low, high))
+    if isinstance(boundary, str):
+        everywhere = _WHOLE_RIM.get(boundary)
+        entries: tuple[str | Sides, ...] = (everywhere or boundary,) * dimension + (everywhere or "neumann",)
+    elif not isinstance(boundary, tuple | list) or len(boundary) not in (dimension, dimension + 1):
+        raise ValueError(
+            f"boundary: got {boundary!r}; expected one name, or a tuple of {dimension}, one per axis, "
+            f"or of {dimension + 1}, the last for the rim of a mask"
+        )
+    else:
+        entries = tuple(boundary)
+    sides = [_pair(entry) for entry in entries]
+    if len(sides) == dimension:
+        rim = "mean" if any("mean" in pair for pair in sides) else "neumann"
+        sides.append((rim, rim))
+    elif sides[-1][0] != sides[-1][1] or sides[-1][0] not in _SIDE_BY_SIDE:
+        raise ValueError(
+            f"boundary: got {entries[-1]!r} for the rim of a mask; "
+            f"expected one of {', '.join(map(repr, _SIDE_BY_SIDE))}"
+        )
     return tuple(sides)
 
 
-def mirror_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
-    """Return the mixed problems whose spectra together are that of the domain doubled along its mirror axes.
+def _pair(entry: str | Sides) -> Sides:
+    """Return the (low, high) conditions of one axis."""
+    pair = (entry, entry) if isinstance(entry, str) else entry
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise ValueError(f"boundary: got {entry!r} for one axis; expected a name or a pair (low, high)")
+    low, high = pair
+    unknown = [name for name in pair if name not in _CONDITIONS]
+    if unknown:
+        known = ", ".join(map(repr, _CONDITIONS))
+        alone = ', or "dirichlet-rim" alone, for all sides and the rim of a mask'
+        raise ValueError(f"boundary: got {unknown[0]!r}; expected one of {known}{alone}")
+    if low != high and not {low, high} <= set(_SIDE_BY_SIDE):
+        raise ValueError(f'boundary: got {entry!r} for one axis; "periodic" and "mirror" bind both sides of an axis')
+    return low, high
+
+
+def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
+    """Return the problems whose spectra together are that of the domain doubled along mirrors and the mean's rim.
 
     Functions on the doubled, periodic axis are even or odd about both mirrors: even ones have no normal derivative
     there, odd ones vanish. So each mirror axis stands for a Neumann and a Dirichlet problem, and m mirror axes
-    for 2^m of them.
+    for 2^m of them. Likewise two copies of a domain, glued along all of the rim that has the mean, have even functions
+    (Neumann there) and odd ones (Dirichlet). The first problem is that of functions even in every respect.
     """
     choices = [
         [("neumann", "neumann"), ("dirichlet", "dirichlet")] if sides == ("mirror", "mirror") else [sides]
         for sides in boundary
     ]
-    return list(product(*choices))
+    mixed = list(product(*choices))
+    if not any("mean" in sides for sides in boundary):
+        return mixed
+    return [_replaced(problem, "mean", condition) for condition in ("neumann", "dirichlet") for problem in mixed]
+
+
+def _replaced(boundary: tuple[Sides, ...], old: Side, new: Side) -> tuple[Sides, ...]:
+    """Return the conditions, with another name for one of them."""
+    return tuple((new if low == old else low, new if high == old else high) for low, high in boundary)
 
 
 def reflect(field: TensorField, width: int) -> TensorField:

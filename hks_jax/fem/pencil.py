@@ -58,10 +58,10 @@ class Pencil(SymmetricPencil):
 
 
 class MirrorPencil(eqx.Module):
-    """The 2^m mixed Neumann/Dirichlet pencils of a domain reflected along m axes.
+    """The 2^m mixed Neumann/Dirichlet pencils of a domain doubled m times: reflected along axes, or along its rim.
 
-    Their spectra united are the spectrum of the reflected domain. An eigenfunction of a part, divided by √2^m, is
-    one of the reflected domain, restricted to the original.
+    Their spectra united are the spectrum of the doubled domain. An eigenfunction of a part, divided by √2^m, is
+    one of the doubled domain, restricted to the original.
     """
 
     parts: tuple[Pencil, ...]
@@ -83,7 +83,7 @@ class MirrorPencil(eqx.Module):
 
     @property
     def volume(self) -> Float[Array, ""]:
-        """The area or volume of the reflected domain."""
+        """The area or volume of the doubled domain."""
         return len(self.parts) * self.parts[0].volume
 
     def apply_stiffness(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
@@ -97,7 +97,7 @@ class MirrorPencil(eqx.Module):
     def among(
         self, images: Float[Array, "k n_dof"], vectors: Float[Array, "k n_dof"], part: Int[Array, " k"]
     ) -> Float[Array, "k k"]:
-        """Return the products of images with vectors on the reflected domain: parts do not mix."""
+        """Return the products of images with vectors on the doubled domain: parts do not mix."""
         products = len(self.parts) * jnp.matmul(images, vectors.T, precision="highest")
         return jnp.where(part[:, None] == part, products, 0)
 

@@ -1,64 +1,14 @@
-"""The rim of a domain, grid sides and mask alike: its length or area, and zero on all of it."""
+"""The rim of a domain, grid sides and mask alike: its length or area."""
 
 import math
-from itertools import product
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
 
 from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.domain.triangulation import FACETS
-from hks_jax.fem.assembly import free_couplings
-from hks_jax.fem.operators import StencilOperator
-from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import FunctionSpace, GridSpace
-
-
-@jax.tree_util.register_static
-class PinnedSpace(GridSpace):
-    """The functions of a grid's space that vanish on the whole rim of the domain, a mask's included."""
-
-    def __init__(self, space: GridSpace) -> None:
-        super().__init__(space.grid, space.boundary)
-        self.free = self.free & ~rim_nodes(space)
-        if not self.free.any():
-            raise ValueError("field: every node of the domain is on its rim; use a finer grid or a thicker mask")
-        self._key = (*self._key, "pinned")
-
-
-def pin_rim(pencil: Pencil) -> Pencil:
-    """Return the Dirichlet problem of a grid's pencil with consistent mass: zero at every node of the rim.
-
-    Unlike the boundary ``"dirichlet"`` this takes in the rim of a mask. Periodic axes stay periodic.
-    """
-    assert isinstance(pencil.stiffness, StencilOperator)
-    assert isinstance(pencil.mass, StencilOperator)
-    natural = pencil.stiffness.space
-    space = PinnedSpace(natural)
-    couplings = free_couplings(space)
-    stiffness, mass = (
-        StencilOperator(coefficients=jnp.where(couplings, operator.coefficients, 0), space=space)
-        for operator in (pencil.stiffness, pencil.mass)
-    )
-    resolution = pencil.resolution.mapped(lambda values: space.restrict(natural.extend(values)))
-    return Pencil(stiffness, mass, resolution, pencil.volume, space)
-
-
-def rim_nodes(space: GridSpace) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes of the domain that do not have all their 2^d elements."""
-    count = np.zeros(space.node_shape, dtype=int)
-    padded = space.elements
-    for axis, wraps in enumerate(space.periodic):
-        before = [(1, 0) if a == axis else (0, 0) for a in range(space.dimension)]
-        both = [(1, 1) if a == axis else (0, 0) for a in range(space.dimension)]
-        padded = np.pad(padded, before, mode="wrap") if wraps else np.pad(padded, both)
-    for start in product((0, 1), repeat=space.dimension):
-        count += padded[tuple(slice(s, s + n) for s, n in zip(start, space.node_shape, strict=True))]
-    return space.domain & (count < 2**space.dimension)
 
 
 def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
@@ -93,10 +43,9 @@ def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
     if space.periodic[axis]:
         rim, density = (array.take(range(n - 2), axis) for array in (rim, density))
     faces = np.where(rim, density, 0).sum(axis=tuple(others))
-    sign = np.ones(faces.size)
+    sign = np.full(faces.size, -1.0 if "dirichlet" in space.boundary[-1] else 1.0)
     for end, condition in zip((0, -1), space.boundary[axis], strict=True):
-        if condition == "dirichlet":
-            sign[end] = -1
+        sign[end] = -1 if condition == "dirichlet" else 1
     return float(faces @ sign)
 
 

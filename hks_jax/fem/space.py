@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.domain.components import active_elements, element_nodes, label_nodes
+from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
@@ -21,7 +21,8 @@ class FunctionSpace:
         dimension: the dimension of the manifold.
         domain: nodes of the domain, bool (*node_shape). Results are NaN elsewhere.
         free: nodes that carry a degree of freedom, bool (*node_shape). Dirichlet nodes are in the domain, not free.
-        boundary: the conditions per axis; ``(("neumann", "neumann"),)`` or its like for a mesh.
+        boundary: the conditions per axis and, last, on the rim of a mask; ``(("neumann", "neumann"),)`` or its like for
+            a mesh.
         n_components: the number of connected components of the domain.
     """
 
@@ -109,7 +110,7 @@ def _spread(
 
 @jax.tree_util.register_static
 class GridSpace(FunctionSpace):
-    """The Q1 space on a grid with given boundary conditions.
+    """The Q1 space on a grid with given boundary conditions, as `normalise_boundary` writes them.
 
     Attributes:
         grid: the grid.
@@ -120,7 +121,8 @@ class GridSpace(FunctionSpace):
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
         self.grid, self.boundary = grid, boundary
         self.node_shape, self.dimension = grid.shape, grid.dimension
-        self.periodic = tuple(sides == ("periodic", "periodic") for sides in boundary)
+        *axes, rim = boundary
+        self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)
         if any(wraps and n < 3 for wraps, n in zip(self.periodic, grid.shape, strict=True)):
             raise ValueError(f"boundary: a periodic axis needs at least 3 nodes; the grid has shape {grid.shape}")
         self.elements = active_elements(grid.inside, self.periodic)
@@ -128,13 +130,16 @@ class GridSpace(FunctionSpace):
         if not self.domain.any():
             raise ValueError("mask: no element has all its nodes inside; use a thicker mask or a finer grid")
         self.free = self.domain.copy()
-        for axis, sides in enumerate(boundary):
+        for axis, sides in enumerate(axes):
             for end, condition in zip((0, -1), sides, strict=True):
                 if condition == "dirichlet":
                     self.free[(slice(None),) * axis + (end,)] = False
+        if "dirichlet" in rim:
+            self.free &= ~rim_nodes(self.elements, self.periodic)
         if not self.free.any():
             raise ValueError(
-                f"boundary: every node of the domain is on a Dirichlet side (grid shape {grid.shape}); use a finer grid"
+                f"boundary: every node of the domain is on a Dirichlet side or rim (grid shape {grid.shape}); use a "
+                "finer grid or a thicker mask"
             )
         self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
         self._key = (grid, boundary)

@@ -22,9 +22,10 @@ def scalar_image(
     values: Real[ArrayLike, "nx ny"],
     grid: Grid,
     *,
-    cmap: str | Colormap = "viridis",
+    cmap: str | Colormap | None = None,
     vmin: float | None = None,
     vmax: float | None = None,
+    centre: float | None = None,
     quantiles: tuple[float, float] = (0.0, 1.0),
     least_range: float = 1e-6,
     colorbar: bool = True,
@@ -37,9 +38,11 @@ def scalar_image(
         ax: the axes to draw on.
         values: (*shape,), NaN where there is nothing to draw.
         grid: the 2D grid of the values.
-        cmap: colour map; use a perceptually uniform one.
+        cmap: colour map; None: viridis, or a diverging one, red above and blue below, where there is a centre.
         vmin: value of the first colour; None: from `quantiles`.
         vmax: value of the last colour; None: from `quantiles`.
+        centre: value of the middle colour where vmin and vmax do not say, such as 1 for 4πt·HKS, which it is where the
+            metric is flat: the colours reach as far above it as below.
         quantiles: the values' quantiles that take the first and the last colour where vmin and vmax do not
             say. The colour bar has arrows where values lie beyond.
         least_range: the least difference between the last colour's value and the first's, relative to the larger.
@@ -53,13 +56,13 @@ def scalar_image(
     """
     require_plane("grid", grid)
     array = masked("values", values, grid)
-    low, high = colour_range(array.compressed(), quantiles, least_range)
+    low, high = colour_range(array.compressed(), quantiles, least_range, centre)
     low, high = low if vmin is None else vmin, high if vmax is None else vmax
     image = ax.imshow(
         array.T,
         origin="lower",
         extent=cell_extent(grid),
-        cmap=cmap,
+        cmap=cmap or ("viridis" if centre is None else "RdBu_r"),
         vmin=low,
         vmax=high,
         **{"interpolation": "nearest", **kwargs},
@@ -79,9 +82,10 @@ def hks_panels(
     unit: str = "",
     shared_range: bool = False,
     path: str | os.PathLike[str] | None = None,
-    cmap: str | Colormap = "viridis",
+    cmap: str | Colormap | None = None,
     vmin: float | None = None,
     vmax: float | None = None,
+    centre: float | None = None,
     quantiles: tuple[float, float] = (0.0, 1.0),
     label: str = "",
     suptitle: str = "",
@@ -96,9 +100,10 @@ def hks_panels(
         unit: the unit of t, written after it.
         shared_range: whether all images use the colours of one range.
         path: where to save the figure; None: nowhere.
-        cmap: colour map.
+        cmap: colour map; None: as for `scalar_image`.
         vmin: value of the first colour of all images; None: see `shared_range`.
         vmax: value of the last colour of all images; likewise.
+        centre: value of the middle colour, as for `scalar_image`.
         quantiles: as for `scalar_image`.
         label: the colour bars' label.
         suptitle: the figure's title.
@@ -111,7 +116,7 @@ def hks_panels(
     images = [masked("values", v, grid) for v in np.asarray(values)]
     everything = np.concatenate([image.compressed() for image in images])
     if shared_range:
-        low, high = colour_range(everything, quantiles)
+        low, high = colour_range(everything, quantiles, centre=centre)
         vmin, vmax = low if vmin is None else vmin, high if vmax is None else vmax
 
     rows, columns = _layout(t.size)
@@ -121,7 +126,8 @@ def hks_panels(
         if index >= t.size:
             ax.remove()
             continue
-        scalar_image(ax, images[index], grid, cmap=cmap, vmin=vmin, vmax=vmax, quantiles=quantiles, label=label)
+        colours: dict[str, Any] = {"cmap": cmap, "vmin": vmin, "vmax": vmax, "centre": centre, "quantiles": quantiles}
+        scalar_image(ax, images[index], grid, label=label, **colours)
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
     if suptitle:
@@ -167,9 +173,14 @@ def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
     return masked
 
 
-def colour_range(values: np.ndarray, quantiles: tuple[float, float], least_range: float = 1e-6) -> tuple[float, float]:
+def colour_range(
+    values: np.ndarray, quantiles: tuple[float, float], least_range: float = 1e-6, centre: float | None = None
+) -> tuple[float, float]:
     """Return the values of the first and the last colour; see `scalar_image`."""
     low, high = (float(q) for q in np.quantile(values, quantiles))
+    if centre is not None:
+        reach = max(high - centre, centre - low, 0.0)
+        low, high = centre - reach, centre + reach
     lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
     return low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
 

@@ -2,23 +2,28 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
-from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
-from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.rim import pin_rim
+from hks_jax.fem.boundary import BoundarySpec, Sides, normalise_boundary
+from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.heat import hks_of_pairs
+from hks_jax.signatures.spectral import spectral_diagonal
+from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.truncation import warn_if_truncated
 
 
 def boundary_influence(
-    field: TensorField,
+    domain: TensorField | SimplicialMesh | Eigenpairs,
     times: Any,
-    k: int,
+    k: int | None = None,
     boundary: BoundarySpec = "neumann",
     solver: str | Eigensolver = "auto",
 ) -> Float[Array, "n_times *shape"]:
@@ -28,36 +33,59 @@ def boundary_influence(
     k_N ≥ k_D. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t): 1 on the rim, 0 where no
     heat has come back from it, whatever conditions are set there.
 
-    Differentiable with respect to the tensors. It takes the eigenpairs of two problems.
+    Differentiable with respect to the tensors. It takes the eigenpairs of two problems, which are also those of the
+    boundary ``"mean"``, whose signature is (k_N + k_D)/2.
 
     Args:
-        field: the metric, 2D or 3D.
+        domain: the metric, 2D or 3D; or a mesh; or eigenpairs with the boundary ``"mean"``, which hold both problems.
         times: (n_times,) positive, in (metric length)².
-        k: how many eigenpairs of either problem.
-        boundary: ``"neumann"`` or ``"periodic"``, one for all axes or one per axis.
+        k: how many eigenpairs of either problem; not with eigenpairs.
+        boundary: ``"neumann"`` or, the same here, ``"mean"``; on grids also ``"periodic"``, one for all axes or one per
+            axis. Not with eigenpairs.
         solver: as for `eigenpairs`.
 
     Returns:
         (n_times, *shape), 0 … 1, without unit; NaN outside the mask.
 
     Raises:
-        ValueError: another boundary; a domain with no rim, or with no node off it; what `eigenpairs` and `hks` refuse.
+        ValueError: another boundary, or other eigenpairs; a domain with no rim, or with no node off it; what
+            `eigenpairs` and `hks` refuse.
 
     Warns:
         AccuracyWarning: as `eigenpairs` and `hks` do.
     """
-    sides = normalise_boundary(boundary, field.grid.dimension)
-    if any(condition not in ("neumann", "periodic") for pair in sides for condition in pair):
+    if isinstance(domain, Eigenpairs):
+        if k is not None or boundary != "neumann":
+            raise ValueError("k, boundary: eigenpairs have them already; leave them out")
+        if len(domain.pencil.parts) != 2:
+            raise ValueError('domain: got eigenpairs of another boundary than "mean"; compute them with that')
+        times = checked_times("times", times, require_pairs(domain).eigenvalues.dtype)
+        warn_if_truncated(domain, times)
+        # Pairs that are not kept count as pairs with f = 0, also to derivatives.
+        halves = [eqx.tree_at(lambda p: p.kept, domain, domain.kept & (domain.part == i)) for i in range(2)]
+        free, zero = (spectral_diagonal(half, Heat(times)) for half in halves)
+    else:
+        if k is None:
+            raise ValueError("k: got None; say how many eigenpairs of either problem to compute")
+        pencil = assemble(domain, _glued(domain, boundary))
+        pairs = (eigenpairs(part, k, solver=solver, multiplet="complete") for part in pencil.parts)
+        free, zero = (hks_of_pairs(each, times) for each in pairs)
+    # Rounding where both are equal, and truncation where both are small, may leave the interval.
+    return jnp.clip((free - zero) / (free + zero), 0, 1)
+
+
+def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:
+    """Return the boundary that has the mean on all of the rim."""
+    allowed = ("neumann", "mean", "periodic")
+    if isinstance(domain, SimplicialMesh):
+        if boundary not in allowed[:2]:
+            raise ValueError(f'boundary: got {boundary!r}; a mesh takes "neumann" here')
+        return "mean"
+    sides = normalise_boundary(boundary, domain.grid.dimension)
+    if any(condition not in allowed for pair in sides for condition in pair):
         raise ValueError(
             f'boundary: got {boundary!r}; expected "neumann" or "periodic" for each axis: natural and Dirichlet '
             "conditions on all sides that are not periodic are compared"
         )
-    natural = assemble(field, boundary)
-    assert isinstance(natural, Pencil)
-    pinned = pin_rim(natural)
-    if pinned.space.n_dof == natural.space.n_dof:
-        raise ValueError(f"boundary: got {boundary!r}; the domain has no rim whose influence could be seen")
-    pairs = (eigenpairs(pencil, k, solver=solver, multiplet="complete") for pencil in (natural, pinned))
-    free, zero = (hks_of_pairs(each, times) for each in pairs)
-    # Rounding where both are equal, and truncation where both are small, may leave the interval.
-    return jnp.clip((free - zero) / (free + zero), 0, 1)
+    mean: Sides = ("mean", "mean")
+    return tuple(pair if pair == ("periodic", "periodic") else mean for pair in sides)

@@ -82,7 +82,7 @@ class Applied(Contraction):
 
     Attributes:
         functionals: (s, n).
-        part: (k,) the part of a mirrored problem that a function is of; the functionals act on those of part 0.
+        part: (k,) the part of a doubled problem that a function is of; the functionals act on those of part 0.
     """
 
     functionals: Float[Array, "s n"]

@@ -24,7 +24,8 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
 
     Args:
         pairs: from `eigenpairs`. Their boundary conditions hold for u, too: with ``"dirichlet"`` its values there are
-            not used. With ``"mirror"`` u is continued evenly, which is the flow with ``"neumann"`` on those sides.
+            not used. With ``"mirror"`` and ``"mean"`` u is continued evenly, which is the flow with ``"neumann"``
+            there.
         times: (n_times,) positive, in (metric length)².
         functions: (*shape), or several (…, *shape); values outside the mask are not used.
 

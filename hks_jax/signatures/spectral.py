@@ -45,9 +45,9 @@ def spectral_flow(
 ) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x) ∫φᵢu for each of m filters and s functions u; NaN outside the mask.
 
-    Under "mirror" the functions are continued evenly, as the metric is.
+    Under "mirror" and "mean" the functions are continued evenly, as the metric is.
     """
-    # Inner products over the reflected domain: twice those over the domain for each mirror, and 0 with odd functions.
+    # Inner products over the doubled domain: twice those over the domain for each doubling, and 0 with odd functions.
     part = pairs.pencil.parts[0]
     functionals = len(pairs.pencil.parts) * part.mass.apply(pairs.space.restrict(functions))
     return pairs.space.extend(_kernel(Applied(functionals, pairs.part), filters, pairs))
@@ -88,7 +88,7 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
 # xᵢ the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept count as pairs
-# with f = 0. Under "mirror" pairs of different parts do not mix.
+# with f = 0. Under "mirror" and "mean" pairs of different parts do not mix.
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents

@@ -39,7 +39,7 @@ def varadhan_distance(
 
     Args:
         pairs: from `eigenpairs`; more of them reach further. Distances are those within the domain: around holes of its
-            mask, across periodic sides. Under ``"mirror"`` straight sides have no effect.
+            mask, across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
         times: (n_times,) positive, in (metric length)²; about d·h for distances d.
         sources: node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers (n_sources,).
         normalised: whether to divide by the diagonal. False is the formula as it stands, which depends on the unit of

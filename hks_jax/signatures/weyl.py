@@ -45,6 +45,6 @@ def weyl_count(
     shape = domain.grid.shape if isinstance(domain, TensorField) else (len(domain.vertices),)
     if shape != pencil.space.node_shape:
         raise ValueError(f"domain: got one of shape {shape}; expected that of the problem, {pencil.space.node_shape}")
-    # The mixed problems that make up a mirrored domain have opposite conditions on its mirrors.
+    # The problems that make up a doubled domain have opposite conditions where it was doubled.
     rim = sum(rim_measure(domain, part.space) for part in pencil.parts)
     return weyl_number(numbers, float(pencil.volume), d, rim)

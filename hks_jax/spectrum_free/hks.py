@@ -68,7 +68,7 @@ def hks_spectrum_free(
     require_number("tolerance", tolerance, 1)
     settings = choose_method(pencil, times, method, tolerance)
     values = [_diagonal(part, times, settings, checked=isinstance(method, Colouring)) for part in pencil.parts]
-    # On a reflected domain, heat that starts at a node is even and odd by halves.
+    # On a doubled domain, heat that starts at a node is even and odd by halves.
     return jnp.mean(jnp.stack(values), axis=0)
 
 
