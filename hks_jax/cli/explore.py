@@ -1,0 +1,188 @@
+"""``hks-jax explore OUT``: a page to explore what ``hks-jax hks`` has computed."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.progress import Progress
+from hks_jax.npz import load_npz
+
+DESCRIPTION = """\
+Write a page to explore the signature that 'hks-jax hks' has left in the folder OUT: one HTML file that any browser opens,
+without a network. It has sliders for t and the slice, maps of the tensors beside the signature, the curves of
+the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV.
+"""
+
+EPILOG = """\
+examples:
+  hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse --times auto:24
+  hks-jax explore out
+  hks-jax explore out -o page.html --labels atlas.nii.gz --names names.tsv --title "Subject 7"
+"""
+
+LETTERS = (("L", "R"), ("P", "A"), ("I", "S"))
+"""What lies at the low and the high end of NIfTI's world axes: left, right, posterior, anterior, inferior, superior."""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand's parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "explore",
+        help="write a page to explore a signature in a browser",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("result", metavar="OUT", type=Path, help="the folder that 'hks-jax hks' wrote, or an .npz from there")
+    add("-o", "--output", metavar="PAGE", type=Path, help="the page (default: explore.html in OUT)")
+    add(
+        "--labels",
+        metavar="FILE",
+        type=Path,
+        help="regions: whole numbers on the same voxels, 0 for none (NIfTI, .npy)",
+    )
+    add("--names", metavar="FILE", type=Path, help="names of the labels: lines of a number, a tab or space, and a name")
+    add("--title", help="the page's title (default: the name of the tensors' file)")
+    add("--unit", help="the unit of t (default: s for D⁻¹ of tensors fitted here, else none)")
+    add_json_argument(parser)
+    return parser
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the subcommand.
+
+    Raises:
+        FileNotFoundError: no such result, labels or names.
+        ValueError: a result that cannot be shown, or labels that do not fit it.
+    """
+    from hks_jax.cli.outputs import check_folder
+    from hks_jax.cli.plot import read_saved
+    from hks_jax.io.labels import read_labels
+    from hks_jax.plot import explore
+
+    source = args.result / "hks.npz" if args.result.is_dir() else args.result
+    page = source.with_name("explore.html") if args.output is None else args.output
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"--output: got {page}; expected a name that ends in .html")
+    if args.names is not None and args.labels is None:
+        raise ValueError("--names: it names labels; pass --labels too")
+    check_folder(page.parent)
+    progress = Progress(args.quiet)
+    with progress.catching_warnings():
+        with progress.stage("reading", str(source)):
+            more = load_npz(source)
+            if "faces" in more or "cells" in more:
+                raise ValueError(
+                    f"{source}: a signature on a mesh; expected one on a grid. ParaView shows the .vtu beside it"
+                )
+            saved = read_saved(source, "hks")
+            if saved.times is None:
+                raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
+            place = _Place.of(more, saved.grid.dimension)
+            labels = None
+            if args.labels is not None:
+                labels = read_labels(args.labels, saved.grid.shape, place.affine, place.slice_axis)
+            names = None if args.names is None else read_names(args.names)
+        about = _About.of(more)
+        with progress.stage("writing", str(page)):
+            explore(
+                saved.values,
+                saved.times,
+                saved.grid,
+                page,
+                tensors=more.get("input_tensors"),
+                labels=labels,
+                label_names=names,
+                normalisation=about.settings.get("normalisation", "raw"),
+                title=args.title or about.title or source.parent.name,
+                facts=_facts(about, saved.grid.shape, place.slice_axis),
+                unit=about.unit if args.unit is None else args.unit,
+                length_unit="" if place.affine is None else "mm",
+                ends=place.ends,
+            )
+    if args.json:
+        print(json.dumps({"source": str(source), "times": saved.times.tolist(), "files": [str(page)]}))
+    elif not args.quiet:
+        print(page)
+
+
+class _Place(NamedTuple):
+    """Where the grid lies in space, and what lies at the ends of its axes."""
+
+    affine: np.ndarray | None
+    slice_axis: int | None
+    ends: list[tuple[str, str]] | None
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray], dimension: int) -> "_Place":
+        affine = arrays.get("affine")
+        slice_axis = int(arrays["slice_axis"]) if "slice_axis" in arrays else None
+        if affine is None:
+            return cls(None, slice_axis, None)
+        thin = 2 if slice_axis is None else slice_axis
+        axes = [a for a in range(3) if dimension == 3 or a != thin]
+        return cls(affine, slice_axis, [_ends(affine[:3, a]) for a in axes])
+
+
+def _ends(direction: np.ndarray) -> tuple[str, str]:
+    """Return what lies at the low and the high end of an axis, by the world axis that it is nearest to."""
+    world = int(np.argmax(np.abs(direction)))
+    low, high = LETTERS[world]
+    return (low, high) if direction[world] > 0 else (high, low)
+
+
+class _About(NamedTuple):
+    """What the result says of its origin."""
+
+    settings: dict[str, Any]
+    title: str
+    unit: str
+    k: int | None
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray]) -> "_About":
+        record = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
+        settings = record.get("settings") or {}
+        # Fitted tensors are in mm²/s, and their grids in mm.
+        seconds = record.get("order") == "fit" and settings.get("metric") == "inverse"
+        k = len(arrays["eigenvalues"]) if "eigenvalues" in arrays else None
+        return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", k)
+
+
+def _facts(about: _About, shape: tuple[int, ...], slice_axis: int | None) -> dict[str, Any]:
+    settings, words = about.settings, {"tensor": "D itself", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
+    facts: dict[str, Any] = {"grid": " × ".join(map(str, shape))}
+    if slice_axis is not None:
+        facts["slice"] = f"across {'xyz'[slice_axis]}"
+    if settings.get("metric"):
+        facts["metric"] = words.get(settings["metric"], settings["metric"])
+    if settings.get("boundary"):
+        boundary = settings["boundary"]
+        facts["boundary"] = boundary if isinstance(boundary, str) else json.dumps(boundary)
+    if about.k is not None and settings.get("method", "spectral") == "spectral":
+        facts["eigenpairs"] = about.k
+    return facts
+
+
+def read_names(path: Path) -> dict[int, str]:
+    """Read lines of a number and a name; further columns, as FreeSurfer's tables of colours have them, belong to the name.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no line begins with a number.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    names = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        number, *words = line.split(None, 1)[:2] or [""]
+        if number.lstrip("-").isdecimal() and words:
+            names[int(number)] = words[0].strip()
+    if not names:
+        raise ValueError(f"{path}: no line has a number and a name; expected lines such as '17 left hippocampus'")
+    return names
