@@ -34,7 +34,7 @@ class Browser:
         to_browser, self._out = os.pipe()
         self._in, from_browser = os.pipe()
         options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe"]
-        options += ["--disable-background-networking", f"--user-data-dir={folder}", "about:blank"]
+        options += ["--disable-background-networking", "--hide-scrollbars", f"--user-data-dir={folder}", "about:blank"]
         # The browser reads commands from its file descriptor 3 and writes to 4.
         script = f'exec "$0" "$@" 3<&{to_browser} 4>&{from_browser}'
         self.process = subprocess.Popen(
@@ -134,7 +134,8 @@ class Browser:
     def box(self, selector):
         """Return x, y, width and height of an element in the window, scrolled to it."""
         return self.run(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)}); e.scrollIntoView({{block: 'center'}});"
+            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
+            "e.scrollIntoView({block: 'center'});"
             "const b = e.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })()"
         )
 

@@ -12,8 +12,8 @@ from hks_jax.cli.progress import Progress
 from hks_jax.npz import load_npz
 
 DESCRIPTION = """\
-Write a page to explore the signature that 'hks-jax hks' has left in the folder OUT: one HTML file that any browser opens,
-without a network. It has sliders for t and the slice, maps of the tensors beside the signature, the curves of
+Write a page to explore the signature that 'hks-jax hks' has left in the folder OUT: one HTML file that any browser
+opens, without a network. It has sliders for t and the slice, maps of the tensors beside the signature, the curves of
 the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV.
 """
 
@@ -23,9 +23,6 @@ examples:
   hks-jax explore out
   hks-jax explore out -o page.html --labels atlas.nii.gz --names names.tsv --title "Subject 7"
 """
-
-LETTERS = (("L", "R"), ("P", "A"), ("I", "S"))
-"""What lies at the low and the high end of NIfTI's world axes: left, right, posterior, anterior, inferior, superior."""
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -100,10 +97,10 @@ def run(args: argparse.Namespace) -> None:
                 label_names=names,
                 normalisation=about.settings.get("normalisation", "raw"),
                 title=args.title or about.title or source.parent.name,
-                facts=_facts(about, saved.grid.shape, place.slice_axis),
+                facts=_facts(about, saved.grid.shape),
                 unit=about.unit if args.unit is None else args.unit,
                 length_unit="" if place.affine is None else "mm",
-                ends=place.ends,
+                world=place.world,
             )
     if args.json:
         print(json.dumps({"source": str(source), "times": saved.times.tolist(), "files": [str(page)]}))
@@ -112,11 +109,11 @@ def run(args: argparse.Namespace) -> None:
 
 
 class _Place(NamedTuple):
-    """Where the grid lies in space, and what lies at the ends of its axes."""
+    """Where the grid lies in space: the affine of its volume, the axis that it cuts, and what its indices become."""
 
     affine: np.ndarray | None
     slice_axis: int | None
-    ends: list[tuple[str, str]] | None
+    world: np.ndarray | None
 
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray], dimension: int) -> "_Place":
@@ -125,15 +122,7 @@ class _Place(NamedTuple):
         if affine is None:
             return cls(None, slice_axis, None)
         thin = 2 if slice_axis is None else slice_axis
-        axes = [a for a in range(3) if dimension == 3 or a != thin]
-        return cls(affine, slice_axis, [_ends(affine[:3, a]) for a in axes])
-
-
-def _ends(direction: np.ndarray) -> tuple[str, str]:
-    """Return what lies at the low and the high end of an axis, by the world axis that it is nearest to."""
-    world = int(np.argmax(np.abs(direction)))
-    low, high = LETTERS[world]
-    return (low, high) if direction[world] > 0 else (high, low)
+        return cls(affine, slice_axis, affine[:3, [a for a in range(4) if dimension == 3 or a != thin]])
 
 
 class _About(NamedTuple):
@@ -142,6 +131,7 @@ class _About(NamedTuple):
     settings: dict[str, Any]
     title: str
     unit: str
+    cut: str
     k: int | None
 
     @classmethod
@@ -151,14 +141,17 @@ class _About(NamedTuple):
         # Fitted tensors are in mm²/s, and their grids in mm.
         seconds = record.get("order") == "fit" and settings.get("metric") == "inverse"
         k = len(arrays["eigenvalues"]) if "eigenvalues" in arrays else None
-        return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", k)
+        cuts = [
+            note.partition(":")[0].removeprefix("slice ") for note in record.get("notes", ()) if "slice " in note[:6]
+        ]
+        return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", "".join(cuts[-1:]), k)
 
 
-def _facts(about: _About, shape: tuple[int, ...], slice_axis: int | None) -> dict[str, Any]:
+def _facts(about: _About, shape: tuple[int, ...]) -> dict[str, Any]:
     settings, words = about.settings, {"tensor": "D itself", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
     facts: dict[str, Any] = {"grid": " × ".join(map(str, shape))}
-    if slice_axis is not None:
-        facts["slice"] = f"across {'xyz'[slice_axis]}"
+    if about.cut:
+        facts["slice"] = about.cut
     if settings.get("metric"):
         facts["metric"] = words.get(settings["metric"], settings["metric"])
     if settings.get("boundary"):
@@ -170,7 +163,7 @@ def _facts(about: _About, shape: tuple[int, ...], slice_axis: int | None) -> dic
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Read lines of a number and a name; further columns, as FreeSurfer's tables of colours have them, belong to the name.
+    """Read lines of a number and a name, which may have several words.
 
     Raises:
         FileNotFoundError: no such file.

@@ -68,7 +68,7 @@ def _at_voxels(
     inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
     if apart > NEAR or not inside:
         raise ValueError(
-            f"{name}: its affine places the labels on other voxels than the image's; expected the image's own. Resample "
-            "them to the image, by the nearest neighbour"
+            f"{name}: its affine places the labels on other voxels than the image's; expected the image's own. "
+            "Resample them to the image, by the nearest neighbour"
         )
     return values[box].reshape(shape)

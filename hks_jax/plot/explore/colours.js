@@ -27,7 +27,7 @@ function showBar(bar, scale, centre) {
   const middle = centre ?? (scale.low + scale.high) / 2;
   for (const value of [scale.low, middle, scale.high]) {
     const tick = document.createElement("span");
-    tick.textContent = number(value, Math.max(Math.abs(scale.low), Math.abs(scale.high)));
+    tick.textContent = tickText(value, Math.max(Math.abs(scale.low), Math.abs(scale.high)));
     ticks.append(tick);
   }
   bar.replaceChildren(strip, ticks);
@@ -40,13 +40,16 @@ function number(x, largest = Math.abs(x)) {
   if (!Number.isFinite(x)) return "–";
   if (x === 0 || Math.abs(x) < 1e-6 * largest) return "0";
   const exponent = Math.floor(Math.log10(largest) + 1e-9);
-  if (exponent >= 5 || exponent < -3) {
+  if (exponent >= 4 || exponent < -3) {
     const digits = (x / 10 ** exponent).toFixed(2).replace(/\.?0+$/, "");
     const tens = `10${raised(String(exponent))}`;
     return (digits === "1" ? tens : `${digits}·${tens}`).replace("-", "−");
   }
   return x.toFixed(Math.max(0, 2 - exponent)).replace("-", "−");
 }
+
+// A round number, without the zeros at its end.
+const tickText = (x, largest) => number(x, largest).replace(/\.(\d*?)0+$/, (_, kept) => (kept ? `.${kept}` : ""));
 
 const withUnit = (text, unit) => (unit ? `${text} ${unit}` : text);
 const timeText = (t) => withUnit(number(times[t]), about.unit);

@@ -14,7 +14,7 @@ function ticksOfLogarithm(low, high, most) {
     for (const m of [1, 2, 5]) all.push({ m, x: m * 10 ** e });
   }
   const seen = all.filter(({ x }) => x >= low * 0.999 && x <= high * 1.001);
-  for (const kept of [[1, 2, 5], [1, 3], [1]]) {
+  for (const kept of [[1, 2, 5], [1, 5], [1]]) {
     const found = seen.filter(({ m }) => kept.includes(m));
     if (found.length <= most && found.length > 0) return found.map(({ x }) => x);
   }
@@ -60,8 +60,8 @@ class Chart {
     const height = this.svg.clientHeight || 320;
     this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
     const all = series.flatMap((one) => [...one.line, ...(one.low ?? []), ...(one.high ?? [])]).filter(Number.isFinite);
-    const log = Boolean(quantity.log) && Math.min(...all) > 0;
     let [low, high] = [Math.min(...all), Math.max(...all)];
+    const log = low > 0 && (Boolean(quantity.log) || high > 6 * low);
     if (log) [low, high] = [low / 1.1, high * 1.1];
     else {
       if (quantity.centre !== null) [low, high] = [Math.min(low, quantity.centre), Math.max(high, quantity.centre)];
@@ -78,12 +78,12 @@ class Chart {
     shade(this.x(to), this.right);
     for (const tick of log ? ticksOfLogarithm(low, high, 7) : ticksOfNumbers(low, high, 6)) {
       parts.push(shapeOf("line", { class: "grid", x1: this.left, x2: this.right, y1: y(tick), y2: y(tick) }));
-      parts.push(shapeOf("text", { x: this.left - 6, y: y(tick) + 4, "text-anchor": "end" }, number(tick, log ? tick : Math.max(Math.abs(low), Math.abs(high)))));
+      parts.push(shapeOf("text", { x: this.left - 6, y: y(tick) + 4, "text-anchor": "end" }, tickText(tick, log ? tick : Math.max(Math.abs(low), Math.abs(high)))));
     }
     for (const tick of ticksOfLogarithm(times[0], times[times.length - 1], Math.max(2, Math.floor(width / 90)))) {
       const x = this.left + (this.right - this.left) * this.fraction(tick);
       parts.push(shapeOf("line", { class: "grid", x1: x, x2: x, y1: this.top, y2: this.bottom }));
-      parts.push(shapeOf("text", { x, y: this.bottom + 17, "text-anchor": "middle" }, number(tick)));
+      parts.push(shapeOf("text", { x, y: this.bottom + 17, "text-anchor": "middle" }, tickText(tick)));
     }
     const label = withUnit("t", about.unit && `in ${about.unit}`);
     parts.push(shapeOf("text", { x: (this.left + this.right) / 2, y: height - 5, "text-anchor": "middle" }, label));
@@ -95,7 +95,7 @@ class Chart {
       parts.push(shapeOf("polygon", { points, style: `fill: var(${one.colour}); opacity: 0.18` }));
     }
     for (const one of series) {
-      const drawn = `fill: none; stroke: var(${one.colour}); stroke-width: ${one.thin ? 1.6 : 2.4}; stroke-linejoin: round`;
+      const drawn = `fill: none; stroke: var(${one.colour}); stroke-width: ${one.thin ? 1.6 : 2.4}; stroke-linejoin: round; stroke-dasharray: ${one.dashes ?? "none"}`;
       parts.push(shapeOf("polyline", { points: path(one.line).join(" "), style: drawn, "data-name": one.name }));
       const dot = `fill: var(${one.colour})`;
       parts.push(shapeOf("circle", { cx: this.x(now), cy: y(one.line[now]), r: 3.5, style: dot }));
@@ -109,7 +109,7 @@ class Chart {
   entry(one) {
     const item = document.createElement("li");
     const mark = document.createElement("i");
-    mark.style.background = `var(${one.colour})`;
+    mark.style.borderTop = `0.2rem ${one.dashes ? "dashed" : "solid"} var(${one.colour})`;
     item.append(mark, one.note ? `${one.name} (${one.note})` : one.name);
     return item;
   }

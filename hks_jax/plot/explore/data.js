@@ -41,7 +41,12 @@ function placeAt(node) {
 }
 
 const voxel = (place) => about.offset.map((o, a) => o + place[a]);
-const position = (place) => voxel(place).map((i, a) => about.origin[a] + i * about.spacing[a]);
+
+function position(place) {
+  const index = voxel(place);
+  if (!about.world) return index.map((i, a) => about.origin[a] + i * about.spacing[a]);
+  return about.world.map((row) => index.reduce((sum, i, a) => sum + row[a] * i, row[dimension]));
+}
 
 const mean = times.map((_, t) => {
   let sum = 0;

@@ -32,7 +32,8 @@ function signatureScale() {
   const stretch = 2 ** -element("contrast").value;
   if (quantity.centre !== null) {
     const halves = spans.map(([half]) => half).sort((a, b) => a - b);
-    const half = Math.max(halves[halves.length >> 1] * stretch, 1e-6);
+    // Signatures are positive: 0 is as far below 1 as 2 is above.
+    const half = Math.max(Math.min(halves[halves.length >> 1], 1) * stretch, 1e-6);
     return scaleOf("diverging", quantity.centre - half, quantity.centre + half);
   }
   const [low, high] = [Math.min(...spans.map((s) => s[0])), Math.max(...spans.map((s) => s[1]))];
@@ -147,7 +148,7 @@ function seriesShown() {
     shown.push({ name: "region", note: `${region.note}; mean ± standard deviation`, colour: "--region", line, ...band, found });
   }
   for (const [name, place] of Object.entries(points)) {
-    if (place) shown.push({ name, note: `node ${voxel(place).join(", ")}`, colour: `--${name.toLowerCase()}`, line: curve(nodeAt(place), quantity) });
+    if (place) shown.push({ name, note: `node ${voxel(place).join(", ")}`, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line: curve(nodeAt(place), quantity) });
   }
   return shown;
 }
@@ -169,7 +170,7 @@ function save() {
 function showPoints() {
   const names = ["A", "B"].filter((name) => state.points[name]);
   const rows = [["", ...names], ["node", ...names.map((name) => voxel(state.points[name]).join(", "))]];
-  rows.push([withUnit("position", about.lengthUnit && `in ${about.lengthUnit}`), ...names.map((name) => position(state.points[name]).map((x) => number(x, Math.max(1, Math.abs(x)))).join(", "))]);
+  rows.push([withUnit("position", about.lengthUnit && `in ${about.lengthUnit}`), ...names.map((name) => position(state.points[name]).map((x) => number(x, Math.max(100, Math.abs(x)))).join(", "))]);
   const nodes = names.map((name) => nodeAt(state.points[name]));
   rows.push([`${state.quantity.name} at t`, ...nodes.map((n) => number(signatureAt(n)))]);
   for (const layer of layers) rows.push([layer.name, ...nodes.map((n) => layerText(layer, n))]);

@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -24,6 +24,8 @@ from hks_jax.signatures.heat import Normalisation
 SCRIPTS = ("data", "colours", "image", "curves", "regions", "controls", "main")
 """The page's scripts, in the order in which they need one another."""
 COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_r", "grey": "gray"}
+LETTERS = ("LR", "PA", "IS")
+"""What lies at the low and the high end of the world's axes."""
 LIMIT = 256 * 1024**2
 """Bytes of numbers in a page at most. They are a text a third longer, and browsers hold no text of over 512 MiB."""
 
@@ -43,15 +45,15 @@ def explore(
     facts: Mapping[str, Any] | None = None,
     unit: str = "",
     length_unit: str = "",
-    ends: Sequence[tuple[str, str]] | None = None,
+    world: Real[ArrayLike, "3 d_and_1"] | None = None,
 ) -> Path:
     """Write a page to explore a signature on a grid: one HTML file that opens in any browser, without a network.
 
-    It shows the signature with sliders for t and, of a volume, the slice; beside it maps of the tensors. A chosen point,
-    by a click or with the arrow keys, draws its signature over t, and colours all others by the distance of their
-    curves to its own (Sun, Ovsjanikov and Guibas 2009): the root mean square over log t of the difference of the two
-    signatures, each relative to the mean over the domain. Two points can be compared; a lasso, the points alike, or a label give a
-    region's mean curve and its spread. Curves can be saved as CSV.
+    It shows the signature with sliders for t and, of a volume, the slice; beside it maps of the tensors. A point that
+    is chosen, by a click or with the arrow keys, draws its signature over t, and colours all others by the distance of
+    their curves to its own (Sun, Ovsjanikov and Guibas 2009): the root mean square over log t of the difference of the
+    two signatures, each relative to the mean over the domain. Two points can be compared; a lasso, the points alike, or
+    a label give a region's mean curve and its spread. Curves can be saved as CSV.
 
     The numbers are in the file in single precision: 4 bytes and a third for each node inside, time and map.
 
@@ -70,17 +72,21 @@ def explore(
         title: the page's title.
         facts: what else the page should say of the data, by name.
         unit: the unit of t.
-        length_unit: the unit of the grid's coordinates.
-        ends: for each axis what lies at its low and its high end, such as ``("L", "R")``.
+        length_unit: the unit of lengths, in the grid or in `world`.
+        world: (3, d + 1), node indices to coordinates in space, the last column those of node 0: positions are then
+            given there, and the sides of the images named by L and R, P and A, I and S, for coordinates that grow to
+            the right, the front and the top, as NIfTI's do.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: shapes that do not agree, times that do not increase, nothing finite, or more numbers than a browser
-            can open.
+        ValueError: shapes that do not agree, times that do not increase, nothing finite, an unknown normalisation, or
+            more numbers than a browser can open.
     """
     t, array = _checked(values, times, grid)
+    if normalisation not in get_args(Normalisation):
+        raise ValueError(f"normalisation: got {normalisation!r}; expected one of {', '.join(get_args(Normalisation))}")
     inside = grid.inside & np.isfinite(array).all(axis=0)
     if not inside.any():
         raise ValueError("values: nothing is finite inside the grid's mask at all times; nothing to show")
@@ -103,7 +109,7 @@ def explore(
         "offset": low,
         "spacing": grid.spacing,
         "origin": grid.origin,
-        "ends": ends,
+        **_in_space(world, grid.dimension),
         "unit": unit,
         "lengthUnit": length_unit,
         "times": t.tolist(),
@@ -126,8 +132,8 @@ def _checked(values: Any, times: Any, grid: Grid) -> tuple[np.ndarray, np.ndarra
         raise ValueError(f"times: got {times}; expected positive numbers that increase, at least one")
     if array.shape != (t.size, *grid.shape):
         raise ValueError(
-            f"values: got shape {array.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}, as hks_jax.hks "
-            "returns them"
+            f"values: got shape {array.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}, as "
+            "hks_jax.hks returns them"
         )
     return t, array
 
@@ -150,6 +156,20 @@ def _deep_node(inside: Bool[np.ndarray, "*shape"]) -> list[int]:
         middle = np.abs(np.arange(inside.shape[2]) - int(np.median(np.nonzero(inside)[2])))
         depth = np.where(middle == 0, depth, -1.0)
     return [int(i) for i in np.unravel_index(int(np.argmax(depth)), inside.shape)]
+
+
+def _in_space(world: Any, d: int) -> dict[str, Any]:
+    """Return where the nodes are, and the names of the grid's sides, each by the world axis that it is nearest to."""
+    if world is None:
+        return {"world": None, "ends": None}
+    matrix = np.asarray(world, dtype=np.float64)
+    if matrix.shape != (3, d + 1) or not np.isfinite(matrix).all():
+        raise ValueError(f"world: got shape {matrix.shape}; expected (3, d + 1) = {(3, d + 1)}, finite")
+    ends = []
+    for direction in matrix[:, :d].T:
+        axis = int(np.argmax(np.abs(direction)))
+        ends.append(LETTERS[axis] if direction[axis] > 0 else LETTERS[axis][::-1])
+    return {"world": matrix.tolist(), "ends": ends}
 
 
 def _colour_table(name: str) -> str:
