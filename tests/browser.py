@@ -3,6 +3,7 @@
 https://chromedevtools.github.io/devtools-protocol describes the commands and events.
 """
 
+import contextlib
 import json
 import os
 import select
@@ -26,6 +27,7 @@ class Browser:
     """A browser with one page.
 
     Attributes:
+        folder: for the browser's own files and what it downloads.
         problems: errors, warnings and messages of the page, in words.
         requests: the addresses that the page asked for.
     """
@@ -45,9 +47,12 @@ class Browser:
         )
         os.close(to_browser)
         os.close(from_browser)
+        self.folder = Path(folder)
         self._number, self._rest, self._session = 0, b"", None
         self.problems, self.requests = [], []
         target = next(one for one in self.send("Target.getTargets")["targetInfos"] if one["type"] == "page")
+        # Downloads belong to the browser, all else from here on to its page.
+        self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
         self._session = self.send("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
@@ -57,6 +62,10 @@ class Browser:
         return self
 
     def __exit__(self, *error):
+        self._session = None
+        with contextlib.suppress(Exception):  # it may have ended
+            self.send("Browser.close")
+            self.process.wait(10)
         self.process.kill()
         self.process.wait()
         os.close(self._in)
