@@ -104,6 +104,7 @@ def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(
         ({"labels": np.zeros(SHAPE)}, "labels: 0 everywhere"),
         ({"labels": np.zeros((3, 3))}, "labels: got shape"),
         ({"normalisation": "flatt"}, "normalisation: got 'flatt'"),
+        ({"lengths": TIMES[1:]}, r"lengths: got shape \(6,\)"),
         ({"world": np.eye(4)}, "world: got shape"),
     ],
 )
@@ -161,6 +162,8 @@ def test_the_command_reads_a_result_with_labels_in_space(result, capsys):
     about = json.loads(re.search(r'id="about">([^<]*)<', text)[1])
     assert about["labels"] == [[17, "left half"]]
     assert about["ends"] == ["PA", "RL"]  # the first axis runs to the front, the second to the left
+    medians = np.median(np.trace(tensors()[np.isfinite(signature()[0])], axis1=-2, axis2=-1)) / 2
+    np.testing.assert_allclose(about["lengths"], np.sqrt(medians * TIMES), rtol=1e-5)
     assert about["world"] == [[0, -2, 5], [2, 0, -3], [0, 0, -5]]
     assert dict(about["facts"]) == {
         "grid": "24 × 18", "slice": "z = 2", "metric": "D⁻¹", "boundary": "neumann", "eigenpairs": "9",

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.plot import Saved, read_saved
 from hks_jax.cli.progress import Progress
 from hks_jax.npz import load_npz
 
@@ -58,7 +59,6 @@ def run(args: argparse.Namespace) -> None:
         ValueError: a result that cannot be shown, or labels that do not fit it.
     """
     from hks_jax.cli.outputs import check_folder
-    from hks_jax.cli.plot import read_saved
     from hks_jax.io.labels import read_labels
     from hks_jax.plot import explore
 
@@ -99,6 +99,7 @@ def run(args: argparse.Namespace) -> None:
                 title=args.title or about.title or source.parent.name,
                 facts=_facts(about, saved.grid.shape),
                 unit=about.unit if args.unit is None else args.unit,
+                lengths=_spread(more.get("input_tensors"), saved, about),
                 length_unit="" if place.affine is None else "mm",
                 world=place.world,
             )
@@ -145,6 +146,15 @@ class _About(NamedTuple):
             note.partition(":")[0].removeprefix("slice ") for note in record.get("notes", ()) if "slice " in note[:6]
         ]
         return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", "".join(cuts[-1:]), k)
+
+
+def _spread(tensors: np.ndarray | None, saved: Saved, about: _About) -> np.ndarray | None:
+    """Return √(Dt), where t is the time of a diffusion: with the median of the mean diffusivity inside."""
+    if tensors is None or about.settings.get("metric") != "inverse":
+        return None
+    inside = np.isfinite(saved.values[0])
+    diffusivity = float(np.median(np.trace(tensors[inside], axis1=-2, axis2=-1))) / saved.grid.dimension
+    return np.sqrt(diffusivity * saved.times) if diffusivity > 0 and saved.times is not None else None
 
 
 def _facts(about: _About, shape: tuple[int, ...]) -> dict[str, Any]:

@@ -52,4 +52,5 @@ function number(x, largest = Math.abs(x)) {
 const tickText = (x, largest) => number(x, largest).replace(/\.(\d*?)0+$/, (_, kept) => (kept ? `.${kept}` : ""));
 
 const withUnit = (text, unit) => (unit ? `${text} ${unit}` : text);
+const spreadText = (t) => (about.lengths ? ` (√(Dt) ≈ ${withUnit(tickText(Number(about.lengths[t].toPrecision(2))), about.lengthUnit)})` : "");
 const timeText = (t) => withUnit(number(times[t]), about.unit);

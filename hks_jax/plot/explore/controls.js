@@ -58,6 +58,7 @@ function setUp() {
   options(element("quantity"), quantities.map((q) => q.name));
   options(element("layer-name"), layers.map((layer) => layer.name));
   options(element("region"), [...REGIONS, ...about.labels.map(([, name]) => name)]);
+  element("quantity").value = quantities.indexOf(state.quantity);
   element("plane").value = state.axis;
   element("layer-figure").hidden = layers.length === 0;
   element("directions").hidden = !layers.some((layer) => layer.kind === "direction");

@@ -56,7 +56,7 @@ const mean = times.map((_, t) => {
 
 // A quantity is what is stored times a factor at each time.
 const ones = times.map(() => 1);
-const power = dimension === 2 ? "4πt" : "(4πt)³ᐟ²";
+const power = dimension === 2 ? "4πt" : "(4πt)³⁄²";
 const relative = { name: "HKS / mean", long: "HKS divided by its mean at each t", factor: mean.map((m) => 1 / m), centre: 1 };
 const isFlat = about.normalisation === "raw" || about.normalisation === "flat";
 const quantities = isFlat

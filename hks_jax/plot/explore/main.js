@@ -195,8 +195,8 @@ function showPoints() {
 
 function showControls() {
   const { axis, index } = planeOf();
-  element("time-text").textContent = `t = ${timeText(state.time)}`;
-  element("time").setAttribute("aria-valuetext", timeText(state.time));
+  element("time-text").textContent = `t = ${timeText(state.time)}${spreadText(state.time)}`;
+  element("time").setAttribute("aria-valuetext", element("time-text").textContent);
   element("slice").max = shape[axis] - 1;
   element("slice").value = index;
   element("slice-text").textContent = `${AXES[axis]} = ${voxel(planePlace(planeOf()))[axis]}`;
@@ -233,6 +233,9 @@ function render() {
 
 state.points.A = [...about.start, 0].slice(0, 3);
 state.index = [...state.points.A];
+// Where most of the domain is far above 1 already, as in small volumes, all of it would be of one colour.
+const typical = () => quantiles(count, (n) => values[state.time * count + n], [0.5])[0];
+if (isFlat && typical() > 2) state.quantity = relative;
 setUp();
 measure();
 renderNow();

@@ -44,6 +44,7 @@ def explore(
     title: str = "Heat kernel signature",
     facts: Mapping[str, Any] | None = None,
     unit: str = "",
+    lengths: Sequence[float] | Real[ArrayLike, " n_times"] | None = None,
     length_unit: str = "",
     world: Real[ArrayLike, "3 d_and_1"] | None = None,
 ) -> Path:
@@ -72,6 +73,7 @@ def explore(
         title: the page's title.
         facts: what else the page should say of the data, by name.
         unit: the unit of t.
+        lengths: (n_times,), how far heat has spread at each time, such as √(Dt): said beside t.
         length_unit: the unit of lengths, in the grid or in `world`.
         world: (3, d + 1), node indices to coordinates in space, the last column those of node 0: positions are then
             given there, and the sides of the images named by L and R, P and A, I and S, for coordinates that grow to
@@ -90,6 +92,9 @@ def explore(
     inside = grid.inside & np.isfinite(array).all(axis=0)
     if not inside.any():
         raise ValueError("values: nothing is finite inside the grid's mask at all times; nothing to show")
+    spread = None if lengths is None else np.asarray(lengths, dtype=np.float64)
+    if spread is not None and (spread.shape != t.shape or not np.isfinite(spread).all()):
+        raise ValueError(f"lengths: got shape {spread.shape}; expected {t.shape}, one finite number per time")
     layers = [] if tensors is None else tensor_layers(tensors, inside)
     layers += scalar_layers(maps or {}, inside)
     parts = None if labels is None else regions(labels, label_names, inside)
@@ -113,6 +118,7 @@ def explore(
         "unit": unit,
         "lengthUnit": length_unit,
         "times": t.tolist(),
+        "lengths": None if spread is None else spread.tolist(),
         "flat": flat.tolist(),
         "normalisation": normalisation,
         "start": _deep_node(inside[box]),
