@@ -18,6 +18,7 @@ from hks_jax.cli.demo import B_MAX, RIM
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from browser import Browser
 
+BOUNDARY, PAIRS = "neumann", 400
 LENGTHS = np.geomspace(4, 40, 24)  # √(Dt), mm
 
 
@@ -32,13 +33,13 @@ def write_page(path: Path) -> None:
     diffusivity = np.median(np.trace(plane.tensors[grid.inside], axis1=-2, axis2=-1)) / 2
     times = LENGTHS**2 / diffusivity
     hj.plot.explore(
-        hj.hks(hj.eigenpairs(field, 400), times),
+        hj.hks(hj.eigenpairs(field, PAIRS, boundary=BOUNDARY), times),
         times,
         grid,
         path,
         tensors=plane.tensors,
         title="A brain slice",
-        facts={"grid": " × ".join(map(str, grid.shape)), "metric": "D⁻¹", "boundary": "neumann", "eigenpairs": 400},
+        facts={"grid": " × ".join(map(str, grid.shape)), "metric": "D⁻¹", "boundary": BOUNDARY, "eigenpairs": PAIRS},
         unit="s",
         lengths=LENGTHS,
         length_unit="mm",
@@ -55,7 +56,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_page(folder / "page.html")
-        with Browser(folder / "browser", 1240, 1010) as browser:
+        with Browser(folder / "browser", 1240, 1330) as browser:
             browser.open(folder / "page.html")
             browser.choose("#time", "8")
             browser.click("#signature", 0.362, 0.495)
