@@ -295,6 +295,9 @@ def test_regions_have_the_mean_and_spread_of_their_points(plane):
     np.testing.assert_allclose(named["mean"], inside.mean(axis=1), rtol=1e-6)
     np.testing.assert_allclose(named["standard deviation"], inside.std(axis=1), rtol=1e-5)
     np.testing.assert_array_equal(columns["points in region: lasso"], 20)
+    quartiles = np.quantile(inside, [0.25, 0.5, 0.75], axis=1, method="nearest")
+    np.testing.assert_allclose(named["lower quartile"], quartiles[0], rtol=1e-6)
+    np.testing.assert_allclose(named["upper quartile"], quartiles[2], rtol=1e-6)
 
     plane.choose("#region", "3")  # label 3
     inside = flat[:, :8].reshape(TIMES.size, -1)

@@ -156,5 +156,5 @@ function takeAlike() {
 function take(nodes, note) {
   const chosen = new Uint8Array(count);
   for (const n of nodes) chosen[n] = 1;
-  state.region = { ...state.region, nodes: nodes.length ? nodes : null, chosen, note };
+  state.region = { kind: state.region.kind, nodes: nodes.length ? nodes : null, chosen, note };
 }

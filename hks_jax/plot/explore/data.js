@@ -96,23 +96,22 @@ function distances(node, from, to) {
   return found.map(Math.sqrt);
 }
 
-// Mean, standard deviation and quartiles at each time over some nodes (null: all of them).
+// Mean and standard deviation at each time over some nodes.
 function statistics(nodes, quantity) {
-  const size = nodes ? nodes.length : count;
   return times.map((_, t) => {
-    const sample = new Float64Array(size);
     let sum = 0;
-    for (let i = 0; i < size; i++) {
-      sample[i] = values[t * count + (nodes ? nodes[i] : i)] * quantity.factor[t];
-      sum += sample[i];
-    }
-    const average = sum / size;
+    for (const n of nodes) sum += values[t * count + n];
+    const average = sum / nodes.length;
     let squares = 0;
-    for (let i = 0; i < size; i++) squares += (sample[i] - average) ** 2;
-    sample.sort();
-    const at = (q) => sample[Math.min(size - 1, Math.round(q * (size - 1)))];
-    return { mean: average, deviation: Math.sqrt(squares / size), quartiles: [at(0.25), at(0.5), at(0.75)] };
+    for (const n of nodes) squares += (values[t * count + n] - average) ** 2;
+    return { mean: average * quantity.factor[t], deviation: Math.sqrt(squares / nodes.length) * quantity.factor[t] };
   });
+}
+
+// Three quartiles over some nodes: for each of them its values over t.
+function quartiles(nodes, quantity) {
+  const sorted = times.map((_, t) => Float64Array.from(nodes, (n) => values[t * count + n] * quantity.factor[t]).sort());
+  return [0.25, 0.5, 0.75].map((q) => sorted.map((sample) => sample[Math.round(q * (nodes.length - 1))]));
 }
 
 // Quantiles of numbers, of a sample where there are many.

@@ -100,7 +100,9 @@ class SliceImage {
         const node = nodeAt(place);
         if (node < 0) continue;
         colour(node, rgb);
-        pixels.data.set([...rgb, 255], 4 * ((nv - 1 - v) * nu + u));
+        const p = 4 * ((nv - 1 - v) * nu + u);
+        for (let c = 0; c < 3; c++) pixels.data[p + c] = rgb[c];
+        pixels.data[p + 3] = 255;
       }
     }
     this.tile.getContext("2d").putImageData(pixels, 0, 0);

@@ -51,7 +51,7 @@ def tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarra
     direction = np.zeros((len(array), 3))
     direction[:, :d] = anisotropy[:, None] * np.take_along_axis(vectors, largest[:, None, None], axis=2)[..., 0]
     return [
-        Layer("Mean diffusivity (mean eigenvalue)", "scalar", mean.astype(np.float32)),
+        Layer("Mean eigenvalue (diffusivity)", "scalar", mean.astype(np.float32)),
         Layer("Anisotropy (λ₁ − λ₂)/(λ₁ + λ₂)" if d == 2 else "Fractional anisotropy", "scalar", _single(anisotropy)),
         Layer("Principal direction", "direction", _single(direction)),
     ]

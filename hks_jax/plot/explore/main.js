@@ -134,18 +134,16 @@ function drawLayer(layer, shared) {
   }
 }
 
-const everywhere = new Map(); // by quantity: statistics of the whole domain
-
 function seriesShown() {
   const { quantity, points, region } = state;
-  if (!everywhere.has(quantity)) everywhere.set(quantity, statistics(null, quantity));
-  const all = everywhere.get(quantity);
-  const shown = [{ name: "mean", note: "all points", colour: "--mean", line: all.map((s) => s.mean), thin: true }];
+  const all = mean.map((m, t) => m * quantity.factor[t]);
+  const shown = [{ name: "mean", note: "all points", colour: "--mean", line: all, thin: true }];
   if (region.nodes) {
-    const found = statistics(region.nodes, quantity);
+    if (region.quantity !== quantity) Object.assign(region, { quantity, found: statistics(region.nodes, quantity) });
+    const { found } = region;
     const [line, spread] = [found.map((s) => s.mean), found.map((s) => s.deviation)];
     const band = { low: line.map((m, t) => m - spread[t]), high: line.map((m, t) => m + spread[t]) };
-    shown.push({ name: "region", note: `${region.note}; mean ± standard deviation`, colour: "--region", line, ...band, found });
+    shown.push({ name: "region", note: `${region.note}; mean ± standard deviation`, colour: "--region", line, ...band, spread });
   }
   for (const [name, place] of Object.entries(points)) {
     if (place) shown.push({ name, note: `node ${voxel(place).join(", ")}`, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line: curve(nodeAt(place), quantity) });
@@ -157,11 +155,11 @@ function save() {
   const q = state.quantity.name;
   const columns = seriesShown().flatMap((one) => {
     if (one.name !== "region") return [[`${q} ${one.name}${one.note ? `: ${one.note}` : ""}`, one.line]];
-    const quartile = (i) => one.found.map((s) => s.quartiles[i]);
+    const [lower, median, upper] = quartiles(state.region.nodes, state.quantity);
     const size = [`points in region: ${state.region.note}`, times.map(() => state.region.nodes.length)];
     return [
-      size, [`${q} region mean`, one.line], [`${q} region standard deviation`, one.found.map((s) => s.deviation)],
-      [`${q} region lower quartile`, quartile(0)], [`${q} region median`, quartile(1)], [`${q} region upper quartile`, quartile(2)],
+      size, [`${q} region mean`, one.line], [`${q} region standard deviation`, one.spread],
+      [`${q} region lower quartile`, lower], [`${q} region median`, median], [`${q} region upper quartile`, upper],
     ];
   });
   download(csv(columns), "hks-curves.csv");
