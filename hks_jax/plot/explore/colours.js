@@ -7,9 +7,9 @@ function entry(fraction) {
   return 3 * Math.max(0, Math.min(255, Math.round(255 * fraction)));
 }
 
-// A scale: which colours, from which value to which.
+// A scale: which colours, from which value to which. What is constant but for rounding looks constant.
 function scaleOf(table, low, high) {
-  const least = 1e-6 * (Math.max(Math.abs(low), Math.abs(high)) || 1);
+  const least = 1e-5 * (Math.max(Math.abs(low), Math.abs(high)) || 1);
   if (high - low < least) [low, high] = [low - least / 2, high + least / 2];
   return { table: tables[table], low, high };
 }
@@ -45,7 +45,7 @@ function number(x, largest = Math.abs(x)) {
     const tens = `10${raised(String(exponent))}`;
     return (digits === "1" ? tens : `${digits}·${tens}`).replace("-", "−");
   }
-  return x.toFixed(Math.max(0, 2 - exponent)).replace("-", "−");
+  return x.toFixed(Math.max(0, 2 - exponent)).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
 }
 
 // A round number, without the zeros at its end.

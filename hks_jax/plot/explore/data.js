@@ -48,6 +48,9 @@ function position(place) {
   return about.world.map((row) => index.reduce((sum, i, a) => sum + row[a] * i, row[dimension]));
 }
 
+// The largest coordinate, which says how many digits are worth showing.
+const reach = Math.max(...[[0, 0, 0], shape.map((n) => n - 1)].flatMap((corner) => position(corner).map(Math.abs)));
+
 const mean = times.map((_, t) => {
   let sum = 0;
   for (let n = t * count; n < (t + 1) * count; n++) sum += values[n];

@@ -42,7 +42,12 @@ function signatureScale() {
 }
 
 const byScale = (scale, numberAt) => (node, rgb) => {
-  const e = entry((numberAt(node) - scale.low) / (scale.high - scale.low));
+  const value = numberAt(node);
+  if (!Number.isFinite(value)) {
+    rgb.fill(128);
+    return;
+  }
+  const e = entry((value - scale.low) / (scale.high - scale.low));
   [rgb[0], rgb[1], rgb[2]] = [scale.table[e], scale.table[e + 1], scale.table[e + 2]];
 };
 
@@ -168,7 +173,7 @@ function save() {
 function showPoints() {
   const names = ["A", "B"].filter((name) => state.points[name]);
   const rows = [["", ...names], ["node", ...names.map((name) => voxel(state.points[name]).join(", "))]];
-  rows.push([withUnit("position", about.lengthUnit && `in ${about.lengthUnit}`), ...names.map((name) => position(state.points[name]).map((x) => number(x, Math.max(100, Math.abs(x)))).join(", "))]);
+  rows.push([withUnit("position", about.lengthUnit && `in ${about.lengthUnit}`), ...names.map((name) => position(state.points[name]).map((x) => number(x, reach)).join(", "))]);
   const nodes = names.map((name) => nodeAt(state.points[name]));
   rows.push([`${state.quantity.name} at t`, ...nodes.map((n) => number(signatureAt(n)))]);
   for (const layer of layers) rows.push([layer.name, ...nodes.map((n) => layerText(layer, n))]);
