@@ -188,8 +188,8 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
     assert "pass --labels too" in error(result, "--names", tmp_path / "names.tsv")
     assert "ends in .html" in error(result, "-o", tmp_path / "page.png")
     assert "no such file" in error(tmp_path / "nowhere")
-    np.savez(tmp_path / "mesh.npz", hks=np.ones((1, 3)), vertices=np.ones((3, 3)), faces=np.array([[0, 1, 2]]))
-    assert "a signature on a mesh" in error(tmp_path / "mesh.npz")
+    np.savez(tmp_path / "mesh.npz", hks=np.ones((1, 4)), vertices=np.eye(4, 3), cells=np.array([[0, 1, 2, 3]]))
+    assert "is on tetrahedra" in error(tmp_path / "mesh.npz")
     assert not (result / "explore.html").exists()
 
 
@@ -378,4 +378,51 @@ def test_slices_of_a_volume(browser, tmp_path):
     columns = saved_columns(browser)
     expected = flat[:, *node] / (4 * np.pi * TIMES) ** 1.5
     np.testing.assert_allclose(columns[f"HKS A: node {', '.join(map(str, node))}"], expected, rtol=1e-6)
+    assert browser.problems == []
+
+
+@needs_browser
+def test_a_surface_is_turned_and_its_vertices_are_chosen(browser, tmp_path):
+    browser.problems.clear()
+    sphere = hj.examples.sphere_mesh(6)
+    vertices = np.asarray(sphere.vertices)
+    flat = 1 + 0.3 * np.sin(np.outer(TIMES, vertices[:, 0]) + vertices[:, 2])
+    np.savez(
+        tmp_path / "hks.npz",
+        hks=flat / (4 * np.pi * TIMES[:, None]),
+        times=TIMES,
+        vertices=vertices,
+        faces=sphere.faces,
+    )
+    assert main(["explore", str(tmp_path), "-q"]) == 0
+    browser.open(tmp_path / "explore.html")
+
+    def chosen():
+        return int(re.search(r"A \(vertex (\d+)\)", browser.text("#legend"))[1])
+
+    # The middle of the image is the point that looks at the reader.
+    for turn, tilt in ((90, 0), (-160, 30), (0, 90)):
+        browser.choose("#turn", str(turn))
+        browser.choose("#tilt", str(tilt))
+        browser.click("#distance")
+        a, e = np.radians([turn, tilt])
+        towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        assert chosen() == np.argmax(vertices @ towards)
+    before = vertices[chosen()]
+    browser.key("ArrowRight", 2)  # seen from above, with x down
+    assert vertices[chosen()][1] > before[1] + 0.2
+    x, y, width, height = browser.box("#signature")
+    browser.drag([(x + width / 2, y + height / 2), (x + width / 2 - 40, y + height / 2), (x + width / 2 - 40, y + 10)])
+    assert browser.run("document.querySelector('#turn').value") == "20"
+    columns = saved_columns(browser)
+    np.testing.assert_allclose(columns[f"4πt·HKS A: vertex {chosen()}"], flat[:, chosen()], rtol=1e-6)
+
+    browser.choose("#region", "1")  # around the middle of the image: one side of the sphere alone
+    browser.choose("#tilt", "90")
+    x, y, width, height = browser.box("#signature")
+    reach = 0.4 * 0.49 * min(width, height)
+    corners = [(x + width / 2 + reach * np.cos(a), y + height / 2 + reach * np.sin(a)) for a in np.linspace(0, 6.2, 90)]
+    browser.drag(corners)
+    inside = (np.hypot(vertices[:, 0], vertices[:, 1]) < 0.4) & (vertices[:, 2] > 0)
+    assert abs(int(browser.text("#region-text").split()[0]) - inside.sum()) <= 2
     assert browser.problems == []

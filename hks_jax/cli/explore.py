@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hks_jax.cli.inputs import add_json_argument
-from hks_jax.cli.plot import Saved, read_saved
+from hks_jax.cli.plot import read_saved
 from hks_jax.cli.progress import Progress
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.npz import load_npz
 
 DESCRIPTION = """\
@@ -73,40 +75,46 @@ def run(args: argparse.Namespace) -> None:
     with progress.catching_warnings():
         with progress.stage("reading", str(source)):
             more = load_npz(source)
-            if "faces" in more or "cells" in more:
-                raise ValueError(
-                    f"{source}: a signature on a mesh; expected one on a grid. ParaView shows the .vtu beside it"
-                )
-            saved = read_saved(source, "hks")
-            if saved.times is None:
-                raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
-            place = _Place.of(more, saved.grid.dimension)
+            values, times, domain = _read(source, more)
+            place = _Place.of(more, values.ndim - 1)
             labels = None
             if args.labels is not None:
-                labels = read_labels(args.labels, saved.grid.shape, place.affine, place.slice_axis)
+                labels = read_labels(args.labels, values.shape[1:], place.affine, place.slice_axis)
             names = None if args.names is None else read_names(args.names)
         about = _About.of(more)
         with progress.stage("writing", str(page)):
             explore(
-                saved.values,
-                saved.times,
-                saved.grid,
+                values,
+                times,
+                domain,
                 page,
                 tensors=more.get("input_tensors"),
                 labels=labels,
                 label_names=names,
                 normalisation=about.settings.get("normalisation", "raw"),
                 title=args.title or about.title or source.parent.name,
-                facts=_facts(about, saved.grid.shape),
+                facts=_facts(about, domain),
                 unit=about.unit if args.unit is None else args.unit,
-                lengths=_spread(more.get("input_tensors"), saved, about),
+                lengths=_spread(more.get("input_tensors"), values, times, about),
                 length_unit="" if place.affine is None else "mm",
                 world=place.world,
             )
     if args.json:
-        print(json.dumps({"source": str(source), "times": saved.times.tolist(), "files": [str(page)]}))
+        print(json.dumps({"source": str(source), "times": times.tolist(), "files": [str(page)]}))
     elif not args.quiet:
         print(page)
+
+
+def _read(source: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, Grid | SurfaceMesh]:
+    """Return the signature, its times, and the grid or the surface that it is on."""
+    if "cells" in arrays:
+        raise ValueError(f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu beside it")
+    if "faces" in arrays and {"hks", "times", "vertices"} <= set(arrays):
+        return arrays["hks"], arrays["times"], SurfaceMesh(arrays["vertices"], arrays["faces"])
+    saved = read_saved(source, "hks")
+    if saved.times is None:
+        raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
+    return saved.values, saved.times, saved.grid
 
 
 class _Place(NamedTuple):
@@ -148,18 +156,22 @@ class _About(NamedTuple):
         return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", "".join(cuts[-1:]), k)
 
 
-def _spread(tensors: np.ndarray | None, saved: Saved, about: _About) -> np.ndarray | None:
+def _spread(tensors: np.ndarray | None, values: np.ndarray, times: np.ndarray, about: _About) -> np.ndarray | None:
     """Return √(Dt), where t is the time of a diffusion: with the median of the mean diffusivity inside."""
     if tensors is None or about.settings.get("metric") != "inverse":
         return None
-    inside = np.isfinite(saved.values[0])
-    diffusivity = float(np.median(np.trace(tensors[inside], axis1=-2, axis2=-1))) / saved.grid.dimension
-    return np.sqrt(diffusivity * saved.times) if diffusivity > 0 and saved.times is not None else None
+    inside = np.isfinite(values[0])
+    diffusivity = float(np.median(np.trace(tensors[inside], axis1=-2, axis2=-1))) / tensors.shape[-1]
+    return np.sqrt(diffusivity * times) if diffusivity > 0 else None
 
 
-def _facts(about: _About, shape: tuple[int, ...]) -> dict[str, Any]:
+def _facts(about: _About, domain: Grid | SurfaceMesh) -> dict[str, Any]:
     settings, words = about.settings, {"tensor": "D itself", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
-    facts: dict[str, Any] = {"grid": " × ".join(map(str, shape))}
+    facts: dict[str, Any] = {}
+    if isinstance(domain, Grid):
+        facts["grid"] = " × ".join(map(str, domain.shape))
+    else:
+        facts |= {"vertices": len(domain.vertices), "triangles": len(domain.faces)}
     if about.cut:
         facts["slice"] = about.cut
     if settings.get("metric"):

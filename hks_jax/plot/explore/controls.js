@@ -54,6 +54,7 @@ function setUp() {
   element("from").value = nearest;
   for (const id of ["time", "from", "to"]) element(id).disabled = farthest === 0;
   for (const row of document.querySelectorAll(".volume")) row.hidden = dimension === 2;
+  for (const row of document.querySelectorAll(".surface")) row.hidden = !surface;
   options(element("plane"), AXES.map((name, a) => `across ${name} (${AXES.filter((_, b) => b !== a).join(", ")})`));
   options(element("quantity"), quantities.map((q) => q.name));
   options(element("layer-name"), layers.map((layer) => layer.name));
@@ -69,6 +70,9 @@ function setUp() {
     state.axis = Number(input.value);
     if (state.points.A) state.index[state.axis] = state.points.A[state.axis];
   });
+  for (const id of ["turn", "tilt"]) {
+    onInput(id, () => setView(Number(element("turn").value), Number(element("tilt").value)));
+  }
   onInput("quantity", (input) => (state.quantity = quantities[input.value]));
   onInput("contrast", () => {});
   onInput("same", () => {});
@@ -123,6 +127,14 @@ function stepFrom(place, axis, step) {
   return last;
 }
 
+// Along the edges of a surface, as far as they lead that way on the screen.
+function walk(place, [axis, step]) {
+  let node = place[0];
+  const [right, up] = axis === 0 ? [Math.sign(step), 0] : [0, Math.sign(step)];
+  for (let i = 0; i < Math.abs(step); i++) node = neighbourTowards(node, right, up) ?? node;
+  return [node, 0, 0];
+}
+
 function onKey(event) {
   const { axis, across, up } = planeOf();
   const size = event.shiftKey ? 5 : 1;
@@ -133,7 +145,8 @@ function onKey(event) {
   const step = steps[event.key];
   if (!step || event.ctrlKey || event.altKey || event.metaKey) return;
   event.preventDefault();
-  const place = stepFrom(state.points[state.active], ...step);
+  const from = state.points[state.active];
+  const place = surface ? walk(from, step) : stepFrom(from, ...step);
   if (!place) return;
   setPoint(state.active, place);
   state.index = [...place];

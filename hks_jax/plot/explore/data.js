@@ -13,7 +13,7 @@ function bytes(id) {
 
 const floats = (id) => new Float32Array(bytes(id).buffer);
 
-const shape = [...about.shape, 1].slice(0, 3);
+const shape = [...about.shape, 1, 1].slice(0, 3);
 const dimension = about.dimension;
 const times = about.times;
 const inside = bytes("inside");
@@ -43,13 +43,11 @@ function placeAt(node) {
 const voxel = (place) => about.offset.map((o, a) => o + place[a]);
 
 function position(place) {
+  if (surface) return [...surface.vertices.subarray(3 * place[0], 3 * place[0] + 3)];
   const index = voxel(place);
   if (!about.world) return index.map((i, a) => about.origin[a] + i * about.spacing[a]);
   return about.world.map((row) => index.reduce((sum, i, a) => sum + row[a] * i, row[dimension]));
 }
-
-// The largest coordinate, which says how many digits are worth showing.
-const reach = Math.max(...[[0, 0, 0], shape.map((n) => n - 1)].flatMap((corner) => position(corner).map(Math.abs)));
 
 const mean = times.map((_, t) => {
   let sum = 0;

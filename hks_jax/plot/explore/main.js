@@ -53,9 +53,10 @@ const byScale = (scale, numberAt) => (node, rgb) => {
 
 const signatureAt = (node) => values[state.time * count + node] * state.quantity.factor[state.time];
 
+const NODE = surface ? "vertex" : "node";
 const images = {};
 for (const id of ["signature", "distance", "layer"]) {
-  images[id] = new SliceImage(element(id), {
+  images[id] = new (surface ? SurfaceImage : SliceImage)(element(id), {
     pick(place, second) {
       if (nodeAt(place) < 0) return;
       if (second) setActive("B");
@@ -67,7 +68,8 @@ for (const id of ["signature", "distance", "layer"]) {
     },
     lassoing: () => state.region.kind === "lasso",
     lasso(polygon, plane) {
-      take(nodesInPolygon(polygon, plane), dimension === 3 ? `lasso, slice ${AXES[plane.axis]} = ${voxel(planePlace(plane))[plane.axis]}` : "lasso");
+      if (surface) take(verticesInPolygon(polygon), "lasso");
+      else take(nodesInPolygon(polygon, plane), dimension === 3 ? `lasso, slice ${AXES[plane.axis]} = ${voxel(planePlace(plane))[plane.axis]}` : "lasso");
       render();
     },
     redraw: () => render(),
@@ -93,7 +95,7 @@ function layerText(layer, node) {
 
 function showHover(place) {
   const node = place ? nodeAt(place) : -1;
-  const texts = node < 0 ? [] : [`node ${voxel(place).join(", ")}`, `${state.quantity.name} ${number(signatureAt(node))}`, `distance ${number(apart[node], farApart)}`];
+  const texts = node < 0 ? [] : [`${NODE} ${voxel(place).join(", ")}`, `${state.quantity.name} ${number(signatureAt(node))}`, `distance ${number(apart[node], farApart)}`];
   if (node >= 0 && layers.length) texts.push(`${layers[state.layer].name} ${layerText(layers[state.layer], node)}`);
   element("hover").textContent = texts.join("   ·   ");
 }
@@ -151,7 +153,7 @@ function seriesShown() {
     shown.push({ name: "region", note: `${region.note}; mean ± standard deviation`, colour: "--region", line, ...band, spread });
   }
   for (const [name, place] of Object.entries(points)) {
-    if (place) shown.push({ name, note: `node ${voxel(place).join(", ")}`, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line: curve(nodeAt(place), quantity) });
+    if (place) shown.push({ name, note: `${NODE} ${voxel(place).join(", ")}`, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line: curve(nodeAt(place), quantity) });
   }
   return shown;
 }
@@ -170,9 +172,14 @@ function save() {
   download(csv(columns), "hks-curves.csv");
 }
 
+// The largest coordinate, which says how many digits are worth showing.
+const reach = surface
+  ? surface.vertices.reduce((most, x) => Math.max(most, Math.abs(x)), 0)
+  : Math.max(...[[0, 0, 0], shape.map((n) => n - 1)].flatMap((corner) => position(corner).map(Math.abs)));
+
 function showPoints() {
   const names = ["A", "B"].filter((name) => state.points[name]);
-  const rows = [["", ...names], ["node", ...names.map((name) => voxel(state.points[name]).join(", "))]];
+  const rows = [["", ...names], [NODE, ...names.map((name) => voxel(state.points[name]).join(", "))]];
   rows.push([withUnit("position", about.lengthUnit && `in ${about.lengthUnit}`), ...names.map((name) => position(state.points[name]).map((x) => number(x, reach)).join(", "))]);
   const nodes = names.map((name) => nodeAt(state.points[name]));
   rows.push([`${state.quantity.name} at t`, ...nodes.map((n) => number(signatureAt(n)))]);
@@ -193,7 +200,7 @@ function showPoints() {
   element("clear").disabled = !both;
   element("apart").textContent = both ? `Distance between A and B: ${number(apart[nodes[1]], farApart)}` : "";
   const active = state.points[state.active];
-  element("status").textContent = `Point ${state.active} at node ${voxel(active).join(", ")}: ${state.quantity.name} ${number(signatureAt(nodeAt(active)))}, distance ${number(apart[nodeAt(active)], farApart)}`;
+  element("status").textContent = `Point ${state.active} at ${NODE} ${voxel(active).join(", ")}: ${state.quantity.name} ${number(signatureAt(nodeAt(active)))}, distance ${number(apart[nodeAt(active)], farApart)}`;
 }
 
 function showControls() {
@@ -234,7 +241,7 @@ function render() {
   requestAnimationFrame(renderNow);
 }
 
-state.points.A = [...about.start, 0].slice(0, 3);
+state.points.A = surface ? [frontVertex(), 0, 0] : [...about.start, 0].slice(0, 3);
 state.index = [...state.points.A];
 // Where most of the domain is far above 1 already, as in small volumes, all of it would be of one colour.
 const typical = () => quantiles(count, (n) => values[state.time * count + n], [0.5])[0];

@@ -18,10 +18,11 @@ from matplotlib import colormaps
 from hks_jax import __version__
 from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
 from hks_jax.signatures.heat import Normalisation
 
-SCRIPTS = ("data", "colours", "image", "curves", "regions", "controls", "main")
+SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
 """The page's scripts, in the order in which they need one another."""
 COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_r", "grey": "gray"}
 LETTERS = ("LR", "PA", "IS")
@@ -33,7 +34,7 @@ LIMIT = 256 * 1024**2
 def explore(
     values: Real[ArrayLike, "n_times *shape"],
     times: Sequence[float] | Real[ArrayLike, " n_times"],
-    grid: Grid,
+    grid: Grid | SurfaceMesh,
     path: str | os.PathLike[str],
     *,
     tensors: Real[ArrayLike, "*shape d d"] | None = None,
@@ -48,7 +49,7 @@ def explore(
     length_unit: str = "",
     world: Real[ArrayLike, "3 d_and_1"] | None = None,
 ) -> Path:
-    """Write a page to explore a signature on a grid: one HTML file that opens in any browser, without a network.
+    """Write a page to explore a signature on a grid or a surface: an HTML file for any browser, without a network.
 
     It shows the signature with sliders for t and, of a volume, the slice; beside it maps of the tensors. A point that
     is chosen, by a click or with the arrow keys, draws its signature over t, and colours all others by the distance of
@@ -59,12 +60,13 @@ def explore(
     The numbers are in the file in single precision: 4 bytes and a third for each node inside, time and map.
 
     Args:
-        values: (n_times, *shape), as `hks_jax.hks` returns them; nodes that are not finite are left out.
+        values: (n_times, *shape), as `hks_jax.hks` returns them; nodes that are not finite are left out. On a surface
+            (n_times, V), all finite; what follows is then (V,) where it is (*shape) here.
         times: (n_times,), positive and increasing.
-        grid: the grid of the values, 2D or 3D.
+        grid: the grid of the values, 2D or 3D, or the surface.
         path: the page; its folder is made.
         tensors: (*shape, d, d), as they were measured, such as diffusivities: their mean eigenvalue, anisotropy and
-            principal direction (as red, green and blue for x, y and z) are shown.
+            principal direction (as red, green and blue for x, y and z) are shown. Not on surfaces.
         maps: more maps (*shape) by name.
         labels: (*shape), whole numbers, 0 for none: regions.
         label_names: the names of the labels.
@@ -86,10 +88,18 @@ def explore(
         ValueError: shapes that do not agree, times that do not increase, nothing finite, an unknown normalisation, or
             more numbers than a browser can open.
     """
-    t, array = _checked(values, times, grid)
+    shape, d = ((len(grid.vertices),), 2) if isinstance(grid, SurfaceMesh) else (grid.shape, grid.dimension)
+    t, array = _checked(values, times, shape)
     if normalisation not in get_args(Normalisation):
         raise ValueError(f"normalisation: got {normalisation!r}; expected one of {', '.join(get_args(Normalisation))}")
-    inside = grid.inside & np.isfinite(array).all(axis=0)
+    inside, surface, place = np.isfinite(array).all(axis=0), {}, {}
+    if isinstance(grid, SurfaceMesh):
+        if not (inside.all() and tensors is None and world is None):
+            raise ValueError("values, tensors, world: on a surface values must be finite, and the others left out")
+        surface = {"vertices": np.asarray(grid.vertices, "<f4"), "faces": grid.faces.astype("<i4")}
+    else:
+        inside &= grid.inside
+        place = {"spacing": grid.spacing, "origin": grid.origin}
     if not inside.any():
         raise ValueError("values: nothing is finite inside the grid's mask at all times; nothing to show")
     spread = None if lengths is None else np.asarray(lengths, dtype=np.float64)
@@ -99,7 +109,7 @@ def explore(
     layers += scalar_layers(maps or {}, inside)
     parts = None if labels is None else regions(labels, label_names, inside)
     _check_size(int(inside.sum()), t.size, layers)
-    flat = (4 * math.pi * t) ** (grid.dimension / 2)
+    flat = (4 * math.pi * t) ** (d / 2)
     # (4πt)^(d/2)·HKS is of order 1 in any unit: no float32 is too small for it.
     shown = array[:, inside] * (flat[:, None] if normalisation == "raw" else 1.0)
     low = [int(along.min()) for along in np.nonzero(inside)]
@@ -109,36 +119,36 @@ def explore(
         "title": title,
         "facts": [[str(name), str(value)] for name, value in (facts or {}).items()],
         "software": f"hks-jax {__version__}",
-        "dimension": grid.dimension,
+        "dimension": d,
+        "mesh": bool(surface),
         "shape": inside[box].shape,
         "offset": low,
-        "spacing": grid.spacing,
-        "origin": grid.origin,
-        **_in_space(world, grid.dimension),
+        **place,
+        **_in_space(world, d),
         "unit": unit,
         "lengthUnit": length_unit,
         "times": t.tolist(),
         "lengths": None if spread is None else spread.tolist(),
         "flat": flat.tolist(),
         "normalisation": normalisation,
-        "start": _deep_node(inside[box]),
+        "start": [0] if surface else _deep_node(inside[box]),
         "layers": [{"name": layer.name, "kind": layer.kind} for layer in layers],
         "labels": [] if parts is None else [[label, name] for label, name in parts.names.items()],
         "colours": {name: _colour_table(colours) for name, colours in COLOURS.items()},
     }
-    page = _assemble(about, inside[box], shown, layers, parts)
+    page = _assemble(about, inside[box], shown, layers, parts, surface)
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(path)
 
 
-def _checked(values: Any, times: Any, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _checked(values: Any, times: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     t, array = np.atleast_1d(np.asarray(times, dtype=np.float64)), np.asarray(values, dtype=np.float64)
     if t.ndim != 1 or t.size == 0 or not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
         raise ValueError(f"times: got {times}; expected positive numbers that increase, at least one")
-    if array.shape != (t.size, *grid.shape):
+    if array.shape != (t.size, *shape):
         raise ValueError(
-            f"values: got shape {array.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}, as "
+            f"values: got shape {array.shape}; expected (n_times, *shape) = {(t.size, *shape)}, as "
             "hks_jax.hks returns them"
         )
     return t, array
@@ -189,11 +199,13 @@ def _assemble(
     shown: Real[np.ndarray, "n_times n_nodes"],
     layers: list[Layer],
     parts: Regions | None,
+    surface: dict[str, np.ndarray],
 ) -> str:
     numbers = {"inside": _base64(inside.astype(np.uint8)), "values": _base64(shown.astype("<f4"))}
     numbers |= {f"layer-{i}": _base64(layer.values.astype("<f4")) for i, layer in enumerate(layers)}
     if parts is not None:
         numbers["labels"] = _base64(parts.values.astype("<i4"))
+    numbers |= {name: _base64(array) for name, array in surface.items()}
     own = files(__package__)
     scripts = "\n".join((own / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
     # No text can end the script that it is in: "<" is written as JSON also writes it.

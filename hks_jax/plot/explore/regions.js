@@ -1,19 +1,23 @@
 // Regions: what a lasso, a distance or a label takes; and curves as a table.
 
-// The nodes of a slice whose middle lies in a polygon, by how often a ray from there crosses it.
+// Whether a ray from a point crosses a polygon an odd number of times.
+function isInPolygon(polygon, x, y) {
+  let odd = false;
+  for (let i = 0, j = polygon.length - 1; i < polygon.length; j = i++) {
+    const [[xi, yi], [xj, yj]] = [polygon[i], polygon[j]];
+    if (yi > y !== yj > y && x < xi + ((y - yi) / (yj - yi)) * (xj - xi)) odd = !odd;
+  }
+  return odd;
+}
+
+// The nodes of a slice whose middle lies in a polygon.
 function nodesInPolygon(polygon, { axis, across, up, index }) {
   const found = [];
   const place = [0, 0, 0];
   place[axis] = index;
   for (let u = 0; u < shape[across]; u++) {
     for (let v = 0; v < shape[up]; v++) {
-      let odd = false;
-      const [x, y] = [u + 0.5, v + 0.5];
-      for (let i = 0, j = polygon.length - 1; i < polygon.length; j = i++) {
-        const [[xi, yi], [xj, yj]] = [polygon[i], polygon[j]];
-        if (yi > y !== yj > y && x < xi + ((y - yi) / (yj - yi)) * (xj - xi)) odd = !odd;
-      }
-      if (!odd) continue;
+      if (!isInPolygon(polygon, u + 0.5, v + 0.5)) continue;
       [place[across], place[up]] = [u, v];
       const node = nodeAt(place);
       if (node >= 0) found.push(node);
