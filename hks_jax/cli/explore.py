@@ -17,7 +17,8 @@ from hks_jax.npz import load_npz
 DESCRIPTION = """\
 Write a page to explore the signature that 'hks-jax hks' has left in the folder OUT: one HTML file that any browser
 opens, without a network. It has sliders for t and the slice, maps of the tensors beside the signature, the curves of
-the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV.
+the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV. Surfaces
+are turned by hand.
 """
 
 EPILOG = """\
@@ -44,7 +45,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--labels",
         metavar="FILE",
         type=Path,
-        help="regions: whole numbers on the same voxels, 0 for none (NIfTI, .npy)",
+        help="regions: whole numbers on the same voxels or at the vertices, 0 for none (NIfTI, .npy)",
     )
     add("--names", metavar="FILE", type=Path, help="names of the labels: lines of a number, a tab or space, and a name")
     add("--title", help="the page's title (default: the name of the tensors' file)")

@@ -65,7 +65,7 @@ class SliceImage {
     const at = this.place(event);
     if (this.lasso) {
       this.lasso.push(at);
-      this.events.redraw();
+      this.drawLasso(); // on top of what is there: nothing else has changed
     } else if (event.buttons & 1 && event.pointerType !== "touch") {
       this.events.pick(this.gridPlace(at), event.shiftKey);
     }
@@ -75,6 +75,7 @@ class SliceImage {
   release(event) {
     const drawn = this.lasso;
     this.lasso = null;
+    if (drawn) this.events.redraw();
     if (!event) return;
     // Less than two cells wide: a click, as is the end of every touch that did not scroll.
     const wide = drawn && [0, 1].some((a) => {
@@ -113,7 +114,6 @@ class SliceImage {
     pen.drawImage(this.tile, this.corner[0], this.corner[1] - h, w, h);
     if (sticks) this.drawSticks(pen, sticks);
     if (chosen) this.drawOutline(pen, chosen);
-    if (this.lasso) this.drawLasso(pen);
     if (about.ends) this.drawEnds(pen);
     for (const [name, at] of Object.entries(points)) if (at) this.drawPoint(pen, name, at);
   }
@@ -169,7 +169,8 @@ class SliceImage {
     this.strokeTwice(pen, style("--region"), 2);
   }
 
-  drawLasso(pen) {
+  drawLasso() {
+    const pen = this.canvas.getContext("2d");
     pen.beginPath();
     this.lasso.forEach((at, i) => (i ? pen.lineTo(...this.toPixels(...at)) : pen.moveTo(...this.toPixels(...at))));
     this.strokeTwice(pen, style("--region"), 2);

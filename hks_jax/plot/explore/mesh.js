@@ -147,7 +147,6 @@ class SurfaceImage extends SliceImage {
     }
     const pen = this.canvas.getContext("2d");
     pen.putImageData(pixels, 0, 0);
-    if (this.lasso) this.drawLasso(pen);
     for (const [name, place] of Object.entries(points)) {
       if (!place) continue;
       this.plane = { axis: 2, across: 0, up: 1, index: isVisible(place[0], this.raster) ? 0 : -1 };
