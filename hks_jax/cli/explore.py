@@ -17,8 +17,8 @@ from hks_jax.npz import load_npz
 DESCRIPTION = """\
 Write a page to explore the signature that 'hks-jax hks' has left in the folder OUT: one HTML file that any browser
 opens, without a network. It has sliders for t and the slice, maps of the tensors beside the signature, the curves of
-the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV. Surfaces
-are turned by hand.
+the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV.
+Surfaces are turned by hand.
 """
 
 EPILOG = """\
