@@ -45,7 +45,7 @@ function setUp() {
   element("reading").textContent = isFlat
     ? `${power}·HKS is 1 where space is flat and no boundary is near. At small t it is above 1 where the curvature is positive, ` +
       "below 1 where it is negative. Natural (Neumann) boundaries raise it nearby, up to twofold along a straight side; " +
-      "fixed ones (Dirichlet) lower it to 0. At large t it grows everywhere, as heat has filled the domain: " +
+      "fixed ones (Dirichlet) lower it to 0; the mean of both is nearly free of them. At large t it grows everywhere, as heat has filled the domain: " +
       "HKS / mean then shows the differences."
     : "This signature is normalised; only its differences from place to place mean something.";
   element("time").max = element("from").max = element("to").max = farthest;
