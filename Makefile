@@ -8,6 +8,7 @@
 #   make lint        lint, format and type checks
 #   make notebooks   run every notebook
 #   make docs        the documentation site, in site/
+#   make browser     Chromium, by apt-get, for the tests of the page to explore, which are skipped without
 #   make clean       remove what the above made
 
 PYTHON ?= python3
@@ -24,7 +25,7 @@ BRAIN := mdt==1.2.7
 # What rounding and the order of operations reach first: solvers, factorisations and derivatives.
 CORE := $(patsubst %,tests/test_%.py,eigenpairs block_lanczos derivatives float32)
 
-.PHONY: demo test test-slow test-optimised stress lint notebooks docs clean
+.PHONY: browser demo test test-slow test-optimised stress lint notebooks docs clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMPS)/dti $(STAMPS)/brain
@@ -57,6 +58,12 @@ notebooks: $(STAMPS)/dti $(STAMPS)/brain
 # Not --quiet: what is not printed is not counted, and the build would pass with broken links.
 docs: $(STAMPS)/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The only target that installs anything outside $(VENV), and so none needs it.
+browser:
+	@if command -v chromium || command -v chromium-browser || command -v google-chrome; then :; \
+	elif apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium >/dev/null; then :; \
+	else echo "note: Chromium could not be installed; the tests in a browser are skipped" >&2; fi
 
 clean:
 	rm -rf $(VENV) demo site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

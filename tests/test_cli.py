@@ -93,6 +93,7 @@ def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
         np.testing.assert_allclose(read["hks"], expected, rtol=1e-9)
         np.testing.assert_array_equal(read["times"], [0.5, 2, 8])
         np.testing.assert_array_equal(read["mask"], disc())
+        np.testing.assert_array_equal(read["input_tensors"], metric().astype(np.float32))
         assert read["eigenvalues"].shape == (25,)
 
 

@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from hks_jax import __version__
-from hks_jax.cli import convert, curvature, demo, fit, hks, info, paper, plot, spectrum
+from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum
 
 EPILOG = """\
 examples:
@@ -21,7 +21,7 @@ examples:
   hks-jax hks --help
 """
 
-SUBCOMMANDS = (hks, spectrum, curvature, fit, plot, info, convert, demo, paper)
+SUBCOMMANDS = (hks, spectrum, curvature, fit, plot, explore, info, convert, demo, paper)
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 

@@ -15,6 +15,7 @@ from hks_jax.atomic import atomic_folder
 from hks_jax.cli.job import Result
 from hks_jax.cli.progress import Progress
 from hks_jax.io.save import save
+from hks_jax.io.volume import TensorVolume
 
 
 def check_folder(path: Path) -> None:
@@ -39,7 +40,10 @@ def write_outputs(
         extra = {"times": result.times, "eigenvalues": result.eigenvalues}
         origin = {"command": command, "settings": plain(result.report["settings"]), "times": result.times}
         for suffix in filter(None, (".npz", image)):
-            more = None if suffix == ".nii.gz" else extra
+            more: dict[str, Any] | None = None if suffix == ".nii.gz" else extra
+            if suffix == ".npz" and isinstance(result.volume, TensorVolume):
+                # What the signature was computed from, to be shown beside it.
+                more = {**extra, "input_tensors": result.volume.tensors.astype(np.float32)}
             save(temporary / f"hks{suffix}", result.values, result.volume, name="hks", extra=more, provenance=origin)
         draw(temporary / "hks.png")
         write_report(temporary / "report.json", result.report, progress, command)

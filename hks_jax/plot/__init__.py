@@ -9,6 +9,7 @@ from hks_jax.plot.convolution import line_integral_convolution as line_integral_
 from hks_jax.plot.curves import hks_curves as hks_curves
 from hks_jax.plot.degenerate import degenerate_points as degenerate_points
 from hks_jax.plot.ellipses import ellipses as ellipses
+from hks_jax.plot.explore import explore as explore
 from hks_jax.plot.figure import new_figure as new_figure
 from hks_jax.plot.figure import number_text as number_text
 from hks_jax.plot.figure import save_figure as save_figure

@@ -1,0 +1,204 @@
+"""``hks-jax explore OUT``: a page to explore what ``hks-jax hks`` has computed."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.plot import read_saved
+from hks_jax.cli.progress import Progress
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.npz import load_npz
+
+DESCRIPTION = """\
+Write a page to explore the signature that 'hks-jax hks' has left in the folder OUT: one HTML file that any browser
+opens, without a network. It has sliders for t and the slice, maps of the tensors beside the signature, the curves of
+the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV.
+Surfaces are turned by hand.
+"""
+
+EPILOG = """\
+examples:
+  hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse --times auto:24
+  hks-jax explore out
+  hks-jax explore out -o page.html --labels atlas.nii.gz --names names.tsv --title "Subject 7"
+"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand's parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "explore",
+        help="write a page to explore a signature in a browser",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("result", metavar="OUT", type=Path, help="the folder that 'hks-jax hks' wrote, or an .npz from there")
+    add("-o", "--output", metavar="PAGE", type=Path, help="the page (default: explore.html in OUT)")
+    add(
+        "--labels",
+        metavar="FILE",
+        type=Path,
+        help="regions: whole numbers on the same voxels or at the vertices, 0 for none (NIfTI, .npy)",
+    )
+    add("--names", metavar="FILE", type=Path, help="names of the labels: lines of a number, a tab or space, and a name")
+    add("--title", help="the page's title (default: the name of the tensors' file)")
+    add("--unit", help="the unit of t (default: s for D⁻¹ of tensors fitted here, else none)")
+    add_json_argument(parser)
+    return parser
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the subcommand.
+
+    Raises:
+        FileNotFoundError: no such result, labels or names.
+        ValueError: a result that cannot be shown, or labels that do not fit it.
+    """
+    from hks_jax.cli.outputs import check_folder
+    from hks_jax.io.labels import read_labels
+    from hks_jax.plot import explore
+
+    source = args.result / "hks.npz" if args.result.is_dir() else args.result
+    page = source.with_name("explore.html") if args.output is None else args.output
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"--output: got {page}; expected a name that ends in .html")
+    if args.names is not None and args.labels is None:
+        raise ValueError("--names: it names labels; pass --labels too")
+    check_folder(page.parent)
+    progress = Progress(args.quiet)
+    with progress.catching_warnings():
+        with progress.stage("reading", str(source)):
+            more = load_npz(source)
+            values, times, domain = _read(source, more)
+            place = _Place.of(more, values.ndim - 1)
+            labels = None
+            if args.labels is not None:
+                labels = read_labels(args.labels, values.shape[1:], place.affine, place.slice_axis)
+            names = None if args.names is None else read_names(args.names)
+        about = _About.of(more)
+        with progress.stage("writing", str(page)):
+            explore(
+                values,
+                times,
+                domain,
+                page,
+                tensors=more.get("input_tensors"),
+                labels=labels,
+                label_names=names,
+                normalisation=about.settings.get("normalisation", "raw"),
+                title=args.title or about.title or source.parent.name,
+                facts=_facts(about, domain),
+                unit=about.unit if args.unit is None else args.unit,
+                lengths=_spread(more.get("input_tensors"), values, times, about),
+                length_unit="" if place.affine is None else "mm",
+                world=place.world,
+            )
+    if args.json:
+        print(json.dumps({"source": str(source), "times": times.tolist(), "files": [str(page)]}))
+    elif not args.quiet:
+        print(page)
+
+
+def _read(source: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, Grid | SurfaceMesh]:
+    """Return the signature, its times, and the grid or the surface that it is on."""
+    if "cells" in arrays:
+        raise ValueError(f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu beside it")
+    if "faces" in arrays and {"hks", "times", "vertices"} <= set(arrays):
+        return arrays["hks"], arrays["times"], SurfaceMesh(arrays["vertices"], arrays["faces"])
+    saved = read_saved(source, "hks")
+    if saved.times is None:
+        raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
+    return saved.values, saved.times, saved.grid
+
+
+class _Place(NamedTuple):
+    """Where the grid lies in space: the affine of its volume, the axis that it cuts, and what its indices become."""
+
+    affine: np.ndarray | None
+    slice_axis: int | None
+    world: np.ndarray | None
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray], dimension: int) -> "_Place":
+        affine = arrays.get("affine")
+        slice_axis = int(arrays["slice_axis"]) if "slice_axis" in arrays else None
+        if affine is None:
+            return cls(None, slice_axis, None)
+        thin = 2 if slice_axis is None else slice_axis
+        return cls(affine, slice_axis, affine[:3, [a for a in range(4) if dimension == 3 or a != thin]])
+
+
+class _About(NamedTuple):
+    """What the result says of its origin."""
+
+    settings: dict[str, Any]
+    title: str
+    unit: str
+    cut: str
+    k: int | None
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray]) -> "_About":
+        record = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
+        settings = record.get("settings") or {}
+        # Fitted tensors are in mm²/s, and their grids in mm.
+        seconds = record.get("order") == "fit" and settings.get("metric") == "inverse"
+        k = len(arrays["eigenvalues"]) if "eigenvalues" in arrays else None
+        cuts = [
+            note.partition(":")[0].removeprefix("slice ") for note in record.get("notes", ()) if "slice " in note[:6]
+        ]
+        return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", "".join(cuts[-1:]), k)
+
+
+def _spread(tensors: np.ndarray | None, values: np.ndarray, times: np.ndarray, about: _About) -> np.ndarray | None:
+    """Return √(Dt), where t is the time of a diffusion: with the median of the mean diffusivity inside."""
+    if tensors is None or about.settings.get("metric") != "inverse":
+        return None
+    inside = np.isfinite(values[0])
+    diffusivity = float(np.median(np.trace(tensors[inside], axis1=-2, axis2=-1))) / tensors.shape[-1]
+    return np.sqrt(diffusivity * times) if diffusivity > 0 else None
+
+
+def _facts(about: _About, domain: Grid | SurfaceMesh) -> dict[str, Any]:
+    settings, words = about.settings, {"tensor": "D itself", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
+    facts: dict[str, Any] = {}
+    if isinstance(domain, Grid):
+        facts["grid"] = " × ".join(map(str, domain.shape))
+    else:
+        facts |= {"vertices": len(domain.vertices), "triangles": len(domain.faces)}
+    if about.cut:
+        facts["slice"] = about.cut
+    if settings.get("metric"):
+        facts["metric"] = words.get(settings["metric"], settings["metric"])
+    if settings.get("boundary"):
+        boundary = settings["boundary"]
+        facts["boundary"] = boundary if isinstance(boundary, str) else json.dumps(boundary)
+    if about.k is not None and settings.get("method", "spectral") == "spectral":
+        facts["eigenpairs"] = about.k
+    return facts
+
+
+def read_names(path: Path) -> dict[int, str]:
+    """Read lines of a number and a name, which may have several words.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no line begins with a number.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    names = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        number, *words = line.split(None, 1)[:2] or [""]
+        if number.lstrip("-").isdecimal() and words:
+            names[int(number)] = words[0].strip()
+    if not names:
+        raise ValueError(f"{path}: no line has a number and a name; expected lines such as '17 left hippocampus'")
+    return names

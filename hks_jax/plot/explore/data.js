@@ -1,0 +1,126 @@
+// The numbers of the page, and what is computed from them: curves, means, distances.
+const element = (id) => document.getElementById(id);
+const about = JSON.parse(element("about").textContent);
+
+function bytes(id) {
+  const block = element(id);
+  const text = atob(block.textContent);
+  const found = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) found[i] = text.charCodeAt(i);
+  block.remove(); // the text takes more memory than the numbers
+  return found;
+}
+
+const floats = (id) => new Float32Array(bytes(id).buffer);
+
+const shape = [...about.shape, 1, 1].slice(0, 3);
+const dimension = about.dimension;
+const times = about.times;
+const inside = bytes("inside");
+const values = floats("values"); // time by time, for the nodes inside in the order of the grid
+const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
+const labels = about.labels.length ? new Int32Array(bytes("labels").buffer) : null;
+
+// Between places of the grid, flat = (i·ny + j)·nz + k, and nodes, which are counted inside alone.
+const nodeOfPlace = new Int32Array(inside.length).fill(-1);
+let count = 0;
+for (let p = 0; p < inside.length; p++) if (inside[p]) nodeOfPlace[p] = count++;
+const placeOfNode = new Int32Array(count);
+for (let p = 0; p < inside.length; p++) if (nodeOfPlace[p] >= 0) placeOfNode[nodeOfPlace[p]] = p;
+
+function nodeAt(place) {
+  for (let a = 0; a < 3; a++) if (!(place[a] >= 0 && place[a] < shape[a])) return -1;
+  return nodeOfPlace[(place[0] * shape[1] + place[1]) * shape[2] + place[2]];
+}
+
+function placeAt(node) {
+  const p = placeOfNode[node];
+  const k = p % shape[2];
+  const ij = (p - k) / shape[2];
+  return [Math.floor(ij / shape[1]), ij % shape[1], k];
+}
+
+const voxel = (place) => about.offset.map((o, a) => o + place[a]);
+
+function position(place) {
+  if (surface) return [...surface.vertices.subarray(3 * place[0], 3 * place[0] + 3)];
+  const index = voxel(place);
+  if (!about.world) return index.map((i, a) => about.origin[a] + i * about.spacing[a]);
+  return about.world.map((row) => index.reduce((sum, i, a) => sum + row[a] * i, row[dimension]));
+}
+
+const mean = times.map((_, t) => {
+  let sum = 0;
+  for (let n = t * count; n < (t + 1) * count; n++) sum += values[n];
+  return sum / count;
+});
+
+// A quantity is what is stored times a factor at each time.
+const ones = times.map(() => 1);
+const power = dimension === 2 ? "4πt" : "(4πt)³⁄²";
+const relative = { name: "HKS / mean", long: "HKS divided by its mean at each t", factor: mean.map((m) => 1 / m), centre: 1 };
+const isFlat = about.normalisation === "raw" || about.normalisation === "flat";
+const quantities = isFlat
+  ? [
+      { name: `${power}·HKS`, long: `${power}·HKS, 1 where flat`, factor: ones, centre: 1 },
+      relative,
+      { name: "HKS", long: "HKS", factor: about.flat.map((f) => 1 / f), centre: null, log: true },
+    ]
+  : [
+      { name: `HKS, ${about.normalisation}`, long: `HKS, normalised by ${about.normalisation}`, factor: ones, centre: null },
+      relative,
+    ];
+
+const curve = (node, quantity) => times.map((_, t) => values[t * count + node] * quantity.factor[t]);
+
+// Weights of the trapezoidal rule over log t from one time to another; they sum to 1.
+function weights(from, to) {
+  const w = times.map(() => 0);
+  for (let t = from; t < to; t++) {
+    const step = Math.log(times[t + 1] / times[t]) / 2;
+    w[t] += step;
+    w[t + 1] += step;
+  }
+  const sum = w.reduce((a, b) => a + b, 0);
+  if (sum === 0) w[from] = 1;
+  return sum === 0 ? w : w.map((x) => x / sum);
+}
+
+function distances(node, from, to) {
+  const found = new Float64Array(count);
+  weights(from, to).forEach((weight, t) => {
+    if (weight === 0) return;
+    const own = values[t * count + node];
+    const scale = weight / mean[t] ** 2;
+    for (let n = 0; n < count; n++) found[n] += scale * (values[t * count + n] - own) ** 2;
+  });
+  return found.map(Math.sqrt);
+}
+
+// Mean and standard deviation at each time over some nodes.
+function statistics(nodes, quantity) {
+  return times.map((_, t) => {
+    let sum = 0;
+    for (const n of nodes) sum += values[t * count + n];
+    const average = sum / nodes.length;
+    let squares = 0;
+    for (const n of nodes) squares += (values[t * count + n] - average) ** 2;
+    return { mean: average * quantity.factor[t], deviation: Math.sqrt(squares / nodes.length) * quantity.factor[t] };
+  });
+}
+
+// Three quartiles over some nodes: for each of them its values over t.
+function quartiles(nodes, quantity) {
+  const sorted = times.map((_, t) => Float64Array.from(nodes, (n) => values[t * count + n] * quantity.factor[t]).sort());
+  return [0.25, 0.5, 0.75].map((q) => sorted.map((sample) => sample[Math.round(q * (nodes.length - 1))]));
+}
+
+// Quantiles of numbers, of a sample where there are many.
+function quantiles(count, numberAt, wanted) {
+  const stride = Math.max(1, Math.floor(count / 20000));
+  const sample = new Float64Array(Math.ceil(count / stride));
+  for (let i = 0; i < sample.length; i++) sample[i] = numberAt(i * stride);
+  const finite = sample.filter(Number.isFinite).sort();
+  if (finite.length === 0) return wanted.map(() => 0);
+  return wanted.map((q) => finite[Math.round(q * (finite.length - 1))]);
+}

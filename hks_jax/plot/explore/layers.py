@@ -1,0 +1,91 @@
+"""What the page shows beside the signature: scalars and directions of the tensors, and regions."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Integer, Real
+
+
+class Layer(NamedTuple):
+    """A map beside the signature.
+
+    Attributes:
+        name: its heading.
+        kind: ``"scalar"``, or ``"direction"`` of vectors without a sign.
+        values: (n_nodes,), or (n_nodes, 3) of directions, at the nodes of the domain; float32.
+    """
+
+    name: str
+    kind: str
+    values: Float[np.ndarray, "n_nodes *components"]
+
+
+class Regions(NamedTuple):
+    """A label at every node of the domain, 0 for none, and the names of those that occur."""
+
+    values: Integer[np.ndarray, " n_nodes"]
+    names: dict[int, str]
+
+
+def tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarray, "*shape"]) -> list[Layer]:
+    """Return mean eigenvalue, anisotropy and principal direction, the latter as long as the anisotropy is large.
+
+    Raises:
+        ValueError: tensors of another shape, or that are not finite inside.
+    """
+    array, d = np.asarray(tensors), inside.ndim
+    if array.shape != (*inside.shape, d, d):
+        raise ValueError(f"tensors: got shape {array.shape}; expected (*shape, d, d) = {(*inside.shape, d, d)}")
+    array = array[inside].astype(np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError("tensors: some inside the domain are not finite; leave these nodes out by the grid's mask")
+    values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
+    mean = values.mean(axis=-1)
+    spread = np.sqrt(np.sum(np.square(values - mean[:, None]), axis=-1))
+    # Both are 0 for multiples of the identity and 1 where only one eigenvalue is not 0.
+    size = np.abs(values.sum(axis=-1)) / np.sqrt(2) if d == 2 else np.sqrt(np.sum(values**2, axis=-1) / 1.5)
+    anisotropy = spread / np.where(size > 0, size, 1)
+    largest = np.argmax(np.abs(values), axis=-1)
+    direction = np.zeros((len(array), 3))
+    direction[:, :d] = anisotropy[:, None] * np.take_along_axis(vectors, largest[:, None, None], axis=2)[..., 0]
+    return [
+        Layer("Mean eigenvalue (diffusivity)", "scalar", mean.astype(np.float32)),
+        Layer("Anisotropy (λ₁ − λ₂)/(λ₁ + λ₂)" if d == 2 else "Fractional anisotropy", "scalar", _single(anisotropy)),
+        Layer("Principal direction", "direction", _single(direction)),
+    ]
+
+
+def scalar_layers(maps: Mapping[str, Any], inside: Bool[np.ndarray, "*shape"]) -> list[Layer]:
+    """Return maps that are given by name; raise ValueError for those of another shape."""
+    for name, values in maps.items():
+        if np.shape(values) != inside.shape:
+            raise ValueError(f"maps[{name!r}]: got shape {np.shape(values)}; expected the grid's shape {inside.shape}")
+    return [Layer(name, "scalar", _single(np.asarray(values)[inside])) for name, values in maps.items()]
+
+
+def regions(
+    labels: Real[ArrayLike, "*shape"], names: Mapping[int, str] | None, inside: Bool[np.ndarray, "*shape"]
+) -> Regions:
+    """Return the labels inside, and their names, or their numbers where there are none.
+
+    Raises:
+        ValueError: labels of another shape, or that are no whole numbers; none inside.
+    """
+    array = np.asarray(labels)
+    if array.shape != inside.shape:
+        raise ValueError(f"labels: got shape {array.shape}; expected the grid's shape {inside.shape}")
+    found = array[inside]
+    whole = np.rint(found).astype(np.int32)
+    if not np.array_equal(whole, found):
+        raise ValueError("labels: got numbers with a fraction inside the domain; expected whole numbers, 0 for none")
+    present = [int(label) for label in np.unique(whole) if label != 0]
+    if not present:
+        raise ValueError("labels: 0 everywhere inside the domain; expected the number of a region at some of its nodes")
+    given = {} if names is None else names
+    return Regions(whole, {label: str(given.get(label, f"label {label}")) for label in present})
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values, dtype=np.float32)

@@ -1,0 +1,253 @@
+// What is drawn follows from the state alone: every change of it draws all of it again, once a frame.
+let apart = new Float64Array(count); // the distance of each node from A
+let farApart = 1; // nearly the largest of them
+
+function measure() {
+  apart = distances(nodeAt(state.points.A), state.from, state.to);
+  [farApart] = quantiles(count, (n) => apart[n], [0.98]);
+  takeAlike();
+}
+
+// A tenth of the way is a tenth of the distances' range, squared: small ones matter most.
+const alikeLimit = () => (element("alike").value / 100) ** 2 * (farApart || 1);
+
+const spreads = new Map(); // by quantity: what its colours span at each time
+
+function spreadAt(t) {
+  const { quantity } = state;
+  if (!spreads.has(quantity)) spreads.set(quantity, []);
+  return (spreads.get(quantity)[t] ??= quantiles(
+    count,
+    (n) => {
+      const v = values[t * count + n] * quantity.factor[t];
+      return quantity.centre === null ? v : Math.abs(v - quantity.centre);
+    },
+    quantity.centre === null ? [0.02, 0.98] : [0.9, 0.9],
+  ));
+}
+
+function signatureScale() {
+  const { quantity } = state;
+  const spans = element("same").checked ? times.map((_, t) => spreadAt(t)) : [spreadAt(state.time)];
+  const stretch = 2 ** -element("contrast").value;
+  if (quantity.centre !== null) {
+    const halves = spans.map(([half]) => half).sort((a, b) => a - b);
+    // Signatures are positive: 0 is as far below 1 as 2 is above.
+    const half = Math.max(Math.min(halves[halves.length >> 1], 1) * stretch, 1e-6);
+    return scaleOf("diverging", quantity.centre - half, quantity.centre + half);
+  }
+  const [low, high] = [Math.min(...spans.map((s) => s[0])), Math.max(...spans.map((s) => s[1]))];
+  const [middle, half] = [(low + high) / 2, ((high - low) / 2) * stretch];
+  return scaleOf("sequential", Math.max(low >= 0 ? 0 : -Infinity, middle - half), middle + half);
+}
+
+const byScale = (scale, numberAt) => (node, rgb) => {
+  const value = numberAt(node);
+  if (!Number.isFinite(value)) {
+    rgb.fill(128);
+    return;
+  }
+  const e = entry((value - scale.low) / (scale.high - scale.low));
+  [rgb[0], rgb[1], rgb[2]] = [scale.table[e], scale.table[e + 1], scale.table[e + 2]];
+};
+
+const signatureAt = (node) => values[state.time * count + node] * state.quantity.factor[state.time];
+
+const NODE = surface ? "vertex" : "node";
+const images = {};
+for (const id of ["signature", "distance", "layer"]) {
+  images[id] = new (surface ? SurfaceImage : SliceImage)(element(id), {
+    pick(place, second) {
+      if (nodeAt(place) < 0) return;
+      if (second) setActive("B");
+      setPoint(state.active, place);
+      render();
+    },
+    hover(place) {
+      showHover(place);
+    },
+    lassoing: () => state.region.kind === "lasso",
+    lasso(polygon, plane) {
+      if (surface) take(verticesInPolygon(polygon), "lasso");
+      else take(nodesInPolygon(polygon, plane), dimension === 3 ? `lasso, slice ${AXES[plane.axis]} = ${voxel(planePlace(plane))[plane.axis]}` : "lasso");
+      render();
+    },
+    redraw: () => render(),
+  });
+  element(id).addEventListener("keydown", onKey);
+}
+const chart = new Chart(element("chart"), element("legend"), (t) => {
+  state.time = t;
+  element("time").value = t;
+  render();
+});
+
+function planePlace(plane) {
+  const place = [0, 0, 0];
+  place[plane.axis] = plane.index;
+  return place;
+}
+
+function layerText(layer, node) {
+  if (layer.kind !== "direction") return number(layer.values[node]);
+  return [0, 1, 2].slice(0, dimension).map((a) => layer.values[3 * node + a].toFixed(2)).join(", ").replaceAll("-", "−");
+}
+
+function showHover(place) {
+  const node = place ? nodeAt(place) : -1;
+  const texts = node < 0 ? [] : [`${NODE} ${voxel(place).join(", ")}`, `${state.quantity.name} ${number(signatureAt(node))}`, `distance ${number(apart[node], farApart)}`];
+  if (node >= 0 && layers.length) texts.push(`${layers[state.layer].name} ${layerText(layers[state.layer], node)}`);
+  element("hover").textContent = texts.join("   ·   ");
+}
+
+function drawImages() {
+  const plane = planeOf();
+  const { points, region, quantity } = state;
+  const shared = { points, chosen: region.nodes && region.chosen };
+  for (const image of Object.values(images)) if (image.canvas.offsetParent) image.lay(plane);
+
+  const scale = signatureScale();
+  images.signature.draw(byScale(scale, signatureAt), shared);
+  showBar(element("signature-bar"), scale, quantity.centre);
+  element("signature-name").textContent = `${quantity.name} at t = ${timeText(state.time)}`;
+
+  const far = scaleOf("distance", 0, farApart);
+  images.distance.draw(byScale(far, (node) => apart[node]), shared);
+  showBar(element("distance-bar"), far);
+  element("distance-name").textContent = "A";
+
+  if (layers.length) drawLayer(layers[state.layer], shared);
+  const touch = region.kind === "lasso" ? "none" : "";
+  for (const [id, image] of Object.entries(images)) {
+    image.canvas.style.touchAction = touch;
+    const what = { signature: quantity.long, distance: "Distance from A", layer: layers.length ? layers[state.layer].name : "" }[id];
+    image.canvas.setAttribute("aria-label", `${what}. Arrow keys move point ${state.active}.`);
+  }
+}
+
+function drawLayer(layer, shared) {
+  const bar = element("layer-bar");
+  if (layer.kind === "direction") {
+    const colour = (node, rgb) => {
+      for (let a = 0; a < 3; a++) rgb[a] = Math.min(255, 25 + 330 * Math.abs(layer.values[3 * node + a]));
+    };
+    images.layer.draw(colour, { ...shared, sticks: layer.values });
+    bar.textContent = `red: along x, green: along y${dimension === 3 ? ", blue: along z" : ""}`;
+  } else {
+    layer.span ??= quantiles(count, (n) => layer.values[n], [0.01, 0.98]);
+    const scale = scaleOf("grey", ...layer.span);
+    images.layer.draw(byScale(scale, (node) => layer.values[node]), shared);
+    showBar(bar, scale);
+  }
+}
+
+function seriesShown() {
+  const { quantity, points, region } = state;
+  const all = mean.map((m, t) => m * quantity.factor[t]);
+  const shown = [{ name: "mean", note: "all points", colour: "--mean", line: all, thin: true }];
+  if (region.nodes) {
+    if (region.quantity !== quantity) Object.assign(region, { quantity, found: statistics(region.nodes, quantity) });
+    const { found } = region;
+    const [line, spread] = [found.map((s) => s.mean), found.map((s) => s.deviation)];
+    const band = { low: line.map((m, t) => m - spread[t]), high: line.map((m, t) => m + spread[t]) };
+    shown.push({ name: "region", note: `${region.note}; mean ± standard deviation`, colour: "--region", line, ...band, spread });
+  }
+  for (const [name, place] of Object.entries(points)) {
+    if (place) shown.push({ name, note: `${NODE} ${voxel(place).join(", ")}`, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line: curve(nodeAt(place), quantity) });
+  }
+  return shown;
+}
+
+function save() {
+  const q = state.quantity.name;
+  const columns = seriesShown().flatMap((one) => {
+    if (one.name !== "region") return [[`${q} ${one.name}${one.note ? `: ${one.note}` : ""}`, one.line]];
+    const [lower, median, upper] = quartiles(state.region.nodes, state.quantity);
+    const size = [`points in region: ${state.region.note}`, times.map(() => state.region.nodes.length)];
+    return [
+      size, [`${q} region mean`, one.line], [`${q} region standard deviation`, one.spread],
+      [`${q} region lower quartile`, lower], [`${q} region median`, median], [`${q} region upper quartile`, upper],
+    ];
+  });
+  download(csv(columns), "hks-curves.csv");
+}
+
+// The largest coordinate, which says how many digits are worth showing.
+const reach = surface
+  ? surface.vertices.reduce((most, x) => Math.max(most, Math.abs(x)), 0)
+  : Math.max(...[[0, 0, 0], shape.map((n) => n - 1)].flatMap((corner) => position(corner).map(Math.abs)));
+
+function showPoints() {
+  const names = ["A", "B"].filter((name) => state.points[name]);
+  const rows = [["", ...names], [NODE, ...names.map((name) => voxel(state.points[name]).join(", "))]];
+  rows.push([withUnit("position", about.lengthUnit && `in ${about.lengthUnit}`), ...names.map((name) => position(state.points[name]).map((x) => number(x, reach)).join(", "))]);
+  const nodes = names.map((name) => nodeAt(state.points[name]));
+  rows.push([`${state.quantity.name} at t`, ...nodes.map((n) => number(signatureAt(n)))]);
+  for (const layer of layers) rows.push([layer.name, ...nodes.map((n) => layerText(layer, n))]);
+  element("points").replaceChildren(...rows.map((cells, r) => {
+    const row = document.createElement("tr");
+    row.append(...cells.map((text, c) => {
+      const cell = document.createElement(r === 0 || c === 0 ? "th" : "td");
+      cell.scope = r === 0 ? "col" : "row";
+      if (r && c) cell.removeAttribute("scope");
+      cell.textContent = text;
+      if (r === 0 && c) cell.style.color = `var(--${text.toLowerCase()})`;
+      return cell;
+    }));
+    return row;
+  }));
+  const both = nodes.length === 2;
+  element("clear").disabled = !both;
+  element("apart").textContent = both ? `Distance between A and B: ${number(apart[nodes[1]], farApart)}` : "";
+  const active = state.points[state.active];
+  element("status").textContent = `Point ${state.active} at ${NODE} ${voxel(active).join(", ")}: ${state.quantity.name} ${number(signatureAt(nodeAt(active)))}, distance ${number(apart[nodeAt(active)], farApart)}`;
+}
+
+function showControls() {
+  const { axis, index } = planeOf();
+  element("time-text").textContent = `t = ${timeText(state.time)}${spreadText(state.time)}`;
+  element("time").setAttribute("aria-valuetext", element("time-text").textContent);
+  element("slice").max = shape[axis] - 1;
+  element("slice").value = index;
+  element("slice-text").textContent = `${AXES[axis]} = ${voxel(planePlace(planeOf()))[axis]}`;
+  element("slice").setAttribute("aria-valuetext", element("slice-text").textContent);
+  for (const id of ["from", "to"]) {
+    element(`${id}-text`).textContent = timeText(state[id]);
+    element(id).setAttribute("aria-valuetext", timeText(state[id]));
+  }
+  const { kind, nodes } = state.region;
+  element("alike-row").hidden = kind !== "alike";
+  element("alike-text").textContent = number(alikeLimit());
+  element("alike").setAttribute("aria-valuetext", number(alikeLimit()));
+  const empty = kind === "lasso" ? "Draw around points on an image." : kind === "none" ? "" : "No points.";
+  element("region-text").textContent = nodes ? `${nodes.length} of ${count} points (${((100 * nodes.length) / count).toFixed(1)} %)` : empty;
+}
+
+function renderNow() {
+  waiting = false;
+  showControls();
+  drawImages();
+  showPoints();
+  const { quantity, time, from, to } = state;
+  element("chart-name").textContent = quantity.long;
+  chart.draw(seriesShown(), { quantity, now: time, from, to });
+}
+
+let waiting = false;
+
+function render() {
+  if (waiting) return;
+  waiting = true;
+  requestAnimationFrame(renderNow);
+}
+
+state.points.A = surface ? [frontVertex(), 0, 0] : [...about.start, 0].slice(0, 3);
+state.index = [...state.points.A];
+// Where most of the domain is far above 1 already, as in small volumes, all of it would be of one colour.
+const typical = () => quantiles(count, (n) => values[state.time * count + n], [0.5])[0];
+if (isFlat && typical() > 2) state.quantity = relative;
+setUp();
+measure();
+renderNow();
+new ResizeObserver(render).observe(document.body);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", render);
