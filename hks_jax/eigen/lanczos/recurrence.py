@@ -70,7 +70,8 @@ def block_lanczos(
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     Neighbouring blocks are kept orthogonal by the recurrence, and in double precision two at a time by one pass against
-    the whole basis, which reads it from memory half as often and leaves it M-orthonormal to rounding. The steps are a loop of XLA's.
+    the whole basis, which reads it from memory half as often and leaves it M-orthonormal to rounding.
+    The steps are a loop of XLA's.
 
     Args:
         pencil: K and M.
