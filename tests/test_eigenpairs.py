@@ -217,7 +217,7 @@ def test_nan_from_traced_tensors_is_reported():
 def test_progress_is_reported(rng):
     told = []
     field = hj.TensorField(hj.Grid((20, 20)), random_spd(rng, (20, 20)))
-    hj.eigenpairs(field, 40, solver=hj.ShiftInvert(progress=told.append))
+    hj.eigenpairs(field, 40, solver="shift-invert", progress=told.append)
     assert told[0] == "factorising"
     assert "50 solves" in told
 

@@ -16,7 +16,7 @@ from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.mirror import solve_mirror
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice, check_choice, truncate
 from hks_jax.eigen.part import solve_part
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.operators import StencilOperator
@@ -39,6 +39,7 @@ def eigenpairs(
     mass: MassKind = "consistent",
     multiplet: MultipletChoice = "report",
     throw: bool = False,
+    progress: Report | None = None,
 ) -> Eigenpairs:
     """Compute the k lowest eigenpairs of the Laplace–Beltrami operator.
 
@@ -53,7 +54,7 @@ def eigenpairs(
         boundary: see `assemble`; belongs to the pencil if one is given.
         solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (2D and surfaces above all),
             ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
-            ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts. ``"report"`` warns; ``"drop"`` leaves its copies
             out of every signature; ``"complete"`` computes 8 pairs more and takes the missing copies in (or drops
@@ -61,6 +62,7 @@ def eigenpairs(
         throw: whether a failure is an error, also under `jit`, where no warning is possible: pairs whose ``.result`` is
             not successful, and derivatives that do not converge. It takes a callback to the host. Else pairs carry the
             code and derivatives are NaN, with a warning where values are concrete.
+        progress: called with short texts while it runs, where values are concrete; ``print`` will do.
 
     Returns:
         The pairs with residuals and convergence flags. λ of a constant (one per natural component) is exactly zero.
@@ -91,9 +93,9 @@ def eigenpairs(
     name = " + ".join(dict.fromkeys(choice.name for choice in choices))
     extra = min(1, total - size)  # to see where the spectrum is cut
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_mirror(pencil, choices, size, extra, name, throw)
+        pairs = solve_mirror(pencil, choices, size, extra, name, throw, progress or silent)
     else:
-        pairs = solve_part(pencil, choices[0], size, extra, name, throw)
+        pairs = solve_part(pencil, choices[0], size, extra, name, throw, progress or silent)
     pairs = truncate(pairs, k, multiplet)
     if throw:
         result = jax.lax.stop_gradient(pairs).result

@@ -23,7 +23,7 @@ class PinnedSpace(GridSpace):
     """The functions of a grid's space that vanish on the whole rim of the domain, a mask's included."""
 
     def __init__(self, space: GridSpace) -> None:
-        super().__init__(space.grid, space.boundary)
+        super().__init__(space._grid, space.boundary)
         self.free = self.free & ~rim_nodes(space)
         if not self.free.any():
             raise ValueError("field: every node of the domain is on its rim; use a finer grid or a thicker mask")
