@@ -10,7 +10,7 @@ from annotations import unchecked
 from fields import flat, random_spd
 
 import hks_jax as hj
-from hks_jax.eigen.solve import choose_solver
+from hks_jax.eigen.choice import choose_solver
 
 
 def axis_eigenvalues(condition, length: float, n: int) -> np.ndarray:

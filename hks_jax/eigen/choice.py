@@ -1,0 +1,72 @@
+"""Which solver "auto" stands for: the one policy, for `eigenpairs`, fits and the command line."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
+from hks_jax.eigen.host.shift_invert import ShiftInvert
+from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
+from hks_jax.eigen.solver import Eigensolver
+from hks_jax.fem.operators import StencilOperator
+from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.traced import is_traced
+
+SOLVERS: dict[str, Callable[[], Eigensolver]] = {
+    solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos, ChebyshevFilter)
+}
+
+_SMALL = 1500
+"""Unknowns up to which all pairs at once are affordable: n³ whatever k is, and nothing can be missed."""
+
+# BEGIN-TABLE
+_LARGE, _LARGE_IN_3D = 4_000_000, 1_000_000
+# END-TABLE
+
+
+def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
+    """Return the solver that a name stands for.
+
+    ``"auto"`` chooses by the pencil's size, k and dtype. Where values are traced (`jax.jit`, `jax.vmap`) or on an
+    accelerator it never chooses shift-invert, which runs on the host.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    if isinstance(solver, Eigensolver):
+        return solver
+    if solver == "auto":
+        return _automatic(pencil, k)
+    if solver not in SOLVERS:
+        raise ValueError(
+            f'solver: got {solver!r}; expected "auto", {", ".join(f"{name!r}" for name in SOLVERS)} or a solver object'
+        )
+    return SOLVERS[solver]()
+
+
+def choose_for_fit(pencil: Pencil | MirrorPencil, k: int) -> Eigensolver:
+    """Return what ``"auto"`` stands for in a fit, where one linearisation serves many products with the Jacobian.
+
+    Factorisations serve them all, which the filter does not have; and as fits are traced, none runs on the host.
+    """
+    n, fitting = pencil.space.n_dof, BlockLanczos(derivative_tolerance=1e-7)
+    return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()
+
+
+def _automatic(pencil: Pencil, k: int) -> Eigensolver:
+    n, volume = pencil.space.n_dof, pencil.space.dimension == 3
+    if n <= _SMALL or 4 * k > n:
+        return Dense()
+    matrix_free = volume and isinstance(pencil.stiffness, StencilOperator)  # in 3D factorisations fill in
+    ours: Eigensolver = ChebyshevFilter() if matrix_free and k < ChebyshevFilter().max_pairs(n) else BlockLanczos()
+    if k >= ours.max_pairs(n):  # one pair more is computed
+        ours = Dense()
+    if is_traced(jax.lax.stop_gradient(pencil)) or jax.default_backend() != "cpu":
+        return ours
+    if isinstance(ours, ChebyshevFilter):
+        return ours if n * k >= _LARGE_IN_3D else ShiftInvert()
+    # In float32 matrices block Lanczos has float32 factors, where the host's solver has float64.
+    exact = not volume and pencil.stiffness.dtype == np.float64 and isinstance(ours, BlockLanczos)
+    return ours if exact and n * k >= _LARGE else ShiftInvert()
