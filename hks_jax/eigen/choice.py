@@ -21,9 +21,20 @@ SOLVERS: dict[str, Callable[[], Eigensolver]] = {
 _SMALL = 1500
 """Unknowns up to which all pairs at once are affordable: n³ whatever k is, and nothing can be missed."""
 
-# BEGIN-TABLE
-_LARGE, _LARGE_IN_3D = 4_000_000, 1_000_000
-# END-TABLE
+# Seconds of the processor for the first call in a process, compilation included, and for those that follow; float64,
+# random anisotropic tensors, two cores that did other work too (which leaves ratios right to some 30 %):
+#
+#   nodes/pairs   n·k     shift-invert    ours, compiled
+#   64²/50        0.2 M   3.5    0.7      13     0.4    block Lanczos
+#   64²/100       0.4 M   7.3    1.8      12     0.8
+#   128²/50       0.8 M   10     7        15     1.0
+#   96²/100       0.9 M   12     2.7      15     3
+#   128²/100      1.6 M   20     5        16     2.3
+#   96²/200       1.8 M   17     7.7      17     1.9
+#   16³/50        0.2 M   5.5    1.5      17     1.9    Chebyshev filter
+#   20³/100       0.8 M   20     13       23     6.4
+_LARGE, _LARGE_IN_3D = 1_000_000, 800_000
+"""Unknowns times pairs from which on JAX's solvers win, or nearly, even if they have to be compiled first."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
