@@ -20,7 +20,7 @@ def keep_compiled(wanted: bool) -> None:
     if not wanted:
         jax.config.update("jax_enable_compilation_cache", False)
         return
-    if jax.config.jax_compilation_cache_dir is not None:
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
     folder = cache_folder(sys.platform, os.environ, Path.home())
     try:

@@ -149,8 +149,8 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
         inner_steps: at most so many products with JᵀJ in each step; in the last steps three times as many.
     """
 
-    rtol: Float[Array, ""]
-    atol: Float[Array, ""]
+    rtol: Float[Array, ""]  # type: ignore[assignment]
+    atol: Float[Array, ""]  # type: ignore[assignment]
     norm: Callable[[Any], Array]
     descent: DampedDescent
     search: optx.ClassicalTrustRegion
