@@ -31,8 +31,12 @@ _SMALL = 1500
 #   96²/100       0.9 M   12     2.7      15     3
 #   128²/100      1.6 M   20     5        16     2.3
 #   96²/200       1.8 M   17     7.7      17     1.9
+#   surface/100   0.6 M   9      4.3      17     2.7    (6400 vertices)
 #   16³/50        0.2 M   5.5    1.5      17     1.9    Chebyshev filter
 #   20³/100       0.8 M   20     13       23     6.4
+#
+# In float32 block Lanczos factorises in float32: at 64²/100 all pairs converge, at 128²/100 one does (20 s). There the
+# filter needs 4 s (the first time 24), for all of them.
 _LARGE, _LARGE_IN_3D = 1_000_000, 800_000
 """Unknowns times pairs from which on JAX's solvers win, or nearly, even if they have to be compiled first."""
 
@@ -70,14 +74,15 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
-    matrix_free = volume and isinstance(pencil.stiffness, StencilOperator)  # in 3D factorisations fill in
+    exact = pencil.stiffness.dtype == np.float64
+    # In 3D factorisations fill in, and in float32 they lose too many digits.
+    matrix_free = isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
     ours: Eigensolver = ChebyshevFilter() if matrix_free and k < ChebyshevFilter().max_pairs(n) else BlockLanczos()
     if k >= ours.max_pairs(n):  # one pair more is computed
         ours = Dense()
     if is_traced(jax.lax.stop_gradient(pencil)) or jax.default_backend() != "cpu":
         return ours
-    if isinstance(ours, ChebyshevFilter):
-        return ours if n * k >= _LARGE_IN_3D else ShiftInvert()
-    # In float32 matrices block Lanczos has float32 factors, where the host's solver has float64.
-    exact = not volume and pencil.stiffness.dtype == np.float64 and isinstance(ours, BlockLanczos)
-    return ours if exact and n * k >= _LARGE else ShiftInvert()
+    # The host's solver has float64 for float32 matrices too.
+    if volume:
+        return ours if isinstance(ours, ChebyshevFilter) and n * k >= _LARGE_IN_3D else ShiftInvert()
+    return ours if exact and isinstance(ours, BlockLanczos) and n * k >= _LARGE else ShiftInvert()
