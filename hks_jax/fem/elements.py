@@ -25,8 +25,9 @@ class Element:
     weights: Float[np.ndarray | Array, " q"]
 
     def stretched(self, sides: Float[np.ndarray | Array, " d"]) -> "Element":
-        """Return the element whose sides are so many times as long."""
-        return Element(self.values, self.gradients / sides, self.weights * sides.prod())
+        """Return the element whose sides are so many times as long, in the dtype of these."""
+        gradients, weights = (jnp.asarray(array, sides.dtype) for array in (self.gradients, self.weights))
+        return Element(self.values, gradients / sides, weights * sides.prod())
 
 
 def element_matrices(
