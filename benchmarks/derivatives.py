@@ -23,7 +23,7 @@ from jax.scipy.linalg import solve_triangular
 from machine import RESULTS, field, timed, write
 
 import hks_jax as hj
-from hks_jax.eigen.solve import choose_solver
+from hks_jax.eigen.choice import choose_solver
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from differences import directional, heat_kernel_by_contour

@@ -41,10 +41,14 @@ CASES = {
 }
 
 
+def grid_of(name):
+    shape = CASES[name][0]
+    return hj.Grid(shape, 0.1, mask=mask(shape), components="all") if name == "mask" else hj.Grid(shape, 0.1)
+
+
 def problem(rng, name, spread=1.0):
     shape, boundary, mass = CASES[name]
-    grid = hj.Grid(shape, 0.1, mask=mask(shape), components="all") if name == "mask" else hj.Grid(shape, 0.1)
-    return hj.assemble(hj.TensorField(grid, random_spd(rng, shape, spread)), boundary, mass)
+    return hj.assemble(hj.TensorField(grid_of(name), random_spd(rng, shape, spread)), boundary, mass)
 
 
 def dense_matrices(pencil):
@@ -272,7 +276,7 @@ def test_traced_and_batched(rng):
     field = hj.TensorField(hj.Grid((26, 22), 0.1), random_spd(rng, (26, 22)))
     solve = partial(hj.eigenpairs, k=20, solver=hj.BlockLanczos(block=4, slice_size=14))
     said = []
-    plain = hj.eigenpairs(field, 20, solver=hj.BlockLanczos(block=4, slice_size=14, progress=said.append))
+    plain = solve(field, progress=said.append)
     assert len(said) >= 2
     assert "of 21 eigenpairs" in said[-1]
     tensors = jnp.stack([field.tensors, 1.1 * field.tensors])
@@ -354,7 +358,7 @@ def test_what_it_cannot_do_is_said(rng):
 def test_random_small_problems_miss_no_eigenvalue(rng, name):
     """200 problems in all, traced."""
     shape, boundary, mass = CASES[name]
-    grid = problem(rng, name).space.grid
+    grid = grid_of(name)
     tensors = jnp.asarray([random_spd(rng, shape, spread) for spread in np.linspace(0.01, 2, 40)])
 
     def spectrum(tensors, solver):

@@ -138,7 +138,7 @@ def test_pairs_equal_the_dense_ones(name):
     pencil = problem(name)
     k = 24
     rounds = []
-    pairs = hj.eigenpairs(pencil, k, solver=hj.ChebyshevFilter(block=8, progress=rounds.append))
+    pairs = hj.eigenpairs(pencil, k, solver=hj.ChebyshevFilter(block=8), progress=rounds.append)
     assert pairs.converged.all()
     assert pairs.residuals.max() <= 1e-8
     expected = scipy.linalg.eigh(*dense_matrices(pencil), subset_by_index=[0, k - 1])[0]

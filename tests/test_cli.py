@@ -1,11 +1,13 @@
 """The command line, end to end: files in, files out, one line and a code for what goes wrong."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import equinox as eqx
 import nibabel as nib
@@ -18,6 +20,7 @@ from hks_jax.cli import demo, fit, main, picture
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.arguments import Times, parse_boundary, parse_times
+from hks_jax.cli.cache import cache_folder
 from hks_jax.cli.picture import away_from_rim, bounding_box
 from hks_jax.cli.progress import Progress
 from hks_jax.inverse.fit import OPTIMISERS
@@ -286,6 +289,38 @@ def test_results_are_replaced_and_other_files_kept(npz, tmp_path):
     assert json.loads((out / "report.json").read_text())["times"][0]["t"] == 2
     assert (out / "notes.txt").read_text() == "mine"
     assert sorted(file.name for file in tmp_path.iterdir()) == ["field.npz", "out"]
+
+
+def test_caches_are_where_the_platform_has_them():
+    home = Path("/home/me")
+    assert cache_folder("linux", {}, home) == home / ".cache" / "hks-jax"
+    assert cache_folder("linux", {"XDG_CACHE_HOME": "/fast"}, home) == Path("/fast/hks-jax")
+    assert cache_folder("linux", {"XDG_CACHE_HOME": "relative"}, home) == home / ".cache" / "hks-jax"
+    assert cache_folder("darwin", {"XDG_CACHE_HOME": "/fast"}, home) == home / "Library" / "Caches" / "hks-jax"
+    assert cache_folder("win32", {"LOCALAPPDATA": "C:/Local"}, home) == Path("C:/Local/hks-jax/Cache")
+
+
+@pytest.mark.slow
+def test_the_command_line_keeps_what_it_compiled_and_the_package_nothing(npz, tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path / "cache"), "HOME": str(tmp_path)}
+    folder = cache_folder(sys.platform, environment, tmp_path)
+
+    def run(*options):
+        command = ["hks", str(npz), "-o", str(tmp_path / "out"), "-k", "10", "--times", "1", *options]
+        done = subprocess.run(
+            [sys.executable, "-m", "hks_jax", *command], env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+
+    run("--no-cache")
+    assert not folder.exists()
+    run()
+    kept = {file.name for file in folder.iterdir()}
+    assert kept
+    run()
+    further = {file.name for file in folder.iterdir()} - kept
+    assert len(further) < len(kept) / 2  # one may have been too quick to compile to be kept before
 
 
 def test_module_runs_in_a_process_of_its_own(npz, tmp_path):

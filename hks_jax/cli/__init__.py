@@ -12,6 +12,7 @@ import numpy as np
 
 from hks_jax import __version__
 from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum
+from hks_jax.cli.cache import keep_compiled
 
 EPILOG = """\
 examples:
@@ -57,6 +58,9 @@ def build_parser() -> argparse.ArgumentParser:
     for subcommand in SUBCOMMANDS:
         sub = subcommand.add_parser(subparsers)
         sub.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+        sub.add_argument(
+            "--no-cache", action="store_true", help="neither use nor keep compiled programs in the user's cache folder"
+        )
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
         sub.set_defaults(run=subcommand.run, prog=sub.prog)
     return parser
@@ -79,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # argparse has printed its message
         return int(stop.code or 0)
     try:
+        keep_compiled(not args.no_cache)
         args.run(args)
     except KeyboardInterrupt:
         return _fail(args, "interrupted", INTERRUPTED)

@@ -7,7 +7,7 @@ from hks_jax.cli.arguments import parse_boundary
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments as add_reading_arguments
 from hks_jax.cli.reading import image_suffix, read
-from hks_jax.eigen.solve import SOLVERS
+from hks_jax.eigen.choice import SOLVERS
 from hks_jax.io import TensorVolume
 from hks_jax.io.repair import require_valid
 

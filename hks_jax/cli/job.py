@@ -1,6 +1,5 @@
 """The main job: from a tensor volume or a mesh to its heat kernel signature, and what is known about it."""
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -14,12 +13,9 @@ from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.choice import choose_solver
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
-from hks_jax.eigen.host.shift_invert import ShiftInvert
-from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.solve import choose_solver, eigenpairs
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solve import eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.fem.pencil import MirrorPencil, Pencil
@@ -144,9 +140,9 @@ def _solve(pencil: Pencil | MirrorPencil, settings: Settings, progress: Progress
     """Compute eigenpairs; raise ComputationError unless all of them converged."""
     unknowns = sum(part.space.n_dof for part in pencil.parts)
     k = min(DEFAULT_K[pencil.space.dimension], max(1, unknowns // 4)) if settings.k is None else settings.k
-    solver = _reporting(settings.solver, pencil, k, progress.update)
-    with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
-        pairs = eigenpairs(pencil, k, solver=solver)
+    name = choose_solver(settings.solver, pencil.parts[0], k).name
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {name}"):
+        pairs = eigenpairs(pencil, k, solver=settings.solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])
@@ -187,14 +183,6 @@ def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
                     f"which the mask does not reach; {on_rim}"
                 )
     return found
-
-
-def _reporting(solver: str, pencil: Pencil | MirrorPencil, k: int, callback: Callable[[str], None]) -> Eigensolver:
-    """Return the solver, with progress if it has any to show."""
-    chosen = choose_solver(solver, pencil.parts[0], k)
-    if isinstance(chosen, ShiftInvert | BlockLanczos | ChebyshevFilter):
-        return type(chosen)(progress=callback)
-    return chosen
 
 
 def _report(settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]) -> dict[str, Any]:

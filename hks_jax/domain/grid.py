@@ -109,6 +109,13 @@ class Grid:
         return tuple(float(end) for axis in self.axes for end in (axis[0], axis[-1]))
 
     @cached_property
+    def unit(self) -> "Grid":
+        """The same nodes with spacing 1 from the origin 0: all that the structure of matrices depends on."""
+        unit = Grid(self.shape)
+        unit._mask = self._mask
+        return unit
+
+    @cached_property
     def _key(self) -> tuple:
         return (self.shape, self.spacing, self.origin, self._mask)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_number
-from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.standard_form import standard_form, transposed_solve
 
@@ -24,7 +24,7 @@ class Dense(Eigensolver[SymmetricPencil]):
         """Check the settings."""
         require_number("tolerance", self.tolerance, 1)
 
-    def lowest(self, pencil: SymmetricPencil, k: int) -> RawPairs:
+    def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs."""
         return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.quality import indistinct
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
@@ -24,15 +24,17 @@ Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_do
 Certified = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4))
-def lowest(solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, throw: bool) -> Certified:
+@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5))
+def lowest(
+    solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, throw: bool, report: Report = silent
+) -> Certified:
     """Return the k + extra lowest eigenvalues, their eigenvectors, these again as the frame, and the solver's bound.
 
     The derivative of the frame is that of the eigenvectors without what rotates them among the first k. The derivatives
     of the last ``extra`` are set to zero. Where the derivative does not converge it is NaN: an error, if ``throw``;
     else a warning where values are concrete.
     """
-    values, vectors, complete_below = solver.lowest(pencil, k + extra)
+    values, vectors, complete_below = solver.lowest(pencil, k + extra, report)
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
     return values, vectors, vectors, complete_below
 
@@ -61,13 +63,14 @@ def _lowest_jvp(
     k: int,
     extra: int,
     throw: bool,
+    report: Report,
     primals: tuple[SymmetricPencil],
     changes: tuple[SymmetricPencil],
 ) -> tuple[Certified, Certified]:
     pencil, change = first_order_only(primals[0]), changes[0]
     n_dof = pencil.size
     total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
-    values, vectors, complete_below = solver.lowest(pencil, total)
+    values, vectors, complete_below = solver.lowest(pencil, total, report)
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
     quiet = is_traced(primals) or solver.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"

@@ -18,7 +18,7 @@ from hks_jax.eigen.eigenpairs import RESULTS, result_of
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos
 from hks_jax.eigen.located import locate, translated
 from hks_jax.eigen.quality import quality
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.linear.not_differentiable import not_differentiable
 from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil
@@ -84,6 +84,7 @@ def eigsh(
     interval: tuple[float, float] | None = None,
     solver: BlockLanczos | None = None,
     throw: bool = False,
+    progress: Report | None = None,
 ) -> MatrixEigenpairs:
     """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval, and prove that none is missed.
 
@@ -108,6 +109,7 @@ def eigsh(
         solver: `BlockLanczos` with other settings; None takes its defaults, and for small matrices all pairs at once.
         throw: whether a failure is an error, also under `jit`; else the pairs carry a code, ``.result``, and it is
             warned of where values are concrete.
+        progress: called with short texts after each slice, where values are concrete; ``print`` will do.
 
     Returns:
         The pairs with residuals, convergence flags and the certificate.
@@ -124,13 +126,13 @@ def eigsh(
     if not is_traced(jax.lax.stop_gradient(pencil)):
         _check_mass(pencil)
     if interval is not None:
-        pairs = _in_interval(pencil, *_checked_interval(pencil, interval, k), solver)
+        pairs = _in_interval(pencil, *_checked_interval(pencil, interval, k), solver, progress or silent)
         following = jnp.asarray(jnp.inf, pairs.eigenvalues.dtype)
     elif k is None:
         raise ValueError("k: not given; expected the number of eigenpairs, or an interval")
     else:
         _check_k(k, pencil.size)
-        pairs, following = _lowest(pencil, int(k), solver, throw)
+        pairs, following = _lowest(pencil, int(k), solver, throw, progress or silent)
     if throw:
         result = jax.lax.stop_gradient(pairs).result
         pairs = result.error_if(pairs, result != RESULTS.successful)
@@ -139,7 +141,7 @@ def eigsh(
 
 
 def _lowest(
-    pencil: SymmetricPencil, k: int, solver: BlockLanczos | None, throw: bool
+    pencil: SymmetricPencil, k: int, solver: BlockLanczos | None, throw: bool, report: Report
 ) -> tuple[MatrixEigenpairs, Float[Array, ""]]:
     """Return the k lowest pairs, and the eigenvalue that follows them."""
     n, method = pencil.size, _method(solver, k, pencil.size)
@@ -154,7 +156,7 @@ def _lowest(
         spacing = (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spacing)
     extra = min(1, n - number)
-    values, vectors, frame, bound = lowest(method, moved, number, extra, throw)
+    values, vectors, frame, bound = lowest(method, moved, number, extra, throw, report)
     pairs = _pairs(pencil, moved, origin, values[:k], vectors[:k], frame[:k], bound, method)
     return pairs, (values[k] + origin if number + extra > k else jnp.asarray(jnp.inf, values.dtype))
 
@@ -166,6 +168,7 @@ def _in_interval(
     below: Int[Array, ""],
     k: int,
     solver: BlockLanczos | None,
+    report: Report,
 ) -> MatrixEigenpairs:
     """Return the k pairs between two numbers, below the first of which lie so many eigenvalues."""
     pencil, method = not_differentiable(_NO_DERIVATIVE, pencil), _method(solver, k, pencil.size)
@@ -177,7 +180,7 @@ def _in_interval(
         values, vectors = (jax.lax.dynamic_slice_in_dim(x, below, k) for x in (values, vectors))
         bound = high - low
     else:
-        values, vectors, bound = method.lowest(moved, k)
+        values, vectors, bound = method.lowest(moved, k, report)
     return _pairs(pencil, moved, low, values, vectors, vectors, bound, method)
 
 

@@ -12,13 +12,13 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.part import solve_part
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
 
 def solve_mirror(
-    pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str, throw: bool
+    pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str, throw: bool, report: Report
 ) -> Eigenpairs:
     """Solve the mixed problems and return the k + extra lowest pairs of all.
 
@@ -37,7 +37,7 @@ def solve_mirror(
         for solver, part, limit in zip(solvers, parts, limits, strict=True)
     ]
     problems = zip(parts, solvers, wanted, strict=True)
-    solved = [solve_part(part, solver, size, 0, name, throw) for part, solver, size in problems]
+    solved = [solve_part(part, solver, size, 0, name, throw, report) for part, solver, size in problems]
     while not traced:
         spectra = [np.asarray(jax.lax.stop_gradient(pairs.eigenvalues)) for pairs in solved]
         merged = np.sort(np.concatenate(spectra))
@@ -51,7 +51,7 @@ def solve_mirror(
             break
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
-            solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name, throw)
+            solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name, throw, report)
     return _merge(pencil, tuple(solved), k, extra, name)
 
 

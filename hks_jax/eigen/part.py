@@ -8,11 +8,13 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import lowest
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.quality import quality
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
 
 
-def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool) -> Eigenpairs:
+def solve_part(
+    pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool, report: Report
+) -> Eigenpairs:
     """Return k + extra pairs of one pencil, the last ``extra`` of them without derivatives.
 
     With ``throw``, a derivative that does not converge is an error.
@@ -24,7 +26,7 @@ def solve_part(pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: st
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
-    values, vectors, frame, complete_below = lowest(solver, pencil, k, extra, throw)
+    values, vectors, frame, complete_below = lowest(solver, pencil, k, extra, throw, report)
     residuals, converged, *others = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)
     kept, part, next_eigenvalue, multiplet_tolerance = others
     return Eigenpairs(

@@ -1,34 +1,21 @@
 """The driver: assemble, choose a solver, truncate, report."""
 
-from collections.abc import Callable
-
 import jax
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.choice import choose_solver
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
-from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
-from hks_jax.eigen.host.shift_invert import ShiftInvert
-from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.mirror import solve_mirror
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice, check_choice, truncate
 from hks_jax.eigen.part import solve_part
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.traced import is_traced
-
-SOLVERS: dict[str, Callable[[], Eigensolver]] = {
-    solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos, ChebyshevFilter)
-}
-
-_LARGE, _LARGE_IN_3D = 4_000_000, 1_000_000
-"""Unknowns times pairs from which on JAX's solvers win even if they have to be compiled first."""
 
 
 def eigenpairs(
@@ -39,6 +26,7 @@ def eigenpairs(
     mass: MassKind = "consistent",
     multiplet: MultipletChoice = "report",
     throw: bool = False,
+    progress: Report | None = None,
 ) -> Eigenpairs:
     """Compute the k lowest eigenpairs of the Laplace–Beltrami operator.
 
@@ -51,9 +39,10 @@ def eigenpairs(
             constants of natural components, and so must its perturbations).
         k: how many pairs, 1 … number of degrees of freedom.
         boundary: see `assemble`; belongs to the pencil if one is given.
-        solver: ``"auto"`` (by size), ``"dense"``, ``"shift-invert"``, ``"block-lanczos"`` (2D and surfaces above all),
+        solver: ``"auto"`` (by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
+            ``"shift-invert"`` (on the host), ``"block-lanczos"`` (2D and surfaces above all),
             ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
-            ``hks_jax.BlockLanczos(progress=print)``. The choice made is in ``.solver_name``.
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts. ``"report"`` warns; ``"drop"`` leaves its copies
             out of every signature; ``"complete"`` computes 8 pairs more and takes the missing copies in (or drops
@@ -61,6 +50,7 @@ def eigenpairs(
         throw: whether a failure is an error, also under `jit`, where no warning is possible: pairs whose ``.result`` is
             not successful, and derivatives that do not converge. It takes a callback to the host. Else pairs carry the
             code and derivatives are NaN, with a warning where values are concrete.
+        progress: called with short texts while it runs, where values are concrete; ``print`` will do.
 
     Returns:
         The pairs with residuals and convergence flags. λ of a constant (one per natural component) is exactly zero.
@@ -91,9 +81,9 @@ def eigenpairs(
     name = " + ".join(dict.fromkeys(choice.name for choice in choices))
     extra = min(1, total - size)  # to see where the spectrum is cut
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_mirror(pencil, choices, size, extra, name, throw)
+        pairs = solve_mirror(pencil, choices, size, extra, name, throw, progress or silent)
     else:
-        pairs = solve_part(pencil, choices[0], size, extra, name, throw)
+        pairs = solve_part(pencil, choices[0], size, extra, name, throw, progress or silent)
     pairs = truncate(pairs, k, multiplet)
     if throw:
         result = jax.lax.stop_gradient(pairs).result
@@ -103,28 +93,3 @@ def eigenpairs(
         for message in known.messages():
             warn_of_accuracy(message)
     return pairs
-
-
-def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
-    """Return the solver that a name stands for; ``"auto"`` chooses by the pencil's size and k."""
-    if isinstance(solver, Eigensolver):
-        return solver
-    if solver == "auto":
-        # Dense costs n³ whatever k is; a Lanczos basis of twice k vectors needs room in n.
-        n = pencil.space.n_dof
-        if n <= 1500 or 4 * k > n:
-            return Dense()
-        # In 3D factorisations fill in.
-        if pencil.space.dimension == 3:
-            grid = isinstance(pencil.stiffness, StencilOperator)
-            large = grid and n * k >= _LARGE_IN_3D and k <= ChebyshevFilter().max_pairs(n)
-            return ChebyshevFilter() if large else ShiftInvert()
-        # Block Lanczos is faster from about 60² nodes on, but takes some ten seconds to compile. In float32 matrices
-        # it has float32 factors, where the host's solver has float64.
-        large = n * k >= _LARGE and k <= BlockLanczos().max_pairs(n)
-        return BlockLanczos() if large and pencil.stiffness.dtype == np.float64 else ShiftInvert()
-    if solver not in SOLVERS:
-        raise ValueError(
-            f'solver: got {solver!r}; expected "auto", {", ".join(f"{name!r}" for name in SOLVERS)} or a solver object'
-        )
-    return SOLVERS[solver]()

@@ -1,6 +1,7 @@
 """The interface that every eigensolver implements."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
@@ -12,6 +13,13 @@ P = TypeVar("P", bound=SymmetricPencil)
 """What a method can solve: any pencil, or those of a domain, or of a grid."""
 
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
+
+Report = Callable[[str], Any]
+"""Told in short texts how far a computation is."""
+
+
+def silent(text: str) -> None:
+    """Say nothing."""
 
 
 class Eigensolver(eqx.Module, Generic[P]):
@@ -29,11 +37,12 @@ class Eigensolver(eqx.Module, Generic[P]):
     tolerance: eqx.AbstractVar[float]
 
     @abstractmethod
-    def lowest(self, pencil: P, k: int) -> RawPairs:
+    def lowest(self, pencil: P, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenvalues, ascending, M-orthonormal eigenvectors as rows, and a bound.
 
         Every eigenvalue below the bound is certainly among the k, or beyond them. What was not found is NaN, and so is
-        the bound where nothing is certain. Traceable: works under `jit` and `vmap`.
+        the bound where nothing is certain. Traceable: works under `jit` and `vmap`. Called plainly, it may report
+        progress.
         """
 
     def prepare_complement(self, pencil: P, values: Float[Array, " p"], k: int) -> Any:

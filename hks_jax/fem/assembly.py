@@ -92,8 +92,9 @@ def _joined(pencils: list[Pencil]) -> Pencil | MirrorPencil:
 
 
 def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Pencil:
-    # The masks go in as arrays, so that problems that differ only in them share one compilation.
-    tensors, settings = field.tensors, (space.periodic, space.grid.spacing, field.interpolation)
+    # Masks and spacing go in as arrays, so that problems that differ only in them share one compilation.
+    tensors = field.tensors
+    settings = space.periodic, np.asarray(field.grid.spacing, tensors.dtype), field.interpolation
     stiffness, consistent, lumped, volume = _grid_integrals(
         tensors, space.domain, space.elements, free_couplings(space), *settings
     )
@@ -110,18 +111,18 @@ def _chosen_mass(
     return consistent if mass == "consistent" else DiagonalOperator(entries=space.restrict(lumped))
 
 
-@partial(jax.jit, static_argnames=("periodic", "spacing", "interpolation"))
+@partial(jax.jit, static_argnames=("periodic", "interpolation"))
 def _grid_integrals(
     tensors: Float[Array, "*shape d d"],
     domain: Bool[Array, "*shape"],
     elements: Bool[Array, "*elements"],
     couplings: Bool[Array, "offsets *shape"],
     periodic: tuple[bool, ...],
-    spacing: tuple[float, ...],
+    spacing: Float[np.ndarray | Array, " d"],
     interpolation: Interpolation,
 ) -> tuple[Array, Array, Array, Array]:
     """Return stiffness and mass as stencils, ∫ √|T| hᵢ of all nodes, and the volume."""
-    element = tensor_product_element(spacing)
+    element = tensor_product_element(len(periodic)).stretched(spacing)
     tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
 
     # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them

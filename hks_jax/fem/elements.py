@@ -21,8 +21,13 @@ class Element:
     """
 
     values: Float[np.ndarray, "q n"]
-    gradients: Float[np.ndarray, "q n d"]
-    weights: Float[np.ndarray, " q"]
+    gradients: Float[np.ndarray | Array, "q n d"]
+    weights: Float[np.ndarray | Array, " q"]
+
+    def stretched(self, sides: Float[np.ndarray | Array, " d"]) -> "Element":
+        """Return the element whose sides are so many times as long, in the dtype of these."""
+        gradients, weights = (jnp.asarray(array, sides.dtype) for array in (self.gradients, self.weights))
+        return Element(self.values, gradients / sides, weights * sides.prod())
 
 
 def element_matrices(
@@ -50,25 +55,24 @@ def at_quadrature(nodal: Float[Array, "n d d"], element: Element) -> Float[Array
     return jnp.einsum("qn,nab->qab", jnp.asarray(element.values, nodal.dtype), nodal, precision="highest")
 
 
-@lru_cache(maxsize=64)
-def tensor_product_element(spacing: tuple[float, ...]) -> Element:
-    """Return the Q1 element (bilinear, trilinear) with 2^d Gauss points on a box with the given sides.
+@lru_cache(maxsize=2)
+def tensor_product_element(dimension: int) -> Element:
+    """Return the Q1 element (bilinear, trilinear) with 2^d Gauss points on the unit square or cube.
 
     Nodes and points are in the order of ``itertools.product((0, 1), repeat=d)``.
     """
     gauss = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
     h = np.stack([1 - gauss, gauss], axis=1)  # (point, node) of the unit interval
     dh = np.array([[-1.0, 1.0], [-1.0, 1.0]])
-    corners = list(product((0, 1), repeat=len(spacing)))
-    n, d = len(corners), len(spacing)
+    d, corners = dimension, list(product((0, 1), repeat=dimension))
+    n = len(corners)
     values, gradients = np.ones((n, n)), np.ones((n, n, d))
     for (q, point), (i, node) in product(enumerate(corners), enumerate(corners)):
         for a in range(d):
             values[q, i] *= h[point[a], node[a]]
             for b in range(d):
-                factor = dh[point[a], node[a]] / spacing[a] if a == b else h[point[a], node[a]]
-                gradients[q, i, b] *= factor
-    return Element(values, gradients, np.full(n, np.prod(spacing) / n))
+                gradients[q, i, b] *= (dh if a == b else h)[point[a], node[a]]
+    return Element(values, gradients, np.full(n, 1 / n))
 
 
 # With d + 1 points, one beside each corner, whose barycentric coordinates are 1 − d·a and d times a, the rule of equal

@@ -112,14 +112,17 @@ def _spread(
 class GridSpace(FunctionSpace):
     """The Q1 space on a grid with given boundary conditions, as `normalise_boundary` writes them.
 
+    Its grids' spacing and origin are no part of it: computations compiled for one serve all.
+
     Attributes:
-        grid: the grid.
+        inside: the nodes inside the mask, bool (*shape).
         periodic: per axis, whether node n is node 0 again.
         elements: the elements that exist, bool; n − 1 per axis, n where periodic.
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
-        self.grid, self.boundary = grid, boundary
+        self._grid, self.boundary = grid.unit, boundary
+        self.inside = grid.inside
         self.node_shape, self.dimension = grid.shape, grid.dimension
         *axes, rim = boundary
         self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)
@@ -142,7 +145,7 @@ class GridSpace(FunctionSpace):
                 "finer grid or a thicker mask"
             )
         self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
-        self._key = (grid, boundary)
+        self._key = (self._grid, boundary)
 
 
 @jax.tree_util.register_static
@@ -161,5 +164,10 @@ class MeshSpace(FunctionSpace):
         self._key = (triangulation, condition)
 
 
-grid_space = lru_cache(maxsize=32)(GridSpace)
+def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
+    """Return the space, one for all grids of the same nodes."""
+    return _unit_space(grid.unit, boundary)
+
+
+_unit_space = lru_cache(maxsize=32)(GridSpace)
 mesh_space = lru_cache(maxsize=32)(MeshSpace)

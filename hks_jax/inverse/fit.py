@@ -16,6 +16,7 @@ import optimistix as optx
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.choice import choose_for_fit
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
@@ -26,7 +27,7 @@ from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Loss, Observation, Signature, observe
 from hks_jax.inverse.optimise import Optimiser, loss_of, optimise
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
-from hks_jax.inverse.problem import Problem, fit_solver, most_pairs, pairs_below, pairs_for, unknowns_of
+from hks_jax.inverse.problem import Problem, most_pairs, pairs_below, pairs_for, unknowns_of
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.smoothing import Euclidean, InnerProduct, smoothing
 from hks_jax.inverse.truncated import more_pairs, observed_times, truncation_misfit, truncation_shows
@@ -148,7 +149,7 @@ def fit_metric(
     problems = []
     for each in stages:
         pairs = _pairs(each, k, np.shape(target), pencil, init)
-        chosen = fit_solver(space.n_dof, pairs, pencil) if solver == "auto" else solver
+        chosen = choose_for_fit(pencil, pairs) if solver == "auto" else solver
         problems.append(Problem(unknowns, each, tuple(regularisers), pairs, boundary, chosen))
 
     inner_product = _inner_product(unknowns, smoothness, noise)
@@ -209,7 +210,7 @@ def fit_metric(
         wanted = more_pairs(problem, log.best) if shows and k is None else problem.k
         if wanted <= problem.k or best_result in ("interrupted", "not finite"):
             break
-        chosen = fit_solver(space.n_dof, wanted, pencil) if solver == "auto" else solver
+        chosen = choose_for_fit(pencil, wanted) if solver == "auto" else solver
         problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
         method = _optimiser(optimiser, tolerance, noise, inner_product, 1.0)
         log.best, best_result = optimise(problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock)
@@ -308,10 +309,10 @@ def _optimiser(
         # Against noise small steps: the misfit must not fall far below what the noise explains.
         damping, growth = (1e-4, 10.0) if noise is None else (1e-2, 3.0)
         return GaussNewton(tolerance, damping / step_size, growth, inner_product)
-    if given == "lbfgs":
-        return optx.LBFGS(tolerance, tolerance, optx.rms_norm)
-    if given == "bfgs":
-        return optx.BFGS(tolerance, tolerance, optx.rms_norm)
+    if given in ("lbfgs", "bfgs"):
+        kind: Any = optx.LBFGS if given == "lbfgs" else optx.BFGS
+        traced = jnp.asarray(tolerance)  # a static one would compile every stage anew
+        return kind(traced, traced, optx.rms_norm)
     if isinstance(given, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         return given
     names = ", ".join(map(repr, OPTIMISERS))

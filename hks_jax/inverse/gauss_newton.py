@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx  # type: ignore[import-untyped]
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.inverse.smoothing import Euclidean, InnerProduct
@@ -68,11 +68,11 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
         inner_steps: at most so many products with JᵀJ.
     """
 
-    tolerance: float
+    tolerance: Float[Array, ""]
     damping: Float[Array, ""]
     inner_product: InnerProduct
-    inner_tolerance: float
-    inner_steps: int
+    inner_tolerance: Float[Array, ""]
+    inner_steps: Int[Array, ""]
 
     def init(self, y: Values, f_info_struct: Any) -> _State:
         """Return a state of the right shape."""
@@ -137,6 +137,8 @@ def _silent(**_: Any) -> None:
 class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
     """The default solver of `hks_jax.fit_metric`.
 
+    Its settings are arrays: steps compiled for some serve all others.
+
     Args:
         tolerance: what the unknowns still change, relative and absolute (root mean square), when it stops; see
             `hks_jax.fit_metric`.
@@ -147,8 +149,8 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
         inner_steps: at most so many products with JᵀJ in each step; in the last steps three times as many.
     """
 
-    rtol: float
-    atol: float
+    rtol: Float[Array, ""]  # type: ignore[assignment]
+    atol: Float[Array, ""]  # type: ignore[assignment]
     norm: Callable[[Any], Array]
     descent: DampedDescent
     search: optx.ClassicalTrustRegion
@@ -156,11 +158,11 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
 
     def __init__(
         self,
-        tolerance: float = 1e-4,
+        tolerance: float | Array = 1e-4,
         damping: float | Array = 1e-4,
-        growth: float = 10.0,
+        growth: float | Array = 10.0,
         inner_product: InnerProduct | None = None,
-        inner_tolerance: float = 3e-2,
+        inner_tolerance: float | Array = 3e-2,
         inner_steps: int = 120,
     ) -> None:
         require_number("tolerance", tolerance)
@@ -168,12 +170,16 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
         require_number("growth", growth, above=1)
         require_number("inner_tolerance", inner_tolerance, 1)
         require_count("inner_steps", inner_steps)
-        self.rtol = self.atol = tolerance
+        self.rtol = self.atol = jnp.asarray(tolerance)
         self.norm = optx.rms_norm
         self.descent = DampedDescent(
-            tolerance, jnp.asarray(damping), inner_product or Euclidean(), inner_tolerance, inner_steps
+            self.rtol,
+            jnp.asarray(damping),
+            inner_product or Euclidean(),
+            jnp.asarray(inner_tolerance),
+            jnp.asarray(inner_steps),
         )
-        self.search = optx.ClassicalTrustRegion(high_cutoff=0.5, high_constant=growth)
+        self.search = optx.ClassicalTrustRegion(high_cutoff=0.5, high_constant=jnp.asarray(growth))
         self.verbose = _silent
 
     def terminate(

@@ -35,6 +35,15 @@ def _objective(values: Values, problem: Problem) -> tuple[Float[Array, ""], tupl
     return jnp.sum(residuals**2) / 2, aux
 
 
+# A solver's state holds the residuals' trace, and the same one, out of this function's cache, for every fit of the same
+# shapes: `_advance` tells traces apart.
+@eqx.filter_jit
+def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem) -> Any:
+    """Return the solver's state before the first step."""
+    struct, aux_struct = eqx.filter_eval_shape(fn, values, problem)
+    return optimiser.init(fn, values, problem, {}, struct, aux_struct, frozenset())
+
+
 @eqx.filter_jit
 def _advance(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem, state: Any) -> tuple:
     values, state, aux = optimiser.step(fn, values, problem, {}, state, frozenset())
@@ -89,8 +98,7 @@ def optimise(
     best, least = values, np.inf
     rejected = 0
     try:
-        struct, aux_struct = eqx.filter_eval_shape(fn, values, problem)
-        state = optimiser.init(fn, values, problem, {}, struct, aux_struct, frozenset())
+        state = _begin(optimiser, fn, values, problem)
         for step in range(max_steps + 1):
             before = values
             values, state, (loss, misfit), done, fine, gradient = _advance(optimiser, fn, values, problem, state)

@@ -10,10 +10,8 @@ from jaxtyping import Array, Float
 
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
-from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
@@ -60,16 +58,6 @@ class Problem(eqx.Module):
         data = self.observation.residuals(self._pairs_of(field))
         penalties = [each.residuals(self.unknowns, values, field) for each in self.regularisers]
         return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties])
-
-
-def fit_solver(n_dof: int, k: int, pencil: Pencil | MirrorPencil) -> str | Eigensolver:
-    """Return the eigensolver for a fit, where one linearisation serves many products with the Jacobian."""
-    if n_dof <= 1500 or 4 * k > n_dof:
-        return "dense"
-    grid = isinstance(pencil.parts[0].stiffness, StencilOperator)
-    if grid and k + 20 <= BlockLanczos().max_pairs(n_dof):
-        return BlockLanczos(derivative_tolerance=1e-7)
-    return "shift-invert"
 
 
 def pairs_below(eigenvalue: float, pencil: Pencil | MirrorPencil, field: TensorField) -> int:

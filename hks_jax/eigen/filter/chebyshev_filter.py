@@ -1,7 +1,6 @@
 """The matrix-free eigensolver for grids: Chebyshev-filtered subspace iteration, from coarse grids to the fine one."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
 
@@ -18,7 +17,7 @@ from hks_jax.eigen.filter.damping import upper_end
 from hks_jax.eigen.filter.rounds import Plan, from_coarse, from_random, improve, unconverged
 from hks_jax.eigen.filter.sharing import replicate
 from hks_jax.eigen.quality import indistinct
-from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.halo import checked_mesh
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
@@ -51,7 +50,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
             below what the eigenvectors' dtype allows.
         mesh: devices to share the work among, a `jax.sharding.Mesh` with one axis: each filters some of the vectors,
             and holds all of them on a part of the grid (docs/devices.md). None: one device.
-        progress: called with short texts after each round; None is silent.
     """
 
     name: ClassVar[str] = "chebyshev-filter"
@@ -62,7 +60,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     single_precision: bool = eqx.field(default=True, static=True)
     derivative_tolerance: float = eqx.field(default=1e-10, static=True)
     mesh: Mesh | None = eqx.field(default=None, static=True)
-    progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
         """Check the settings."""
@@ -74,7 +71,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         if self.mesh is not None:
             checked_mesh(self.mesh)
 
-    def lowest(self, pencil: Pencil, k: int) -> RawPairs:
+    def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs; the bound is NaN: there is no certificate."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("solver: chebyshev-filter needs a grid; use 'shift-invert' for a mesh")
@@ -83,7 +80,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         if is_traced(pencil):
             values, vectors = _lowest_traced(pencil, plan, self.max_rounds)
         else:
-            values, vectors = _lowest(pencil, plan, self.max_rounds, self.progress or (lambda _: None))
+            values, vectors = _lowest(pencil, plan, self.max_rounds, report)
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
     def prepare_complement(self, pencil: Pencil, values: Float[Array, " p"], k: int) -> Float[Array, ""]:
@@ -118,7 +115,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
 
 def _lowest(
-    pencil: Pencil, plan: Plan, max_rounds: int, report: Callable[[str], None] | None
+    pencil: Pencil, plan: Plan, max_rounds: int, report: Report | None
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
     """Return the pairs; without ``report``, in one computation that can be traced."""
     space = pencil.space

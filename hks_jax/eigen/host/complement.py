@@ -37,7 +37,6 @@ def solve_complement(
     factorise: Callable[[csc_matrix], SuperLU],
     tolerance: float,
     dtype: np.dtype,
-    report: Callable[[str], None],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0.
 
@@ -50,7 +49,6 @@ def solve_complement(
         factorise: factorises a symmetric, possibly indefinite matrix.
         tolerance: reduction of the error in the energy norm, relative to the largest row.
         dtype: what eigenvectors and right-hand sides were rounded to before they came here as float64.
-        report: told in words how it goes.
 
     Returns:
         x (k, n), and the relative energy errors (k,) that the iteration saw last, in units of the tolerance asked of
@@ -63,16 +61,12 @@ def solve_complement(
     wanted = wanted_errors(rhs, left, M.diagonal(), values, tolerance, dtype)
     rhs, beyond = left, float(first_beyond(values))
     active = np.flatnonzero(np.isfinite(wanted))
-    done = 0
 
     def solve(block: np.ndarray, factor: SuperLU) -> None:
-        nonlocal done
         solution, errors[block] = _conjugate_gradients(
             K, M, values[block], phi, m_phi, rhs[block].T, factor, wanted[block], beyond
         )
         x[block] = solution.T
-        done += block.size
-        report(f"derivative: {done} of {active.size} solves")
 
     # Blocks are solved side by side, each with one BLAS thread: SuperLU's many small BLAS calls do not gain by more.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:

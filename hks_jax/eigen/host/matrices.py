@@ -23,7 +23,6 @@ def complement_on_host(
     vectors: Float[Array, "p n_dof"],
     rhs: Float[Array, "k n_dof"],
     tolerance: float,
-    report: Callable[[str], None],
 ) -> Float[Array, "k n_dof"]:
     """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.common`.
 
@@ -50,7 +49,6 @@ def complement_on_host(
             factorise=factorise_on_host,
             tolerance=tolerance,
             dtype=rhs.dtype,
-            report=report,
         )
         failed = ~(errors <= 1)
         if failed.any():
@@ -60,7 +58,6 @@ def complement_on_host(
                 "multiplet='drop' in `eigenpairs`",
             )
             x[failed] = np.nan
-        report(f"derivative: error {np.max(errors, initial=0.0) * tolerance:.1e}")
         return x.astype(rhs.dtype)
 
     shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)

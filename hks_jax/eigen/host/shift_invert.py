@@ -1,6 +1,5 @@
 """Large sparse pencils by SciPy's shift-invert Lanczos on the host."""
 
-from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -14,7 +13,7 @@ from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.eigen.host.matrices import complement_on_host, factorise_on_host, host_matrices, inertia_on_host
-from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.traced import is_traced
 
@@ -37,7 +36,6 @@ class ShiftInvert(Eigensolver[Pencil]):
         basis: size of the Lanczos basis, more than k (for derivatives, than 9 + k + k/20); None takes 2k + 20.
         derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
             below what the eigenvectors' dtype allows.
-        progress: called with short texts such as ``"150 solves"`` while it runs; None is silent.
     """
 
     name: ClassVar[str] = "shift-invert"
@@ -46,7 +44,6 @@ class ShiftInvert(Eigensolver[Pencil]):
     max_restarts: int = eqx.field(default=300, static=True)
     basis: int | None = eqx.field(default=None, static=True)
     derivative_tolerance: float = eqx.field(default=1e-12, static=True)
-    progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return n_dof − 1: a Lanczos basis must be larger than what is wanted."""
@@ -60,7 +57,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             require_count("basis", self.basis, 2)
         require_number("derivative_tolerance", self.derivative_tolerance, 1)
 
-    def lowest(self, pencil: Pencil, k: int) -> RawPairs:
+    def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs, and the shift at which inertia confirmed them."""
         n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
         (data_k, data_m), matrices = host_matrices(pencil)
@@ -69,7 +66,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             # The shift keeps K + sM positive definite; Weyl's λ₁ is the scale on which it is small.
             shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
             K, M = matrices(data_k, data_m)
-            return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift))
+            return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift, report))
 
         inputs = (data_k, data_m, pencil.volume)
         if is_traced(inputs):
@@ -87,14 +84,14 @@ class ShiftInvert(Eigensolver[Pencil]):
         rhs: Float[Array, "k n_dof"],
     ) -> Float[Array, "k n_dof"]:
         """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.common`."""
-        return complement_on_host(pencil, values, vectors, rhs, self.derivative_tolerance, self._report)
+        return complement_on_host(pencil, values, vectors, rhs, self.derivative_tolerance)
 
-    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float) -> Found:
+    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float, report: Report) -> Found:
         n = K.shape[0]
         nothing = np.full(k, np.nan), np.full((k, n), np.nan), np.nan
         if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
             return nothing
-        self._report("factorising")
+        report("factorising")
         factor = factorise_on_host(K + shift * M)
         values, vectors = np.empty(0), np.empty((n, 0))
         solves, wanted = 0, k
@@ -103,7 +100,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             nonlocal solves
             solves += 1
             if solves % 50 == 0:
-                self._report(f"{solves} solves")
+                report(f"{solves} solves")
             y = factor.solve(x)
             return y - vectors @ (vectors.T @ (M @ y))
 
@@ -131,13 +128,9 @@ class ShiftInvert(Eigensolver[Pencil]):
             missing = negative - int((values < below).sum())
             if not sound or missing <= 0:
                 return _padded(values, vectors, k, below if sound else np.nan)
-            self._report(f"{missing} missed: looking again")
+            report(f"{missing} missed: looking again")
             wanted = min(missing + 2, n - 1)
         return nothing
-
-    def _report(self, text: str) -> None:
-        if self.progress is not None:
-            self.progress(text)
 
 
 def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> Found:

@@ -1,7 +1,6 @@
 """The eigensolver for what can be factorised: spectrum slicing by block Lanczos, certified to miss no eigenvalue."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
 
@@ -16,7 +15,7 @@ from hks_jax.eigen.complement import factorised
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, crowded, first_state, make_room, unfinished
 from hks_jax.eigen.located import LocatedPencil
-from hks_jax.eigen.solver import Eigensolver, RawPairs
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.dissection import Dissection, dissect
@@ -40,7 +39,6 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         slice_size: eigenvalues per slice; None chooses.
         derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
             below what the eigenvectors' dtype allows.
-        progress: called with short texts after each slice; None is silent.
     """
 
     name: ClassVar[str] = "block-lanczos"
@@ -48,7 +46,6 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     block: int = eqx.field(default=8, static=True)
     slice_size: int | None = eqx.field(default=None, static=True)
     derivative_tolerance: float = eqx.field(default=1e-9, static=True)
-    progress: Callable[[str], None] | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
         """Check the settings."""
@@ -58,10 +55,10 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             require_count("slice_size", self.slice_size)
         require_number("derivative_tolerance", self.derivative_tolerance, 1)
 
-    def lowest(self, pencil: SymmetricPencil, k: int) -> RawPairs:
+    def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs; of a `LocatedPencil`, from its origin upwards."""
         plan = self.plan(k, min(pencil.n_null, k))
-        state = self.slice(expected(pencil, plan), plan)
+        state = self.slice(expected(pencil, plan), plan, report)
         assert state.vectors is not None
         return (*_lowest(state.values, state.vectors, k), state.complete_below)
 
@@ -90,7 +87,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         size = math.ceil(1.06 * k / slices) + 2
         return Plan(k, self.block, size, 3 * slices + 12, nulls)
 
-    def slice(self, problem: Problem, plan: Plan) -> SlicingState:
+    def slice(self, problem: Problem, plan: Plan, report: Report = silent) -> SlicingState:
         """Compute the wanted eigenpairs from zero upwards, slice by slice."""
         dissection = dissect(problem.pencil.pattern)
         if is_traced(problem):
@@ -101,12 +98,8 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             if searchable:
                 state = _make_room(plan, state) if _crowded(plan, state) else state
                 state = search(problem, factor, plan, self.tolerance, state)
-            self._report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
+            report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
         return state
-
-    def _report(self, text: str) -> None:
-        if self.progress is not None:
-            self.progress(text)
 
 
 _first_state = jit_quickly(static_argnames="plan")(first_state)

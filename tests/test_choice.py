@@ -1,0 +1,106 @@
+"""What "auto" chooses, and that nothing it chooses under jit runs on the host."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fields import flat
+
+import hks_jax as hj
+from hks_jax.eigen import choice
+from hks_jax.eigen.choice import choose_for_fit, choose_solver
+
+
+def primitives(jaxpr):
+    """Return the names of all primitives in a jaxpr, inner ones included."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for inner in jax.tree.leaves(equation.params, is_leaf=lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr")):
+            if hasattr(inner, "jaxpr"):
+                yield from primitives(inner.jaxpr)
+            elif hasattr(inner, "eqns"):
+                yield from primitives(inner)
+
+
+def hks_of_grid(tensors, k):
+    grid = hj.Grid(tensors.shape[:-2], 0.1)
+    pairs = hj.eigenpairs(hj.TensorField(grid, tensors), k)
+    return jnp.sum(hj.hks(pairs, [0.1, 1.0])), pairs.solver_name
+
+
+def hks_of_surface(vertices, k):
+    faces = hj.examples.bumpy_torus_mesh(16).faces
+    pairs = hj.eigenpairs(hj.SurfaceMesh(vertices, faces), k)
+    return jnp.sum(hj.hks(pairs, [0.1, 1.0])), pairs.solver_name
+
+
+SMALL = 100
+"""In place of 1500 unknowns: the same choices on smaller grids."""
+CASES = {
+    "dense": (hks_of_grid, (9, 10), 5),
+    "dense, many pairs": (hks_of_grid, (14, 15), 25),
+    "block-lanczos": (hks_of_grid, (14, 15), 5),
+    "block-lanczos, surface": (hks_of_surface, None, 5),
+    "chebyshev-filter": (hks_of_grid, (8, 7, 6), 5),
+    "block-lanczos, 3d, many pairs": (hks_of_grid, (8, 7, 6), 20),
+}
+QUICK = ("dense", "block-lanczos")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in CASES])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+def test_the_jitted_gradient_of_the_default_has_no_callback(monkeypatch, name, dtype):
+    monkeypatch.setattr(choice, "_SMALL", SMALL)
+    function, shape, k = CASES[name]
+    if shape is None:
+        values = hj.examples.bumpy_torus_mesh(16).vertices
+    else:
+        values = jnp.broadcast_to(jnp.eye(len(shape)), (*shape, len(shape), len(shape)))
+    chosen = []
+
+    def loss(values):
+        total, solver = function(values, k)
+        chosen.append(solver)
+        return total
+
+    jaxpr = jax.make_jaxpr(jax.jit(jax.grad(loss)))(values.astype(dtype))
+    found = set(primitives(jaxpr.jaxpr))
+    assert "mul" in found
+    assert not [primitive for primitive in found if "callback" in primitive]
+    assert set(chosen) == {name.split(",")[0]}
+
+
+def test_who_asks_for_shift_invert_gets_it_under_jit():
+    def loss(tensors):
+        pairs = hj.eigenpairs(hj.TensorField(hj.Grid((6, 5)), tensors), 3, solver="shift-invert")
+        return jnp.sum(pairs.eigenvalues)
+
+    jaxpr = jax.make_jaxpr(jax.jit(loss))(jnp.broadcast_to(jnp.eye(2), (6, 5, 2, 2)))
+    assert "pure_callback" in set(primitives(jaxpr.jaxpr))
+
+
+def test_what_auto_chooses_where_values_are_known():
+    plane, volume = hj.assemble(flat((42, 41), (1.0, 1.0))), hj.assemble(flat((12, 12, 13), (1.0, 1.0, 1.0)))
+    surface = hj.assemble(hj.examples.bumpy_torus_mesh(50))
+    assert choose_solver("auto", plane, 20).name == "shift-invert"
+    assert choose_solver("auto", plane, 431).name == "dense"
+    assert [choose_solver("auto", volume, k).name for k in (20, 190)] == ["shift-invert"] * 2
+    assert choose_solver("auto", hj.assemble(flat((20, 20, 20), (1.0, 1.0, 1.0))), 100).name == "chebyshev-filter"
+    assert [choose_solver("auto", surface, k).name for k in (300, 450)] == ["shift-invert", "block-lanczos"]
+    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == np.float64 else x, surface)
+    assert choose_solver("auto", single, 450).name == "shift-invert"
+
+
+def test_on_accelerators_nothing_runs_on_the_host(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    plane = hj.assemble(flat((42, 41), (1.0, 1.0)))
+    assert choose_solver("auto", plane, 20).name == "block-lanczos"
+    # Factors in single precision lose too many digits.
+    assert choose_solver("auto", jax.tree.map(lambda x: x.astype(jnp.float32), plane), 20).name == "chebyshev-filter"
+    assert choose_solver("auto", hj.assemble(flat((12, 12, 13), (1.0, 1.0, 1.0))), 20).name == "chebyshev-filter"
+
+
+def test_fits_take_what_factorises_in_jax():
+    pencil = hj.assemble(flat((42, 41), (1.0, 1.0)))
+    assert [choose_for_fit(pencil, k).name for k in (20, 420)] == ["block-lanczos", "dense"]
+    assert choose_for_fit(hj.assemble(flat((12, 10), (1.0, 1.0))), 5).name == "dense"

@@ -1,0 +1,107 @@
+"""What differs in numbers only, or in whom progress is told, is not compiled anew."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fields import random_spd
+
+import hks_jax as hj
+
+
+@contextmanager
+def compilations() -> Iterator[list[str]]:
+    """Collect what JAX hands to the compiler; also what its cache on disk has."""
+    seen = []
+
+    def listen(event, seconds, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(about.get("fun_name", "?"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield seen
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+SOLVERS = {
+    "dense": ("dense", (9, 10), "neumann"),
+    "dense, mirror": ("dense", (9, 10), ("mirror", "neumann")),
+    "dense, 3d": ("dense", (5, 4, 6), "periodic"),
+    "block-lanczos": (hj.BlockLanczos(block=2), (9, 10), "neumann"),
+    "chebyshev-filter": (hj.ChebyshevFilter(block=4), (14, 13), ("periodic", "dirichlet")),
+}
+QUICK = [("dense", True), ("block-lanczos", False)]
+CASES = [
+    pytest.param(name, gradient, marks=pytest.mark.slow if (gradient and name != "dense") or "," in name else ())
+    for name in SOLVERS
+    for gradient in (False, True)
+]
+
+
+@pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")  # of so few pairs
+@pytest.mark.parametrize(("name", "gradient"), CASES)
+def test_spacing_origin_values_and_progress_compile_nothing_anew(rng, name, gradient):
+    solver, shape, boundary = SOLVERS[name]
+    told = []
+
+    def loss(tensors, grid, scale):
+        field = hj.TensorField(grid, tensors)
+        pairs = hj.eigenpairs(field, 4, boundary, solver, progress=lambda text: told.append(text))
+        return jnp.nansum(hj.hks(pairs, np.array([0.5, 2.0]) * scale))
+
+    def run(spacing, origin):
+        mask = np.arange(np.prod(shape)).reshape(shape) > 0
+        grid = hj.Grid(shape, spacing, origin, mask)
+        tensors = jnp.asarray(random_spd(rng, shape))
+        return (jax.grad(loss) if gradient else loss)(tensors, grid, np.mean(spacing) ** 2)
+
+    run(1.0, 0.0)
+    with compilations() as seen:
+        run((0.5, 0.7, 0.6)[: len(shape)], (3.0, -1.0, 0.0)[: len(shape)])
+    assert not seen
+
+
+def test_matrices_scale_with_the_spacing(rng):
+    """A coordinate in other units is the same metric in other components."""
+    shape, h = (6, 5), np.array([0.3, 0.2])
+    tensors = random_spd(rng, shape)
+    fine = hj.assemble(hj.TensorField(hj.Grid(shape, h, (1.0, 2.0)), tensors))
+    with compilations() as seen:
+        unit = hj.assemble(hj.TensorField(hj.Grid(shape), tensors * h[:, None] * h))
+    assert not seen
+    for ours, other in ((fine.stiffness, unit.stiffness), (fine.mass, unit.mass)):
+        np.testing.assert_allclose(ours.to_dense(), other.to_dense(), atol=1e-13)
+    np.testing.assert_allclose(fine.mesh_width, unit.mesh_width, rtol=1e-13)
+    assert fine.space == unit.space
+    assert hash(fine.space) == hash(unit.space)
+
+
+def test_grids_that_differ_are_still_told_apart_under_jit():
+    area = jax.jit(lambda field: jnp.prod(jnp.asarray(field.grid.spacing)) * hj.assemble(field).volume)
+    for spacing in (0.5, 0.25):
+        grid = hj.Grid((3, 3), spacing)
+        assert area(hj.TensorField(grid, np.broadcast_to(np.eye(2), (3, 3, 2, 2)))) == pytest.approx(4 * spacing**4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("optimiser", ["gauss-newton", "lbfgs"])
+def test_tolerances_of_fits_compile_nothing_anew(optimiser):
+    grid = hj.Grid((5, 6), 0.2)
+    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (5, 6, 2, 2)))
+    field = hj.TensorField(grid, np.exp(0.3 * grid.nodes[..., :1])[..., None] * np.eye(2))
+    times = np.geomspace(0.05, 0.5, 3)
+    target = np.asarray(hj.hks(hj.eigenpairs(field, 30), times))
+
+    def fit(tolerance):
+        return hj.fit_metric(target, times, flat, "conformal", k=30, optimiser=optimiser, tolerance=tolerance)
+
+    rough = fit(1e-1)
+    with compilations() as seen:
+        fine = fit(1e-5)
+    assert not seen
+    assert len(fine.history) > len(rough.history)
