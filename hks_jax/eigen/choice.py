@@ -35,8 +35,8 @@ _SMALL = 1500
 #   16³/50        0.2 M   5.5    1.5      17     1.9    Chebyshev filter
 #   20³/100       0.8 M   20     13       23     6.4
 #
-# In float32 block Lanczos factorises in float32: at 64²/100 all pairs converge, at 128²/100 one does (20 s). There the
-# filter needs 4 s (the first time 24), for all of them.
+# In float32 block Lanczos factorises in float32, which costs it several searches: at 128²/100 it needs 13 s. The filter
+# needs 4 s (the first time 24).
 _LARGE, _LARGE_IN_3D = 1_000_000, 800_000
 """Unknowns times pairs from which on JAX's solvers win, or nearly, even if they have to be compiled first."""
 
