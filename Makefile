@@ -62,7 +62,7 @@ docs: $(STAMPS)/docs
 # The only target that installs anything outside $(VENV), and so none needs it.
 browser:
 	@if command -v chromium || command -v chromium-browser || command -v google-chrome; then :; \
-	elif apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium >/dev/null; then :; \
+	elif apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null; then :; \
 	else echo "note: Chromium could not be installed; the tests in a browser are skipped" >&2; fi
 
 clean:

@@ -18,7 +18,7 @@ from hks_jax.cli.demo import B_MAX, RIM
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from browser import Browser
 
-BOUNDARY, PAIRS = "neumann", 400
+BOUNDARY, PAIRS = "mean", 400
 LENGTHS = np.geomspace(4, 40, 24)  # √(Dt), mm
 
 
