@@ -319,7 +319,7 @@ def test_float32_finds_what_rounding_allows(rng):
     np.testing.assert_allclose(values, reference, atol=1e-3 * reference[1])
 
 
-@pytest.mark.parametrize("solver", ["block-lanczos", "chebyshev-filter"])
+@pytest.mark.parametrize("solver", ["block-lanczos", pytest.param("chebyshev-filter", marks=pytest.mark.slow)])
 def test_float32_tensors_where_float64_is_enabled(rng, solver):
     grid = hj.Grid((24, 22), 0.1)
     tensors = random_spd(rng, grid.shape)

@@ -203,6 +203,7 @@ def test_too_few_rounds_are_reported():
     assert not pairs.converged.all()
 
 
+@pytest.mark.slow
 def test_derivatives_on_a_coarse_grid_of_many_modes(rng):
     """The consistent mass takes modes far above the lumped band, which must not make the preconditioner indefinite."""
     grid, weights = hj.Grid((8, 8, 8), 1.0), jnp.asarray(rng.standard_normal((8, 8, 8)))

@@ -77,7 +77,7 @@ def check(pairs, K, M, exact):
     assert pairs.result == hj.RESULTS.successful
 
 
-@pytest.mark.parametrize("solver", [None, SOLVER])
+@pytest.mark.parametrize("solver", [pytest.param(None, marks=pytest.mark.slow), SOLVER])
 def test_the_lowest_of_any_pencil(problem, solver):
     K, M, spectrum = problem
     k = 20

@@ -185,6 +185,7 @@ def test_noise_stops_the_fit_where_it_explains_the_misfit(rng):
     assert error(fit, CONFORMAL) < 0.03
 
 
+@pytest.mark.slow
 def test_rotations_with_fixed_eigenvalues():
     angle = 0.3 * np.sin(2 * X) + 0.2 * Y
     rotation = np.stack(
