@@ -201,7 +201,8 @@ def octahedron_sphere(levels=2):
     return vertices, faces
 
 
-SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in (("dense", 2), (hj.BlockLanczos(block=4), 3))]
+PRECISE = hj.BlockLanczos(block=4, derivative_tolerance=1e-12)
+SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in (("dense", 2), (PRECISE, 3))]
 
 
 @pytest.mark.parametrize(("solver", "levels"), [*SLOW, ("shift-invert", 2)])

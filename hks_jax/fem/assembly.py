@@ -15,7 +15,7 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
-from hks_jax.fem.elements import at_quadrature, element_matrices, simplex_element, tensor_product_element
+from hks_jax.fem.elements import Element, at_quadrature, element_matrices, simplex_element, tensor_product_element
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.resolution import grid_resolution, mesh_resolution
@@ -92,14 +92,16 @@ def _joined(pencils: list[Pencil]) -> Pencil | MirrorPencil:
 
 
 def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Pencil:
-    # Masks and spacing go in as arrays, so that problems that differ only in them share one compilation.
-    tensors = field.tensors
-    settings = space.periodic, np.asarray(field.grid.spacing, tensors.dtype), field.interpolation
-    stiffness, consistent, lumped, volume = _grid_integrals(
-        tensors, space.domain, space.elements, free_couplings(space), *settings
-    )
+    # Masks, element and spacing go in as arrays, so that problems that differ only in them share one compilation. The
+    # element is made in double precision: its rounding would scale the whole metric.
+    tensors, spacing = field.tensors, field.grid.spacing
+    element = tensor_product_element(space.dimension).stretched(spacing)
+    gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
+    arrays = tensors, space.domain, space.elements, free_couplings(space), gradients, weights
+    stiffness, consistent, lumped, volume = _grid_integrals(*arrays, space.periodic, field.interpolation)
     # Constant to derivatives before it is computed, it is not compiled again for them.
-    resolution = grid_resolution(jax.lax.stop_gradient(tensors), space.domain, *settings, mass == "lumped")
+    fixed = jax.lax.stop_gradient(tensors)
+    resolution = grid_resolution(fixed, space.domain, space.periodic, steps, field.interpolation, mass == "lumped")
     chosen = _chosen_mass(mass, space, StencilOperator(coefficients=consistent, space=space), lumped)
     stiffness = StencilOperator(coefficients=stiffness, space=space)
     return Pencil(stiffness, chosen, resolution.mapped(space.restrict), volume, space)
@@ -117,12 +119,13 @@ def _grid_integrals(
     domain: Bool[Array, "*shape"],
     elements: Bool[Array, "*elements"],
     couplings: Bool[Array, "offsets *shape"],
+    gradients: Float[np.ndarray | Array, "q n d"],
+    weights: Float[np.ndarray | Array, " q"],
     periodic: tuple[bool, ...],
-    spacing: Float[np.ndarray | Array, " d"],
     interpolation: Interpolation,
 ) -> tuple[Array, Array, Array, Array]:
     """Return stiffness and mass as stencils, ∫ √|T| hᵢ of all nodes, and the volume."""
-    element = tensor_product_element(len(periodic)).stretched(spacing)
+    element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
 
     # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them

@@ -24,10 +24,9 @@ class Element:
     gradients: Float[np.ndarray | Array, "q n d"]
     weights: Float[np.ndarray | Array, " q"]
 
-    def stretched(self, sides: Float[np.ndarray | Array, " d"]) -> "Element":
-        """Return the element whose sides are so many times as long, in the dtype of these."""
-        gradients, weights = (jnp.asarray(array, sides.dtype) for array in (self.gradients, self.weights))
-        return Element(self.values, gradients / sides, weights * sides.prod())
+    def stretched(self, sides: tuple[float, ...]) -> "Element":
+        """Return the element whose sides are so many times as long."""
+        return Element(self.values, self.gradients / np.array(sides), self.weights * math.prod(sides))
 
 
 def element_matrices(
