@@ -15,7 +15,7 @@ PYTHON ?= python3
 VENV ?= .venv
 # Test processes. Each compiles for itself, so more than there are cores do not pay.
 JOBS ?= auto
-# As many BLAS threads as cores in each of them would fight for the cores.
+# As many BLAS threads as cores in each of them, or for each of eight virtual devices, would fight for the cores.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1
 
 BIN := $(VENV)/bin
@@ -52,7 +52,7 @@ lint: $(STAMPS)/lint
 notebooks: $(STAMPS)/dti $(STAMPS)/brain
 	@set -e; for notebook in notebooks/*.py; do \
 	    test -e "$$notebook" || { echo "no notebooks"; break; }; \
-	    echo "$$notebook"; MPLBACKEND=Agg $(BIN)/python "$$notebook"; \
+	    echo "$$notebook"; MPLBACKEND=Agg $(ONE_THREAD) $(BIN)/python "$$notebook"; \
 	done
 
 # Not --quiet: what is not printed is not counted, and the build would pass with broken links.
