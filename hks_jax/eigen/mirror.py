@@ -13,6 +13,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.part import solve_part
 from hks_jax.eigen.solver import Eigensolver, Report
+from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
@@ -55,16 +56,15 @@ def solve_mirror(
     return _merge(pencil, tuple(solved), k, extra, name)
 
 
-# Weyl's law with h for the spacing and n for the nodes: N(λ) = n hᵈ λ^(d/2) / c, and a rim of r nodes that is Dirichlet
-# and not natural takes away r h^(d−1) λ^((d−1)/2) / c′, c = 4π and c′ = 2π in 2D, 6π² and 8π in 3D.
+# In units of the spacing a part's volume is its number of nodes, and a rim of r nodes that is Dirichlet and not natural
+# changes the rim's length or area by −2r.
 def _shares(pencil: MirrorPencil, total: int) -> list[int]:
     """Return about how many of the lowest pairs come from each part, and some more."""
     d, sizes = pencil.space.dimension, [part.space.n_dof for part in pencil.parts]
     mean = sum(sizes) / len(sizes)
     share, margin = total / len(sizes), 2 * math.isqrt(total) + 4
-    wave = (share / mean * (4 * math.pi if d == 2 else 6 * math.pi**2)) ** (1 / d)  # √λ h
-    per_node = wave ** (d - 1) / (2 * math.pi if d == 2 else 8 * math.pi)
-    return [max(math.ceil(share + (size - mean) * per_node), 0) + margin for size in sizes]
+    value = weyl(share, mean, d)
+    return [max(math.ceil(share + weyl_number(value, 0.0, d, 2 * (size - mean))), 0) + margin for size in sizes]
 
 
 @partial(jax.jit, static_argnames=("k", "extra", "name"))
