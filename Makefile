@@ -4,10 +4,13 @@
 #   make test        the tests
 #   make test-slow   the tests that take minutes
 #   make test-optimised   tests of the numerical core, compiled as users have it
+#   make test-lowest   a few tests with the lowest versions that pyproject.toml allows
 #   make stress      random problems against independent answers, an hour of them
 #   make lint        lint, format and type checks
 #   make notebooks   run every notebook
 #   make docs        the documentation site, in site/
+#   make tables      tables and plots of benchmarks/results/, in the pages that show them
+#   make dist        wheel and sources, in dist/, built and checked
 #   make browser     Chromium, by apt-get, for the tests of the page to explore, which are skipped without
 #   make clean       remove what the above made
 
@@ -25,7 +28,16 @@ BRAIN := mdt==1.2.7
 # What rounding and the order of operations reach first: solvers, factorisations and derivatives.
 CORE := $(patsubst %,tests/test_%.py,eigenpairs block_lanczos derivatives float32)
 
-.PHONY: browser demo test test-slow test-optimised stress lint notebooks docs clean
+# What calls the libraries that the package stands on: those for files, jax and scipy, matplotlib, lineax and optimistix.
+LIBRARIES := $(addprefix tests/,test_import.py test_io.py test_nrrd.py test_mesh_io.py \
+    test_signatures.py::test_hks_and_kernel_against_the_matrix_exponential \
+    test_signatures.py::test_everything_runs_under_jit \
+    test_plot.py::test_hks_panels_has_one_panel_and_bar_per_time \
+    test_inverse.py::test_gauss_newton_needs_fewer_signatures_than_lbfgs \
+    test_cli.py::test_npz_end_to_end_equals_the_library)
+LOWEST := $(VENV)/lowest
+
+.PHONY: browser demo test test-slow test-optimised test-lowest stress lint notebooks docs tables dist clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMPS)/dti $(STAMPS)/brain
@@ -41,15 +53,19 @@ test-slow: $(STAMPS)/test
 test-optimised: $(STAMPS)/test
 	XLA_FLAGS= $(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" $(CORE)
 
+# Libraries that are newer than they, and come along, deprecate what they do.
+test-lowest: $(STAMPS)/lowest
+	$(ONE_THREAD) $(LOWEST)/bin/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" -W ignore::DeprecationWarning $(LIBRARIES)
+
 stress: $(STAMPS)/test
-	$(ONE_THREAD) $(BIN)/python -m tests.stress --json benchmarks/results/stress.json
+	$(ONE_THREAD) PYTHONPATH=tests $(BIN)/python -m stress --json benchmarks/results/stress.json
 
 lint: $(STAMPS)/lint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-notebooks: $(STAMPS)/dti $(STAMPS)/brain
+notebooks: $(STAMPS)/dti $(STAMPS)/train $(STAMPS)/brain
 	@set -e; for notebook in notebooks/*.py; do \
 	    test -e "$$notebook" || { echo "no notebooks"; break; }; \
 	    echo "$$notebook"; MPLBACKEND=Agg $(ONE_THREAD) $(BIN)/python "$$notebook"; \
@@ -58,6 +74,16 @@ notebooks: $(STAMPS)/dti $(STAMPS)/brain
 # Not --quiet: what is not printed is not counted, and the build would pass with broken links.
 docs: $(STAMPS)/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+tables: $(STAMPS)/test
+	$(BIN)/python benchmarks/tables.py
+
+# The wheel is built from the sources, so that nothing gets into it that they lack.
+dist: $(STAMPS)/dist
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python tests/distribution.py dist
 
 # The only target that installs anything outside $(VENV), and so none needs it.
 browser:
@@ -77,9 +103,17 @@ $(STAMPS)/venv:
 	$(PYTHON) -m venv $(VENV)
 	@mkdir -p $(STAMPS) && touch $@
 
-# One extra of pyproject.toml each: dti, test, lint, docs.
-$(STAMPS)/dti $(STAMPS)/test $(STAMPS)/lint $(STAMPS)/docs: $(STAMPS)/%: pyproject.toml $(STAMPS)/venv
+# One extra of pyproject.toml each: dti, train, test, lint, docs, dist.
+EXTRAS := $(addprefix $(STAMPS)/,dti train test lint docs dist)
+$(EXTRAS): $(STAMPS)/%: pyproject.toml $(STAMPS)/venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$*]"
+	@touch $@
+
+# Of what the libraries require in turn, the newest.
+$(STAMPS)/lowest: pyproject.toml $(STAMPS)/venv
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(BIN)/python tests/floors.py > $(LOWEST)/floors.txt
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(LOWEST)/floors.txt --editable ".[test]"
 	@touch $@
 
 # A brain to show, and no dependency: a phantom takes its place where it cannot be had. It is tried again next time.

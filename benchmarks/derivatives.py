@@ -1,99 +1,109 @@
 """What a gradient costs over the value alone, and how exact it is beside the usual rules.
 
-    python benchmarks/derivatives.py [--sizes 64 128 256] [-o benchmarks/results/derivatives.json]
+    python benchmarks/derivatives.py [--problems 64² 32³ surface …] [-o benchmarks/results/derivatives.json]
 
-Cost: value-and-gradient of a loss on the HKS at eight times over the value, same solver, same process, after a
-warm-up; peak memory of each in a process of its own. Accuracy: the gradient of a truncated HKS on 24² nodes with
-respect to every tensor, against contour integrals of resolvents that JAX differentiates by itself (no eigensolver).
-Rivals are tried where they are installed: `jnp.linalg.eigh` after a Cholesky reduction, the `eigh` package, and xitorch
-on PyTorch.
+Cost: value-and-gradient of a loss on the HKS at eight times over the value, by all tensors of a grid or all vertices of
+a surface, same solver, same process, in turn, the first calls apart; peak memory of each in a process of its own.
+Accuracy: the gradient of a truncated HKS on 24² nodes with respect to every tensor, against contour integrals of
+resolvents that JAX differentiates by itself (no eigensolver). Rivals are tried where they are installed:
+`jnp.linalg.eigh` after a Cholesky reduction, the `eigh` package, and xitorch on PyTorch.
 """
 
 import argparse
+import json
 import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from machine import RESULTS, field, timed, write
+from machine import RESULTS, field, timed_once, write
 
 import hks_jax as hj
-from hks_jax.eigen.choice import choose_solver
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from differences import directional, heat_kernel_by_contour
 
-PAIRS = {64: 100, 128: 200, 256: 500}
+PROBLEMS = {
+    "64²": (partial(field, 64), 100, "block-lanczos"),
+    "128²": (partial(field, 128), 200, "block-lanczos"),
+    "256²": (partial(field, 256), 500, "block-lanczos"),
+    "32³": (partial(field, 32, 3), 200, "chebyshev-filter"),
+    "surface": (partial(hj.examples.bumpy_torus_mesh, 256), 100, "block-lanczos"),
+}
+"""A domain, which is differentiated by its tensors or vertices, the number of pairs, and the solver."""
 N_TIMES = 8
 
 
-def loss_on(n: int) -> tuple[Callable, jax.Array]:
-    """Return a loss on the HKS of n² nodes at eight times, and the tensors."""
-    given = field(n)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", hj.AccuracyWarning)
-        pairs = hj.eigenpairs(given, 20, solver="shift-invert")
+def loss_on(name: str) -> tuple[Callable, jax.Array]:
+    """Return a loss on the HKS at eight times, and what it is a function of."""
+    make, k, solver = PROBLEMS[name]
+    domain = make()
+    dimension = hj.assemble(domain).space.dimension
     # Weyl: λ_k t from 10 to 10³.
-    last = float(pairs.eigenvalues[-1]) * PAIRS[n] / 20
+    volume = float(hj.assemble(domain).volume)
+    ball = {2: np.pi, 3: 4 * np.pi / 3}[dimension]
+    last = (2 * np.pi) ** 2 * (k / (ball * volume)) ** (2 / dimension)
     times = jnp.geomspace(10 / last, 1000 / last, N_TIMES)
+    surface = isinstance(domain, hj.SurfaceMesh)
 
-    def loss(tensors: jax.Array) -> jax.Array:
-        pairs = hj.eigenpairs(hj.TensorField(given.grid, tensors), PAIRS[n])
-        signature = 4 * jnp.pi * times[:, None, None] * hj.hks(pairs, times)
-        return jnp.sum(jnp.log(signature) ** 2)
+    def loss(x: jax.Array) -> jax.Array:
+        moved = hj.SurfaceMesh(x, domain.faces) if surface else hj.TensorField(domain.grid, x)
+        signature = hj.hks(hj.eigenpairs(moved, k, solver=solver), times)
+        scale = (4 * jnp.pi * times) ** (dimension / 2)
+        return jnp.mean(jnp.log(scale.reshape(-1, *[1] * (signature.ndim - 1)) * signature) ** 2)
 
-    return loss, given.tensors
+    return loss, domain.vertices if surface else domain.tensors
 
 
-def peak_memory(n: int, what: str) -> float:
+def peak_memory(name: str, what: str) -> float:
     """Return the peak resident memory in GB of one evaluation in a process of its own."""
-    command = [sys.executable, __file__, "--only", what, "--sizes", str(n)]
+    command = [sys.executable, __file__, "--only", what, "--problems", name]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[-1])
 
 
-def only(what: str, n: int) -> None:
+def only(what: str, name: str) -> None:
     """Evaluate once and print the peak memory in GB."""
-    loss, tensors = loss_on(n)
-    if what == "value":
-        jax.block_until_ready(loss(tensors))
-    elif what == "gradient":
-        jax.block_until_ready(jax.value_and_grad(loss)(tensors))
+    loss, x = loss_on(name)
+    jax.block_until_ready(loss(x) if what == "value" else jax.value_and_grad(loss)(x))
     # Not getrusage, whose peak a child inherits from its parent.
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     print(int(status["VmHWM"].split()[0]) / 1e6)
 
 
-def cost(n: int) -> dict:
-    """Measure one size."""
-    loss, tensors = loss_on(n)
-    solver_name = choose_solver("auto", hj.assemble(field(n)), PAIRS[n]).name
-    repeats = 3 if n < 256 else 1
-    value, _ = timed(loss, tensors, repeats=repeats)
-    both, (_, gradient) = timed(jax.value_and_grad(loss), tensors, repeats=repeats)
-    rng = np.random.default_rng(0)
-    direction = rng.standard_normal(tensors.shape)
-    direction = 0.01 * (direction + np.swapaxes(direction, -1, -2))
-    difference = None
-    if n < 256:
-        truth = directional(loss, tensors, direction, step=0.4)
-        difference = float(abs(jnp.vdot(gradient, direction) - truth) / abs(truth))
-    memory = {what: peak_memory(n, what) for what in ("nothing", "value", "gradient")}
+def cost(name: str, memory: bool) -> dict:
+    """Measure one problem."""
+    loss, x = loss_on(name)
+    seconds, gradients, gradient = [], [], None
+    for _ in range(3):  # value and gradient in turn, so that they share what else the machine does; the first compiles
+        seconds.append(timed_once(loss, x)[0])
+        spent, (_, gradient) = timed_once(jax.value_and_grad(loss), x)
+        gradients.append(spent)
+    value, both = min(seconds[1:]), min(gradients[1:])
+    direction = np.random.default_rng(0).standard_normal(x.shape)
+    direction = 0.01 * (direction + np.swapaxes(direction, -1, -2)) if x.ndim > 2 else 1e-3 * direction
+    truth = directional(loss, x, direction, step=0.4)
     row = {
-        "nodes": n * n,
-        "k": PAIRS[n],
-        "solver": solver_name,
+        "problem": name,
+        "nodes": int(np.prod(x.shape[: x.ndim - 2])) if x.ndim > 2 else len(x),
+        "k": PROBLEMS[name][1],
+        "solver": PROBLEMS[name][2],
         "times": N_TIMES,
         "value_s": value,
         "value_and_gradient_s": both,
+        "ratio": both / value,
+        "value_first_s": seconds[0],
+        "gradient_first_s": gradients[0],
+        "directional_error": float(abs(jnp.vdot(gradient, direction) - truth) / abs(truth)),
     }
-    row |= {"ratio": both / value, "directional_error": difference, "peak_GB": memory}
-    print(f"{n}²/{PAIRS[n]}: value {value:.2f} s, with gradient {both:.2f} s, ratio {both / value:.2f}, ", end="")
-    print(f"error {difference}, peak {memory}")
+    if memory:
+        row["peak_GB"] = {what: peak_memory(name, what) for what in ("value", "gradient")}
+    print(f"{name}: " + ", ".join(f"{key} {value:.3g}" for key, value in row.items() if isinstance(value, float)))
     return row
 
 
@@ -178,17 +188,19 @@ def with_xitorch(tensors: jax.Array, matrices: Callable, probe: jax.Array, times
 def main() -> None:
     """Measure, print, and write the result file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=list(PAIRS), choices=list(PAIRS))
-    parser.add_argument("--only", choices=["nothing", "value", "gradient"], help=argparse.SUPPRESS)
+    parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
+    parser.add_argument("--memory", nargs="*", default=["256²"], choices=list(PROBLEMS), help="peak memory of which")
+    parser.add_argument("--cost-alone", action="store_true", help="leave the accuracy in the file as it is")
+    parser.add_argument("--only", choices=["value", "gradient"], help=argparse.SUPPRESS)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "derivatives.json")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore", hj.AccuracyWarning)
     if args.only:
-        only(args.only, args.sizes[0])
+        only(args.only, args.problems[0])
         return
-    compared = accuracy()
-    write(args.output, [cost(n) for n in args.sizes], accuracy=compared)
+    compared = json.loads(args.output.read_text())["accuracy"] if args.cost_alone else accuracy()
+    write(args.output, [cost(name, name in args.memory) for name in args.problems], accuracy=compared)
 
 
 if __name__ == "__main__":

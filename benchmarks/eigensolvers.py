@@ -178,7 +178,7 @@ def measure(solver: str, name: str, k: int, reference: list[float], slepc_python
 
 
 def main() -> None:
-    """Measure every case, print a table, write the results and their plot."""
+    """Measure every case, print a table, write the results."""
     if sys.argv[1:2] == ["--here"]:
         measure_here(sys.argv[2], sys.argv[3], int(sys.argv[4]))
         return
@@ -229,35 +229,6 @@ def main() -> None:
                 shown = " ".join(f"{key} {value:.3g}" for key, value in found.items())
                 print(f"  {solver:38s} {shown}", flush=True)
             write(arguments.output, rows, tolerance=TOLERANCE)
-    draw(rows, arguments.output.with_suffix(".png"))
-
-
-def draw(rows: list[dict], path: Path) -> None:
-    """Draw time against nodes for each solver and k, with the fitted exponent."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
-    names = list(dict.fromkeys(row["solver"] for row in rows if "seconds" in row))
-    for k, style in zip(sorted({row["k"] for row in rows}), ("-o", "--s", ":^", "-.d"), strict=False):
-        for colour, name in enumerate(names):
-            points = [
-                (r["nodes"], r["seconds"]) for r in rows if r["solver"] == name and r["k"] == k and "seconds" in r
-            ]
-            if len(points) < 2:
-                continue
-            nodes, seconds = np.transpose(sorted(points))
-            exponent = np.polyfit(np.log(nodes), np.log(seconds), 1)[0]
-            axes.loglog(nodes, seconds, style, color=f"C{colour}", label=f"{name}, k = {k}: $N^{{{exponent:.2f}}}$")
-    axes.set_xlabel("nodes")
-    axes.set_ylabel("seconds, compilation apart")
-    axes.grid(alpha=0.3, which="both")
-    if axes.lines:
-        axes.legend(fontsize=7)
-    figure.savefig(path, dpi=150)
-    print(f"written to {path}")
 
 
 if __name__ == "__main__":

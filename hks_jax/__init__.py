@@ -22,6 +22,9 @@ from hks_jax.domain.grid import Grid as Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
 from hks_jax.domain.tet_mesh import TetMesh as TetMesh
+from hks_jax.eigen.complement.adjoint import Adjoint as Adjoint
+from hks_jax.eigen.complement.factorised import FactorisedAdjoint as FactorisedAdjoint
+from hks_jax.eigen.complement.filtered import FilteredAdjoint as FilteredAdjoint
 from hks_jax.eigen.count import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
@@ -29,6 +32,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
 from hks_jax.eigen.eigsh import MatrixEigenpairs as MatrixEigenpairs
 from hks_jax.eigen.eigsh import eigsh as eigsh
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter as ChebyshevFilter
+from hks_jax.eigen.host.complement import HostAdjoint as HostAdjoint
 from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos as BlockLanczos
 from hks_jax.eigen.solve import eigenpairs as eigenpairs
@@ -53,6 +57,8 @@ from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.heat import heat_kernel as heat_kernel
 from hks_jax.signatures.heat import heat_trace as heat_trace
 from hks_jax.signatures.heat import scale_invariant_hks as scale_invariant_hks
+from hks_jax.signatures.regions import RegionStatistics as RegionStatistics
+from hks_jax.signatures.regions import region_statistics as region_statistics
 from hks_jax.signatures.scale_space import gaussian_scale_space as gaussian_scale_space
 from hks_jax.signatures.scale_space import tensor_invariants as tensor_invariants
 from hks_jax.signatures.tail import truncation_map as truncation_map
@@ -70,7 +76,7 @@ from hks_jax.spectrum_free.colours import Colouring as Colouring
 from hks_jax.spectrum_free.hks import colouring as colouring
 from hks_jax.spectrum_free.hks import hks_spectrum_free as hks_spectrum_free
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:

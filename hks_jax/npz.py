@@ -37,9 +37,9 @@ def _check_number(file: Path, archive: zipfile.ZipFile) -> None:
     with open(file, "rb") as stream:
         stream.seek(-(22 + len(archive.comment)), os.SEEK_END)
         end = stream.read()
-    declared, found = int.from_bytes(end[10:12], "little"), len(archive.filelist)
-    if declared not in (found, 0xFFFF):  # the latter stands for more
-        raise ValueError(f"it ends with {declared} members, and lists {found}")
+    declared, listed = int.from_bytes(end[10:12], "little"), len(archive.filelist)
+    if declared not in (listed, 0xFFFF):  # the latter stands for more
+        raise ValueError(f"it ends with {declared} members, and lists {listed}")
 
 
 def load_npy(path: str | os.PathLike[str]) -> np.ndarray:

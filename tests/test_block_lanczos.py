@@ -18,7 +18,6 @@ from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.state import Plan, crowded, first_state, make_room
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import factorise
-from hks_jax.linear.symmetric_inverse import by_eigenvalues, by_elimination
 
 
 def mask(shape):
@@ -53,16 +52,6 @@ def problem(rng, name, spread=1.0):
 
 def dense_matrices(pencil):
     return np.asarray(pencil.stiffness.to_dense()), np.asarray(pencil.mass.to_dense())
-
-
-@pytest.mark.parametrize("inverse", [by_eigenvalues, by_elimination])
-@pytest.mark.parametrize("n", [1, 7, 32, 75])
-def test_inverse_and_inertia_of_an_indefinite_matrix(rng, inverse, n):
-    a = rng.standard_normal((3, n, n))
-    a = a + np.swapaxes(a, 1, 2)
-    inverted, pivots = inverse(jnp.asarray(a), jnp.zeros(3))
-    np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-9)
-    np.testing.assert_array_equal((pivots < 0).sum(axis=1), (np.linalg.eigvalsh(a) < 0).sum(axis=1))
 
 
 @pytest.mark.parametrize("n", [32, 64])
@@ -107,13 +96,14 @@ def check_against_dense(pencil, pairs):
     np.testing.assert_allclose(vectors[:whole].T @ vectors[:whole], exact @ exact.T, atol=atol)
 
 
-@pytest.mark.parametrize("name", [pytest.param("torus", marks=pytest.mark.slow), "mask", "3d"])
+@pytest.mark.parametrize("name", ["mask", *(pytest.param(n, marks=pytest.mark.slow) for n in ("torus", "3d"))])
 def test_pairs_agree_with_dense_ones(rng, name):
     pencil = problem(rng, name)
     # Slices so small that several are needed.
     check_against_dense(pencil, hj.eigenpairs(pencil, 60, solver=hj.BlockLanczos(block=4, slice_size=20)))
 
 
+@pytest.mark.slow
 def test_multiplicities_beyond_the_block_are_complete():
     # Twelve equal squares: every eigenvalue at least twelvefold, those of symmetric pairs of modes 24-fold.
     inside = np.zeros((27, 36), bool)
@@ -137,7 +127,7 @@ def test_torus_multiplets_and_certificate():
     assert "none missed" in pairs.summary()
 
 
-@pytest.mark.parametrize("domain", ["torus", "mirror", "mesh"])
+@pytest.mark.parametrize("domain", ["torus", pytest.param("mirror", marks=pytest.mark.slow), "mesh"])
 def test_eigenvalues_are_counted_without_being_computed(rng, domain):
     if domain == "torus":
         pencil = hj.assemble(flat((20, 20), (1.0, 1.0), (True, True)), "periodic")
@@ -219,6 +209,7 @@ def test_a_shift_where_a_front_is_singular_is_moved(rng):
     assert np.isfinite(state.start).all()
 
 
+@pytest.mark.slow
 def test_counts_are_right_at_eigenvalues_of_parts_of_the_domain(rng):
     """Without pivots that are bounded and tried out, a third of these counts is wrong."""
     grid = hj.Grid((16, 16), 1 / 15)
@@ -243,6 +234,7 @@ def test_a_count_at_a_square_of_unit_metric():
     assert int(hj.count_eigenvalues(flat((16, 16), (15.0, 15.0)), 3.6491651253263275)) == 63
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "spacing", "k"), [((3, 97), (0.0167, 0.808), 7), ((4, 200), (0.01, 1.0), 7)])
 def test_domains_much_longer_than_wide(shape, spacing, k):
     field = hj.TensorField(hj.Grid(shape, spacing), jnp.broadcast_to(jnp.eye(2), (*shape, 2, 2)))
@@ -256,6 +248,7 @@ def test_domains_much_longer_than_wide(shape, spacing, k):
     assert pairs.complete_below > exact[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1e2, 1e4])
 def test_a_dumbbell_whose_first_eigenvalue_is_tiny(ratio):
     """Two squares and a bridge along which 1/ratio is conducted: right, or told by a warning and by the result code."""
@@ -272,6 +265,7 @@ def test_a_dumbbell_whose_first_eigenvalue_is_tiny(ratio):
     assert not told or not np.isfinite(pairs.eigenvalues).all() or pairs.complete_below > 0
 
 
+@pytest.mark.slow
 def test_traced_and_batched(rng):
     field = hj.TensorField(hj.Grid((26, 22), 0.1), random_spd(rng, (26, 22)))
     solve = partial(hj.eigenpairs, k=20, solver=hj.BlockLanczos(block=4, slice_size=14))
@@ -306,6 +300,7 @@ def test_gradient_equals_the_dense_one(rng):
     np.testing.assert_allclose(jax.grad(loss)(tensors, "block-lanczos"), dense, atol=1e-8 * np.abs(dense).max())
 
 
+@pytest.mark.slow
 def test_float32_finds_what_rounding_allows(rng):
     grid = hj.Grid((24, 22), 0.1)
     tensors = random_spd(rng, grid.shape)
@@ -319,6 +314,7 @@ def test_float32_finds_what_rounding_allows(rng):
     np.testing.assert_allclose(values, reference, atol=1e-3 * reference[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["block-lanczos", pytest.param("chebyshev-filter", marks=pytest.mark.slow)])
 def test_float32_tensors_where_float64_is_enabled(rng, solver):
     grid = hj.Grid((24, 22), 0.1)
@@ -338,6 +334,7 @@ def test_float32_tensors_where_float64_is_enabled(rng, solver):
         np.testing.assert_allclose(found, reference, atol=1e-3 * reference[1])
 
 
+@pytest.mark.slow
 def test_what_it_cannot_do_is_said(rng):
     pencil = problem(rng, "neumann")
     with pytest.raises(ValueError, match=r"k: the block-lanczos solver gives at most \d+ of 546 pairs"):

@@ -34,6 +34,7 @@ def field_diagonal_on_the_sides(rng, shape) -> hj.TensorField:
 IN_3D = pytest.param((3, 4, 3), "consistent", marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "mass"), [((7, 9), "lumped"), ((7, 9), "consistent"), IN_3D])
 def test_mirror_is_the_really_doubled_torus(rng, shape, mass):
     field = field_diagonal_on_the_sides(rng, shape)
@@ -49,6 +50,7 @@ def test_mirror_is_the_really_doubled_torus(rng, shape, mass):
     assert mirror.pencil.volume == pytest.approx(float(torus.pencil.volume))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", [pytest.param("consistent", marks=pytest.mark.slow), "lumped"])
 def test_mirror_is_the_mean_of_the_mixed_problems(rng, mass):
     field = hj.TensorField(hj.Grid((6, 7), 0.3), random_spd(rng, (6, 7)))
@@ -62,6 +64,7 @@ def test_mirror_is_the_mean_of_the_mixed_problems(rng, mass):
     np.testing.assert_allclose(hj.hks(mirror, TIMES), np.mean(mixed, axis=0), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_mirror_part_too_small_for_lanczos_is_solved_densely():
     field = flat((20, 4), (1.0, 0.2))
 
@@ -73,6 +76,7 @@ def test_a_mirror_part_too_small_for_lanczos_is_solved_densely():
     np.testing.assert_allclose(jax.jit(signature)(field.tensors)[1], eager[1], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_truncated_mirror_spectrum_misses_nothing(rng):
     # Long and thin: nearly all low modes belong to two of the four problems, not to a fair share of each.
     field = hj.TensorField(hj.Grid((60, 4), (1.0, 0.05)), random_spd(rng, (60, 4), 0.1))
@@ -80,6 +84,7 @@ def test_truncated_mirror_spectrum_misses_nothing(rng):
     np.testing.assert_allclose(hj.eigenpairs(field, 40, "mirror").eigenvalues, whole.eigenvalues[:40], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_mirror_removes_the_boundary_effect_of_a_flat_metric():
     field = flat((17, 17), (1.0, 1.0))
     t = [0.01]
@@ -132,6 +137,7 @@ def test_reflect_and_crop_name_bad_arguments():
         hj.crop(np.zeros((2, 6, 7)), field.grid)
 
 
+@pytest.mark.slow
 def test_neumann_doubles_at_an_edge_and_quadruples_in_a_corner():
     pairs = hj.eigenpairs(flat((21, 21), (1.0, 1.0)), 441)
     values = hj.hks(pairs, [0.02], "flat")[0]

@@ -36,9 +36,13 @@ def test_tolerances_of_solvers(value):
     for solver in SOLVERS:
         with pytest.raises(ValueError, match=r"^tolerance: got .*; expected a finite number above 0 and below 1"):
             solver(tolerance=value)
-    for solver in SOLVERS[1:]:
-        with pytest.raises(ValueError, match=r"^derivative_tolerance: got "):
-            solver(derivative_tolerance=value)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -1e-8, 0, 1, "1e-8"])
+@pytest.mark.parametrize("adjoint", [hj.FactorisedAdjoint, hj.FilteredAdjoint, hj.HostAdjoint])
+def test_tolerances_of_adjoints(adjoint, value):
+    with pytest.raises(ValueError, match=r"^tolerance: got .*; expected a finite number above 0 and below 1"):
+        adjoint(tolerance=value)
 
 
 @pytest.mark.parametrize("value", [0, -3, 0.5, 2.0, NAN, "8", 1j])

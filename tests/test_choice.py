@@ -79,6 +79,7 @@ def test_who_asks_for_shift_invert_gets_it_under_jit():
     assert "pure_callback" in set(primitives(jaxpr.jaxpr))
 
 
+@pytest.mark.slow
 def test_what_auto_chooses_where_values_are_known():
     plane, volume = hj.assemble(flat((42, 41), (1.0, 1.0))), hj.assemble(flat((12, 12, 13), (1.0, 1.0, 1.0)))
     surface = hj.assemble(hj.examples.bumpy_torus_mesh(50))

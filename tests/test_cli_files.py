@@ -1,6 +1,7 @@
 """The command line on files: what is in them, other formats, and scans to signatures."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel as nib
@@ -13,6 +14,7 @@ from hks_jax.cli.job import Result
 from hks_jax.cli.outputs import write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
+from hks_jax.cli.spelling import OPTIONS, as_options
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12, 5)
@@ -57,6 +59,7 @@ def error_of(capsys, arguments):
     return errors[0]
 
 
+@pytest.mark.slow
 def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
     out, mask = tmp_path / "out", str(tmp_path / "m.nii.gz")
     arguments = ["--mask", mask, "--slice", "z=3", "--metric", "inverse", "-k", "10", "--times", "2e4", "4e4"]
@@ -65,7 +68,13 @@ def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
     arguments += ["--repair", "nearest:1e-6"]
     assert main(["hks", *scan, "-o", str(out), "-q", *arguments]) == 0
     assert capsys.readouterr().err == ""
-    assert sorted(file.name for file in out.iterdir()) == ["hks.nii.gz", "hks.npz", "hks.png", "report.json"]
+    assert sorted(file.name for file in out.iterdir()) == [
+        "hks.json",
+        "hks.nii.gz",
+        "hks.npz",
+        "hks.png",
+        "report.json",
+    ]
     report = json.loads((out / "report.json").read_text())
     assert report["input"]["order"] == "fit"
     assert report["input"]["notes"][0] == "weighted least squares on 13 of 13 images (b ≤ 1000 s/mm²)"
@@ -168,6 +177,7 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
 # ------------------------------------------------------------------------------------------------------ meshes
 
 
+@pytest.mark.slow
 def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     meshio = pytest.importorskip("meshio")
     ball = hj.examples.ball_mesh(3)
@@ -297,15 +307,32 @@ def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library
     volume = read_tensors(tensors)
     assert image_suffix(tmp_path / f"t{suffix}") == suffix
     report = {"settings": {"k": 3, "metric": "inverse"}}
+    volume = replace(volume, tensors=volume.tensors.astype(np.float32))
     result = Result(volume, np.array([1.0, 2.0]), np.ones((2, *SHAPE)), np.arange(3.0), report)
     out = tmp_path / "out"
     write_outputs(out, result, Progress(quiet=True), Path.touch, suffix, ["hks-jax", "hks"])
-    assert sorted(file.name for file in out.iterdir()) == sorted([f"hks{suffix}", "hks.npz", "hks.png", "report.json"])
+    names = {f"hks{suffix}", "hks.npz", "hks.png", "report.json"} | ({"hks.json"} if suffix == ".nii.gz" else set())
+    assert {file.name for file in out.iterdir()} == names
     assert b"hks-jax " in (out / f"hks{suffix}").read_bytes() or suffix != ".nrrd"  # headers are text
     with np.load(out / "hks.npz") as read:
         record = json.loads(str(read["provenance"]))
+        assert read["hks"].dtype == np.float32  # as the tensors are
     assert (record["command"], record["settings"], record["times"]) == (["hks-jax", "hks"], report["settings"], [1, 2])
     assert record["source"] == str(tensors)
+
+
+def test_messages_name_the_options():
+    for said, expected in (
+        ("x.vti: it has a and b. Pass array", "x.vti: it has a and b. Pass --array"),
+        ('fitted with b-vectors, pass frame "fsl"', "fitted with b-vectors, pass --frame fsl"),
+        ('Pass frame: "world" (the axes) or "voxel"', 'Pass --frame world (the axes) or "voxel"'),
+        ("Pass order (--order), one of these", "Pass --order, one of these"),
+        ('Pass components="largest", or components="all"', "Pass --components largest, or --components all"),
+        ("k: got 0; expected 1", "-k: got 0; expected 1"),
+        ("b_max: 10 leaves none", "--b-max: 10 leaves none"),
+        ("outside, pass the mask or mask them", "outside, pass the mask or mask them"),
+    ):
+        assert as_options(said, OPTIONS) == expected
 
 
 def test_help(capsys):

@@ -44,6 +44,7 @@ def skewed_torus(shape):
     return field, jax.vmap(jax.vmap(skewed))(jnp.asarray(grid.nodes))[..., 1]
 
 
+@pytest.mark.slow
 def test_curvature_from_a_function_is_exact():
     np.testing.assert_allclose(hj.gaussian_curvature(examples.sphere_field(9)), 1, atol=1e-12)
     np.testing.assert_allclose(hj.gaussian_curvature(examples.hyperbolic_field(9)), -1, atol=1e-12)
@@ -66,6 +67,7 @@ def test_nodal_curvature_converges_at_high_order(periodic):
     assert errors[1] < 1e-3
 
 
+@pytest.mark.slow
 def test_laplace_beltrami_of_known_functions():
     # A coordinate function of the unit sphere: ∇²f = −2f. Stereographic: z = (1 − |x|²)/(1 + |x|²).
     field = examples.sphere_field(41, 1.0)
@@ -116,6 +118,7 @@ def test_curvature_is_differentiable_and_traceable():
     assert both[0] == pytest.approx(2 * float(both[1]))
 
 
+@pytest.mark.slow
 def test_sphere_expansion_has_the_textbook_coefficients():
     # 4πt·k = 1 + t/3 + t²/15 + 4t³/315 + …
     t = np.array([0.1, 0.3])
@@ -146,6 +149,7 @@ def test_expansion_against_the_exact_kernel_of_a_torus(order, source):
     assert np.log2(errors[1] / errors[0]) == pytest.approx(order + 1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_expansion_does_not_depend_on_the_chart():
     """Off-diagonal components in every term, u₃ with its six derivatives included, against the orthogonal chart."""
 
@@ -181,6 +185,7 @@ def test_taylor_series_and_their_arithmetic():
     np.testing.assert_allclose(one, np.eye(15)[0], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_nodal_expansion_in_float32_is_sound_up_to_30_h_squared():
     field = examples.torus_field((32, 32), R, r)
     single = hj.TensorField(field.grid, field.tensors.astype(jnp.float32))
@@ -222,6 +227,7 @@ def test_slip_curvature_of_a_diagonal_metric_needs_a_plus():
     assert abs(curvature(-1, x) - 1) > 0.5
 
 
+@pytest.mark.slow
 def test_slip_varadhan_is_a_limit_of_small_times():
     """−4t log k_t(x, y) → d²(x, y) as t → 0; as t → ∞ it grows without bound, like 4t log(area)."""
     n = 33

@@ -41,7 +41,7 @@ SPACES = {
 }
 
 
-@pytest.mark.parametrize("name", SPACES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n == "hyperbolic" else ()) for n in SPACES])
 def test_spaces_of_known_curvature(name):
     metric, R, u2 = SPACES[name]
     field, t = hj.TensorField.from_function(metric, GRID), 0.3
@@ -103,6 +103,7 @@ def exact():
     return warped_hks(EXACT_TIMES, a, b, EXACT_NODES, 40)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periodic", [True, False])
 def test_nodal_curvature_converges_at_high_order(periodic):
     errors = []
@@ -114,7 +115,9 @@ def test_nodal_curvature_converges_at_high_order(periodic):
     assert np.log2(errors[0] / errors[1]) > (4.8 if periodic else 4.3)
 
 
-@pytest.mark.parametrize(("source", "order"), [("function", 2), ("nodal", 1), ("nodal", 2)])
+@pytest.mark.parametrize(
+    ("source", "order"), [pytest.param("function", 2, marks=pytest.mark.slow), ("nodal", 1), ("nodal", 2)]
+)
 def test_expansion_against_the_exact_kernel(order, source, exact):
     """R and Ric vary, and Ric has three different eigenvalues: every term of u₂ counts."""
     times, n = EXACT_TIMES, EXACT_NODES
@@ -127,6 +130,7 @@ def test_expansion_against_the_exact_kernel(order, source, exact):
     assert np.log2(errors[1] / errors[0]) == pytest.approx(order + 1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_mask_leaves_nan_where_no_stencil_fits_and_nothing_else_changes():
     grid = hj.Grid.from_bounds(-0.5, 0.5, (16, 16, 16))
     tensors = np.array(hj.TensorField.from_function(conformal(1), grid).tensors)

@@ -2,6 +2,7 @@
 
 import warnings
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -99,6 +100,7 @@ def test_truncated_hks_against_contour_integrals(rng, name):
         assert jnp.linalg.norm(gradient - expected) < 1e-8 * jnp.linalg.norm(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["identity", "noise 1e-9"])
 def test_full_spectrum_against_the_matrix_exponential(rng, name):
     tensors, shape, times = FIELDS[name](rng)[:6, :6], (6, 6), TIMES
@@ -122,7 +124,7 @@ def test_full_spectrum_against_the_matrix_exponential(rng, name):
     ("boundary", "mass", "solver"),
     [
         pytest.param("dirichlet", "consistent", "shift-invert", marks=pytest.mark.slow),
-        ("dirichlet", "lumped", "dense"),
+        pytest.param("dirichlet", "lumped", "dense", marks=pytest.mark.slow),
         (("periodic", ("neumann", "dirichlet")), "consistent", "dense"),
         pytest.param(("mirror", "neumann"), "lumped", "dense", marks=pytest.mark.slow),
         pytest.param(("mirror", "periodic"), "consistent", "shift-invert", marks=pytest.mark.slow),
@@ -136,6 +138,7 @@ def test_every_boundary_and_mask(rng, boundary, mass, solver):
     check(f, jnp.asarray(random_spd(rng, (8, 9), 0.5)), 0.1 * symmetric(rng, (8, 9)), step=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["neumann", pytest.param("mirror", marks=pytest.mark.slow)])
 def test_the_cube(rng, boundary):
     grid, solver = hj.Grid((4, 4, 4), 0.2), "dense" if boundary == "mirror" else "shift-invert"
@@ -148,8 +151,8 @@ def test_the_cube(rng, boundary):
 @pytest.mark.parametrize(
     ("solver", "dtype"),
     [
-        ("block-lanczos", jnp.float64),
-        ("chebyshev-filter", jnp.float32),
+        pytest.param("block-lanczos", jnp.float64, marks=pytest.mark.slow),
+        pytest.param("chebyshev-filter", jnp.float32, marks=pytest.mark.slow),
         pytest.param("block-lanczos", jnp.float32, marks=pytest.mark.slow),
         pytest.param("chebyshev-filter", jnp.float64, marks=pytest.mark.slow),
         pytest.param("shift-invert", jnp.float32, marks=pytest.mark.slow),
@@ -172,6 +175,7 @@ def test_along_the_tensors_themselves(solver, dtype):
     np.testing.assert_allclose(along, -(value + (rate - value / 2)), atol=3e3 * rounding * float(value.max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [pytest.param(jnp.float64, marks=pytest.mark.slow), jnp.float32])
 def test_gradients_by_symmetric_weights_on_a_torus(dtype):
     """Reverse mode: cotangents of eigenvectors that are multiples of Mφ, which projections turn into rounding."""
@@ -201,10 +205,11 @@ def octahedron_sphere(levels=2):
     return vertices, faces
 
 
-PRECISE = hj.BlockLanczos(block=4, derivative_tolerance=1e-12)
+PRECISE = hj.BlockLanczos(block=4, adjoint=hj.FactorisedAdjoint(1e-12))
 SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in (("dense", 2), (PRECISE, 3))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("solver", "levels"), [*SLOW, ("shift-invert", 2)])
 def test_mesh_by_vertices_and_by_face_metrics(rng, solver, levels):
     """A sphere with the octahedron's symmetry: nearly every eigenvalue is multiple."""
@@ -315,6 +320,7 @@ def rate(tensors):
     return jax.jvp(lambda t: hks_of(tensors, times=t), (TIMES,), (TIMES,))[1]
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_right_or_refused(rng):
     tensors, direction = FIELDS["rotational"](rng), 0.1 * symmetric(rng, SHAPE)
 
@@ -341,6 +347,7 @@ def test_second_derivatives_are_right_or_refused(rng):
     np.testing.assert_allclose(second, jnp.diag(exact), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_batched_equals_looped_and_jitted_equals_eager(rng, solver):
     batch = jnp.stack([FIELDS["generic"](rng), FIELDS["identity"](rng)])
@@ -396,6 +403,7 @@ def test_eigenvalues_within_a_cluster_are_finite_and_right_in_sum(rng):
     np.testing.assert_allclose(gram[1], 0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["dense", pytest.param("shift-invert", marks=pytest.mark.slow)])
 def test_a_cut_cluster_is_completed_or_dropped(rng, solver):
     tensors, direction = identity(SHAPE), 0.1 * symmetric(rng, SHAPE)
@@ -423,6 +431,7 @@ def test_a_cut_cluster_is_completed_or_dropped(rng, solver):
         hj.eigenpairs(hj.TensorField(GRID, tensors), 5, multiplet="keep")
 
 
+@pytest.mark.slow
 def test_solves_that_do_not_converge_are_nan_and_reported():
     """Twelve equal squares: twelve-fold eigenvalues, cut beyond what the guard pairs reach."""
     mask = np.zeros((18, 24), dtype=bool)
@@ -443,9 +452,38 @@ def test_solves_that_do_not_converge_are_nan_and_reported():
     assert slope == pytest.approx(float(jnp.vdot(gradient, tensors)), rel=1e-9)
 
 
-def test_settings_of_the_solves():
-    with pytest.raises(ValueError, match="derivative_tolerance: got 0; expected a finite number above 0 and below 1"):
-        hj.ShiftInvert(derivative_tolerance=0)
+class Lowest(hj.Eigensolver):
+    """A solver as a user would write one: nothing but its pairs."""
+
+    name: ClassVar[str] = "lowest of all"
+    tolerance: float = 1e-8
+
+    def lowest(self, pencil, k, report=print):
+        values, vectors = hj.eigh(pencil.stiffness.to_dense(), pencil.mass.to_dense())[:2]
+        return values[:k], vectors[:, :k].T, jnp.asarray(jnp.inf)
+
+
+PRECISELY = 1e-13
+OTHER_ADJOINTS = {
+    "a user's solver": Lowest(adjoint=hj.FactorisedAdjoint(PRECISELY)),
+    "a user's solver, filtered": Lowest(adjoint=hj.FilteredAdjoint(PRECISELY, block=4)),
+    "a user's solver, on the host": Lowest(adjoint=hj.HostAdjoint(PRECISELY)),
+    "host's pairs, device's solves": hj.ShiftInvert(adjoint=hj.FactorisedAdjoint(PRECISELY)),
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if "," in n else ()) for n in OTHER_ADJOINTS])
+def test_any_adjoint_serves_any_solver(rng, name):
+    probe = jnp.asarray(rng.standard_normal(GRID.shape))
+
+    def loss(tensors, solver):
+        return jnp.vdot(probe, hj.hks(hj.eigenpairs(hj.TensorField(GRID, tensors), 12, solver=solver), [0.3])[0])
+
+    tensors = FIELDS["generic"](rng)
+    expected = jax.grad(loss)(tensors, "dense")
+    np.testing.assert_allclose(
+        jax.grad(loss)(tensors, OTHER_ADJOINTS[name]), expected, atol=1e-9 * jnp.abs(expected).max()
+    )
 
 
 def test_moving_the_pairs_themselves_is_plain_differentiation(rng):

@@ -42,21 +42,25 @@ def found():
     return finish([start("devices", devices=8)], timeout=500)[0]
 
 
+@pytest.mark.slow
 def test_stencil_products_and_their_derivatives_on_slabs(found):
     assert found["devices"] == 8
     assert [len(errors) for errors in found["halo"]] == [1, 3, 1]
     assert max(error for errors in found["halo"] for error in errors.values()) < 1e-15
 
 
+@pytest.mark.slow
 def test_heat_on_slabs_is_the_exponential(found):
     assert found["heat"]["against expm"] < 1e-12
     assert found["heat"]["derivative"] < 1e-13
 
 
+@pytest.mark.slow
 def test_a_batch_shared_out_is_the_batch(found):
     assert found["batch"] < 1e-14
 
 
+@pytest.mark.slow
 def test_batches_for_lapack_on_all_devices_at_once(found):
     assert found["inverses"] < 1e-12
 
@@ -68,10 +72,12 @@ def check_eigenpairs(errors):
     assert errors["signature"] < 1e-9
 
 
+@pytest.mark.slow
 def test_eigenpairs_on_eight_devices(found):
     check_eigenpairs(found["eigenpairs"])
 
 
+@pytest.mark.slow
 def test_refusals_say_what_was_expected(found):
     for message, expected in zip(
         found["refusals"],
@@ -92,6 +98,7 @@ def on_two_processes(mode):
     return both
 
 
+@pytest.mark.slow
 def test_two_processes_exchange_halos():
     on_two_processes("process")
 

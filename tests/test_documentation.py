@@ -1,7 +1,9 @@
 """What the documentation must have, checked without building it."""
 
 import ast
+import importlib
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,15 @@ import pytest
 import hks_jax as hj
 
 ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def tables(monkeypatch):
+    """The scripts that write measurements into pages; they are no package."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    yield importlib.import_module("tables")
+    for name in ("tables", "plots"):
+        sys.modules.pop(name, None)
 
 
 def facade(module=""):
@@ -54,3 +65,34 @@ def test_every_page_is_in_the_navigation():
     assert pages <= named
     notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.py")}
     assert "notebooks/*" in named or notebooks <= named
+
+
+def test_tables_and_plots_are_what_was_measured(tables):
+    assert tables.differences() == []
+
+
+def test_a_changed_result_and_one_shown_nowhere_are_told(tables, monkeypatch):
+    stored, named = tables.load, tables.named()
+    rows = [{"n": 3, "eigh_s": 0.5, "value_s": 0.5, "value_and_gradient_s": 0.5, "hessian_product_s": 0.5}]
+    monkeypatch.setattr(tables, "load", lambda name: stored(name) | ({"rows": rows} if name == "dense" else {}))
+    monkeypatch.setattr(tables, "named", lambda: named - {"stress"})
+    told = ["benchmarks/README.md: its tables", "benchmarks/README.md: stress.json is shown nowhere"]
+    assert tables.differences() == told
+
+
+@pytest.mark.parametrize(
+    ("value", "power", "expected"),
+    [
+        (262144, 2, "512²"),
+        (262144, 3, "64³"),
+        (262144, 1, "262,144"),
+        (8000, 2, "8,000"),
+        (0.137286, 1, "0.137"),
+        (1234.5, 1, "1,234"),
+        (2.78e-11, 1, "2.8e-11"),
+        (None, 1, "—"),
+        ([64, 48], 1, "64 × 48"),
+    ],
+)
+def test_numbers_read_as_one_writes_them(tables, value, power, expected):
+    assert tables.text(value, power) == expected

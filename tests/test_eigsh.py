@@ -56,7 +56,9 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(
+    scope="module", params=[pytest.param(n, marks=pytest.mark.slow if n != "components" else ()) for n in CASES]
+)
 def problem(request):
     K, M = CASES[request.param]()
     dense = sp.eye(K.shape[0]) if M is None else M
@@ -86,7 +88,7 @@ def test_the_lowest_of_any_pencil(problem, solver):
     check(hj.eigsh(K, M, k, solver=solver), K, M, spectrum[:k])
 
 
-@pytest.mark.parametrize("solver", [None, SOLVER])
+@pytest.mark.parametrize("solver", [None, pytest.param(SOLVER, marks=pytest.mark.slow)])
 def test_all_in_an_interval(problem, solver):
     K, M, spectrum = problem
     gaps = np.flatnonzero(np.diff(spectrum) > 1e-4 * np.ptp(spectrum))
@@ -105,6 +107,7 @@ def test_an_interval_without_eigenvalues():
     assert pairs.result == hj.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_every_form_of_a_matrix():
     K, M = indefinite(200)
     reference = hj.eigsh(K, M, 5).eigenvalues

@@ -381,6 +381,7 @@ def test_slices_of_a_volume(browser, tmp_path):
     assert browser.problems == []
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_surface_is_turned_and_its_vertices_are_chosen(browser, tmp_path):
     browser.problems.clear()

@@ -85,6 +85,7 @@ def double(tensors: np.ndarray) -> Callable[[str], tuple[hj.Eigenpairs, np.ndarr
     return compute
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cases", [CASES, pytest.param(MORE_CASES, marks=pytest.mark.slow)], ids=["some", "others"])
 def test_float32_agrees_with_float64(tmp_path, cases):
     tensors = random_spd(np.random.default_rng(32), SHAPE, 0.5)

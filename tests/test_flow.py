@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from annotations import unchecked
 from fields import random_spd
 from scipy.linalg import expm
 
@@ -92,6 +93,8 @@ def test_invariants():
     np.testing.assert_allclose(found["trace"], low + high)
     np.testing.assert_allclose(found["determinant"], low * high)
     np.testing.assert_allclose(found["anisotropy"], (high - low) / (high + low))
+    with unchecked(), pytest.raises(TypeError, match=r"got ndarray; expected hks_jax.TensorField.*Grid\(shape\), T"):
+        hj.tensor_invariants(tensors)
     solid = hj.TensorField(hj.Grid((2, 2, 2)), np.broadcast_to(np.diag([1.7, 0.3, 0.2]), (2, 2, 2, 3, 3)))
     fa = np.sqrt(1.5 * (0.9667**2 + 0.4333**2 + 0.5333**2) / (1.7**2 + 0.3**2 + 0.2**2))
     np.testing.assert_allclose(hj.tensor_invariants(solid)["anisotropy"], fa, rtol=1e-3)

@@ -29,7 +29,12 @@ def energy(grid):
 
 @pytest.mark.parametrize(
     ("shape", "isotropic"),
-    [((4, 5), True), ((4, 5), False), pytest.param((3, 4, 3), True, marks=pytest.mark.slow), ((3, 4, 3), False)],
+    [
+        ((4, 5), True),
+        ((4, 5), False),
+        pytest.param((3, 4, 3), True, marks=pytest.mark.slow),
+        pytest.param((3, 4, 3), False, marks=pytest.mark.slow),
+    ],
 )
 def test_gradient_agrees_with_differences(rng, shape, isotropic):
     d = len(shape)
@@ -82,6 +87,7 @@ def doubled(tensors):
     return tensors
 
 
+@pytest.mark.slow
 def test_nodes_outside_the_mask_have_no_influence_and_no_gradient(rng):
     mask = np.ones((6, 7), dtype=bool)
     mask[:3, :3] = False
@@ -103,6 +109,7 @@ def test_single_precision(rng):
     np.testing.assert_allclose(single, double, atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["linear", LOG])
 def test_eigenvalues_of_turning_tensors_converge_at_second_order(way):
     values = []

@@ -80,6 +80,7 @@ def test_parametrisations_start_at_the_initial_field_and_stay_positive_definite(
     assert jnp.isfinite(slope).all()
 
 
+@pytest.mark.slow
 def test_a_conformal_factor_is_recovered_from_a_flat_start():
     told = []
     fit = hj.fit_metric(signature(CONFORMAL), TIMES, FLAT, "conformal", k=K, progress=told.append)
@@ -120,6 +121,7 @@ def test_by_default_k_is_enough_for_a_target_of_all_pairs():
     assert error(poor, truth) > 3e-3
 
 
+@pytest.mark.slow
 def test_by_default_the_truth_explains_a_target_of_all_pairs():
     """With fewer pairs it does not, and a fit from it goes away from it, to match its own truncation."""
     grid, times = hj.Grid((16, 14), (1 / 15, 1 / 13)), np.geomspace(0.02, 0.2, 4)
@@ -140,6 +142,7 @@ def test_by_default_the_truth_explains_a_target_of_all_pairs():
     assert fit.loss < 0.7 * of_the_truth
 
 
+@pytest.mark.slow
 def test_more_pairs_are_asked_for_where_the_volume_has_grown():
     """Three times the area of the start: the pairs that were enough there are not."""
     large = hj.TensorField(GRID, 3 * np.asarray(CONFORMAL.tensors))
@@ -198,6 +201,7 @@ def test_rotations_with_fixed_eigenvalues():
     assert error(fit, truth) < 0.02
 
 
+@pytest.mark.slow
 def test_eigenvalues_alone():
     """From a start without symmetry: within a multiple eigenvalue only the sum of its copies has a derivative."""
     target = hj.eigenpairs(CONFORMAL, 30).eigenvalues
@@ -412,3 +416,7 @@ def test_solvers_of_optimistix_are_taken_as_they_are():
     )
     assert float(loss_of(fit.problem, fit.values)[0]) == pytest.approx(fit.loss)
     assert fit.loss < 0.1 * fit.history[0].loss
+    # Each point that the solver came to is told once, the last one too, with the loss that belongs to it.
+    assert [step.step for step in fit.history] == list(range(len(fit.history)))
+    assert len({step.loss for step in fit.history}) == len(fit.history)
+    assert min(step.loss for step in fit.history) == pytest.approx(fit.loss, rel=1e-12)

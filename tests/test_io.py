@@ -208,7 +208,7 @@ def test_unreadable_files(tmp_path, tensors):
     with pytest.raises(FileNotFoundError, match="no such file"):
         hj.io.read_tensors(tmp_path / "absent.nii.gz")
     (tmp_path / "t.mha").write_text("")
-    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii, \.nii\.gz, \.nrrd"):
+    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii, \.nii\.gz, \.mif"):
         hj.io.read_tensors(tmp_path / "t.mha")
     for name in ("t.nii", "t.nii.gz", "t.npz"):
         (tmp_path / name).write_bytes(b"not what the name says")
@@ -373,13 +373,18 @@ def test_npz_results(tmp_path, volume):
         np.testing.assert_array_equal(read["mask"], plane.mask)
 
 
+def test_times_of_an_image_are_beside_it(tmp_path, volume):
+    hj.io.save(tmp_path / "v.nii.gz", np.zeros((2, *SHAPE)), volume, name="hks", extra={"times": np.array([1.0, 2.5])})
+    assert json.loads((tmp_path / "v.json").read_text()) == {"Quantity": "hks", "Times": [1.0, 2.5], "Sources": []}
+
+
 def test_results_that_cannot_be_saved(tmp_path, volume):
     with pytest.raises(ValueError, match=r"values: got shape \(5, 4, 6\); expected \(4, 5, 6\)"):
         hj.io.save(tmp_path / "v.npz", np.zeros((5, 4, 6)), volume)
     with pytest.raises(ValueError, match=r"expected a name that ends in \.npz, \.nii\.gz, \.nii, \.nrrd, \.vti"):
         hj.io.save(tmp_path / "v.txt", np.zeros(SHAPE), volume)
     with pytest.raises(ValueError, match="NIfTI has no place for more arrays"):
-        hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"times": [1]})
+        hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"eigenvalues": [1]})
     with pytest.raises(ValueError, match="no 2×2 tensors"):
         hj.io.save_tensors(tmp_path / "v.nii", volume.slice("z", 1))
     assert list(tmp_path.iterdir()) == []

@@ -64,6 +64,7 @@ def triangulated(n):
     return np.asarray(signature).reshape(-1, n, n), hj.Grid((n, n), PERIOD / n).nodes
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:k =", "ignore:2 of 2|1 of 2")
 @pytest.mark.parametrize("other", [pytest.param(reparametrised, marks=pytest.mark.slow), triangulated])
 def test_same_surface_same_signature_to_discretisation_order(other):
@@ -72,6 +73,7 @@ def test_same_surface_same_signature_to_discretisation_order(other):
     assert fine < 0.02
 
 
+@pytest.mark.slow
 def test_permuted_and_flipped_axes_move_the_signature_with_them(rng):
     tensors = random_spd(rng, (5, 6, 7))
     plain = hj.hks(hj.eigenpairs(hj.TensorField(hj.Grid((5, 6, 7), (1, 2, 3)), tensors), 60), [10.0])[0]

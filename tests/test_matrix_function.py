@@ -96,6 +96,7 @@ def test_hessian_at_the_identity_is_the_textbooks():
     np.testing.assert_allclose(got, -jnp.vdot(W, D @ D), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_third_derivatives_are_refused():
     def along(f):
         return lambda A: jax.jvp(f, (A,), (jnp.ones((2, 2)),))[1]
@@ -128,6 +129,7 @@ def test_of_a_pencil_it_is_f_of_the_quotient_times_the_inverse(rng, double):
     np.testing.assert_allclose(hj.matrix_function(A32, lambda x: 1.0, B32), np.linalg.inv(B), atol=10 * tolerance)
 
 
+@pytest.mark.slow
 def test_parameters_of_f_batched_compute_one_decomposition(rng):
     A, times = with_spectrum(rng, SPECTRA["multiple"]), jnp.array([0.1, 0.5, 2.0])
 
@@ -197,6 +199,7 @@ def test_second_divided_differences(f, exact, scale):
     np.testing.assert_allclose(equal, jax.vmap(jax.grad(jax.grad(scaled)))(same) / 2, atol=1e-13 * scale**2)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_reference_prints_what_it_says():
     page = (Path(__file__).parents[1] / "docs" / "reference" / "dense.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

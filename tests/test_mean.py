@@ -35,6 +35,7 @@ def all_pairs(domain, boundary, mass="consistent"):
     return hj.eigenpairs(pencil, sum(part.space.n_dof for part in pencil.parts))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "mass", "boundaries"),
     [
@@ -112,6 +113,7 @@ def test_on_a_curved_rim_curvature_is_left_to_first_order_in_the_root_of_t():
     assert np.abs(values[0] - 1).max() < 0.1 * np.abs(values * (1 + influence) - 1)[0].max()
 
 
+@pytest.mark.slow
 def test_on_a_geodesic_rim_the_expansion_holds_up_to_the_rim():
     """A zone of the unit sphere: the equator is the rim of a mask; two halves glued along it are the sphere itself."""
     shape, spacing = (24, 20), (0.05, 0.09)

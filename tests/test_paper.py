@@ -25,6 +25,7 @@ def agrees(row: table1.Row) -> bool:
 # --- Table 1 ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [50, pytest.param(100, marks=pytest.mark.slow)])
 def test_table_1_coarse_rows(n):
     row = table1.row(n, table1.QUICK_PAIRS, table1.stored_reference())
@@ -195,6 +196,7 @@ def test_figure_1_shows_a_surface_and_its_chart(tmp_path, drawn, monkeypatch):
     assert fig.axes[3].images[0].get_array().shape == (60, 60)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_2_has_three_boundaries_and_profiles_for_two_metrics(tmp_path, drawn, monkeypatch):
     fig = draw(figure2, tmp_path, drawn, monkeypatch, QUICK=41)
@@ -223,6 +225,7 @@ def test_figure_3_has_ellipses_over_images(tmp_path, drawn, monkeypatch):
     one_colour_range([ax.images[0] for ax in fig.axes[4:]])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_4_has_lines_over_every_field(tmp_path, drawn, monkeypatch):
     fig = draw(figure4, tmp_path, drawn, monkeypatch, QUICK=31)
@@ -233,6 +236,7 @@ def test_figure_4_has_lines_over_every_field(tmp_path, drawn, monkeypatch):
         assert len(bottom.collections[0].get_segments()) > 5
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
     fig = draw(figure5, tmp_path, drawn, monkeypatch, QUICK=31)
@@ -244,6 +248,7 @@ def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
     one_colour_range([ax.images[0] for ax in panels])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_6_draws_a_phantom_where_there_is_no_brain(tmp_path, drawn, monkeypatch):
     monkeypatch.setattr(figure6, "find_example_brain", lambda: None)
@@ -255,6 +260,7 @@ def test_figure_6_draws_a_phantom_where_there_is_no_brain(tmp_path, drawn, monke
         assert 0.3 < image.count() / image.size < 0.95  # nothing outside the mask
 
 
+@pytest.mark.slow
 def test_signature_and_enough_pairs(monkeypatch):
     """Enough pairs are enough, and a continued metric has no boundary: the flat square is flat up to its sides."""
     metric = jnp.array([[2.0, 0.5], [0.5, 1.0]])

@@ -205,7 +205,7 @@ def test_influence_lines_are_where_the_influence_is():
 # --- at any size --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n", [20, 300])
+@pytest.mark.parametrize("n", [20, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("inches", "most"), [(1.0, 10), (3.0, 26), (14.0, 26)])
 def test_glyphs_are_as_many_as_fit_whatever_the_grid(n, inches, most):
     """Sizes are in coordinates, so that nothing overlaps in any figure; in a small one there are fewer."""

@@ -289,7 +289,7 @@ def test_lines_stay_inside_the_mask():
     assert outside.shape == (0, 2)
 
 
-@pytest.mark.parametrize("index", [-1.5, 0.5, 1, 2])
+@pytest.mark.parametrize("index", [-1.5, *(pytest.param(i, marks=pytest.mark.slow) for i in (0.5, 1, 2))])
 @pytest.mark.parametrize("which", ["major", "minor"])
 def test_evenly_spaced_lines_cover_and_keep_their_distance(index, which):
     field, separation = rotating_field(index), 0.12
@@ -312,6 +312,7 @@ def test_circles_close():
     assert len(closed) >= 0.8 * len(full)
 
 
+@pytest.mark.slow
 def test_integral_lines_draws_on_the_axes_it_is_given():
     field = rotating_field(0.5, n=41)
     ax = new_figure(3, 3).subplots()

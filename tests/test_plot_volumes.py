@@ -49,6 +49,7 @@ def test_colours_span_the_whole_volume_and_outside_is_left_out():
     assert middle_node(mask) == (3, 2, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "shape"), [(1, (1, 1)), (7, (2, 4))])
 def test_one_column_of_slices_and_one_bar_per_time(n, shape, tmp_path):
     values = ramp()[None] + 1000 * np.arange(n)[:, None, None, None]

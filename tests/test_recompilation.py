@@ -35,9 +35,8 @@ SOLVERS = {
     "block-lanczos": (hj.BlockLanczos(block=2), (9, 10), "neumann"),
     "chebyshev-filter": (hj.ChebyshevFilter(block=4), (14, 13), ("periodic", "dirichlet")),
 }
-QUICK = [("dense", True), ("block-lanczos", False)]
 CASES = [
-    pytest.param(name, gradient, marks=pytest.mark.slow if (gradient and name != "dense") or "," in name else ())
+    pytest.param(name, gradient, marks=() if name == "dense" else pytest.mark.slow)
     for name in SOLVERS
     for gradient in (False, True)
 ]

@@ -9,7 +9,7 @@ from hks_jax.cli import main
 from hks_jax.io import TensorVolume, find_invalid, read_tensors, repair_tensors
 from hks_jax.io.repair import require_valid
 
-SHAPE = (6, 7)
+SHAPE = (8, 9)
 BAD = [(2, 3), (4, 1)]
 
 
@@ -27,7 +27,7 @@ def volume():
 
 
 def test_the_refusal_counts_and_names_the_choices(volume):
-    with pytest.raises(ValueError, match=r"2 of 35 tensors are not positive definite, worst eigenvalue -0\.0004"):
+    with pytest.raises(ValueError, match=r"2 of 63 tensors are not positive definite, worst eigenvalue -0\.0004"):
         require_valid(volume)
     with pytest.raises(
         ValueError, match=r'first at voxel \(2, 3\)\); expected .*\. Choose repair: "clip".*"mask".*"nearest"'
@@ -37,7 +37,7 @@ def test_the_refusal_counts_and_names_the_choices(volume):
     with pytest.raises(ValueError, match="1 of them NaN or infinite"):
         require_valid(volume)
     with pytest.raises(ValueError, match="repair_tensors"):
-        hj.TensorField(volume.with_mask(np.arange(6)[:, None] + np.zeros(7) > 2).grid(), volume.tensors)
+        hj.TensorField(volume.with_mask(np.arange(8)[:, None] + np.zeros(9) > 2).grid(), volume.tensors)
 
 
 def test_clip_is_the_nearest_tensor_with_this_floor(volume):
@@ -61,7 +61,7 @@ def test_clip_is_the_nearest_tensor_with_this_floor(volume):
 
 def test_mask_and_nearest(volume):
     masked = repair_tensors(volume, "mask")
-    assert masked.inside.sum() == 33
+    assert masked.inside.sum() == 61
     assert not masked.inside[BAD[0]]
     volume.tensors[2, 4] = 1e-3 * np.diag([5.0, 6.0])
     volume.tensors[2, 2] = np.nan
@@ -78,13 +78,13 @@ def test_the_report(volume):
         "method": "clip",
         "floor": 1e-4,
         "voxels": 2,
-        "of": 35,
+        "of": 63,
         "not_finite": 0,
         "worst_eigenvalue": pytest.approx(-4e-4),
         "box": [[2, 1], [4, 3]],
         "first": [[2, 3], [4, 1]],
     }
-    assert "2 of 35 tensors have an eigenvalue below 0.0001 (the worst eigenvalue is -0.0004)" in mended.notes[-1]
+    assert "2 of 63 tensors have an eigenvalue below 0.0001 (the worst eigenvalue is -0.0004)" in mended.notes[-1]
     assert "eigenvalues raised to 0.0001" in mended.notes[-1]
     sound = repair_tensors(mended, "mask")
     assert (sound.repair["voxels"], sound.notes) == (0, mended.notes)
@@ -101,7 +101,7 @@ def test_background_is_left_out_and_reading_repairs(tmp_path, volume):
     volume.tensors[0] = 0
     np.savez(tmp_path / "t.npz", tensors=volume.tensors)
     read = read_tensors(tmp_path / "t.npz", repair="nearest")
-    assert (read.repair["voxels"], read.repair["of"]) == (2, 35)
+    assert (read.repair["voxels"], read.repair["of"]) == (2, 63)
     np.testing.assert_array_equal(read.inside, volume.inside)
     np.testing.assert_array_equal(read_tensors(tmp_path / "t.npz").tensors, volume.tensors)
 
@@ -112,7 +112,7 @@ def test_bad_repairs(volume):
     with pytest.raises(ValueError, match="floor: got -1; expected a finite number above 0"):
         repair_tensors(volume, "clip", -1)
     hopeless = TensorVolume(-volume.tensors, (1.0, 1.0), (0.0, 0.0), volume.mask & (np.indices(SHAPE)[0] > 4))
-    with pytest.raises(ValueError, match="none of the 7 tensors is positive definite; check order and units"):
+    with pytest.raises(ValueError, match="none of the 27 tensors is positive definite; check order and units"):
         repair_tensors(hopeless, "clip")
 
 
@@ -121,7 +121,7 @@ def test_the_command_line_refuses(tmp_path, volume, capsys):
     arguments = ["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "-q", "-k", "5", "--times", "1"]
     assert main(arguments) == 2
     error = capsys.readouterr().err
-    assert "2 of 35 tensors are not positive definite" in error
+    assert "2 of 63 tensors are not positive definite" in error
     assert 'Choose --repair: "clip" (raise eigenvalues to a floor), "mask"' in error
     assert main([*arguments, "--repair", "abs"]) == 2
     assert "such as clip:1e-4" in capsys.readouterr().err

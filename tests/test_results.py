@@ -21,7 +21,7 @@ def solve(tensors, **settings):
     return hj.eigenpairs(hj.TensorField(GRID, tensors), 12, **settings)
 
 
-@pytest.mark.parametrize("solver", ["dense", "block-lanczos", "shift-invert"])
+@pytest.mark.parametrize("solver", ["dense", pytest.param("block-lanczos", marks=pytest.mark.slow), "shift-invert"])
 def test_success_is_a_code_that_is_traced(solver):
     results = jax.jit(jax.vmap(lambda T: solve(T, solver=solver).result))(jnp.stack([TENSORS, 2 * TENSORS]))
     assert (results == hj.RESULTS.successful).all()
@@ -63,7 +63,10 @@ def without_guards(solver):
 SOLVERS = [hj.BlockLanczos(), hj.ShiftInvert(), hj.ChebyshevFilter(block=8)]
 
 
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: solver.name)
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(s, id=s.name, marks=() if isinstance(s, hj.ShiftInvert) else pytest.mark.slow) for s in SOLVERS],
+)
 def test_a_derivative_that_does_not_converge_is_told(solver):
     """The first four eigenvalues above zero of a flat torus are equal: a spectrum cut there has no derivative."""
     field, solver = flat((20, 20), (1.0, 1.0), (True, True)), without_guards(solver)

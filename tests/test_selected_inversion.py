@@ -80,7 +80,15 @@ def test_real_definite_matrices_and_single_precision():
     np.testing.assert_allclose(single, expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["torus", "slot", "open mesh", "ball"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("torus", marks=pytest.mark.slow),
+        pytest.param("slot", marks=pytest.mark.slow),
+        "open mesh",
+        pytest.param("ball", marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_in_both_modes(name):
     """d diag(A⁻¹) = −diag(A⁻¹ dA A⁻¹), for a complex symmetric A; and by the entries, one after another, at no loss."""
     pencil = hj.assemble(*DOMAINS[name]())
@@ -100,6 +108,7 @@ def test_derivatives_in_both_modes(name):
         np.testing.assert_allclose(jnp.sum(slope * change).real, (weights @ expected).real, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_work_and_memory_grow_as_they_do_in_the_plane_and_in_space():
     def ratio(small, large):
         costs = [inversion_cost(dissect(hj.assemble(flat(s, (1.0,) * len(s))).pattern)) for s in (small, large)]
@@ -113,6 +122,7 @@ def test_work_and_memory_grow_as_they_do_in_the_plane_and_in_space():
     assert entries < 8**1.5
 
 
+@pytest.mark.slow
 def test_memory_of_a_gradient_grows_neither_with_poles_nor_with_times():
     field = random_field((24, 22))
 
@@ -126,6 +136,7 @@ def test_memory_of_a_gradient_grows_neither_with_poles_nor_with_times():
     assert bytes_of(jnp.geomspace(0.01, 1.0, 8)) - bytes_of(jnp.array([0.01])) < 8 * 20 * 24 * 22 * 8
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 def test_signature_of_a_mesh_and_its_derivative_by_the_vertices():
     mesh, times = open_mesh(), jnp.array([0.3, 2.0])
@@ -142,6 +153,7 @@ def test_signature_of_a_mesh_and_its_derivative_by_the_vertices():
     np.testing.assert_allclose(slope, directional(loss, mesh.vertices, direction, 1e-4), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_under_vmap():
     fields = jnp.stack([random_field((8, 9), seed=seed).tensors for seed in (1, 2)])
     grid = hj.Grid((8, 9), 0.1)

@@ -120,6 +120,7 @@ def test_default_times_span_the_spectrum(pairs):
     np.testing.assert_allclose(np.diff(np.log(times)), np.log(times[-1] / times[0]) / 6)
 
 
+@pytest.mark.slow
 def test_tail_estimate_is_of_the_right_size():
     field = flat((25, 26), (1.0, 1.04))
     few, many = hj.eigenpairs(field, 60), hj.eigenpairs(field, 650)
@@ -150,8 +151,8 @@ def test_the_tail_by_weyl_in_closed_form(d):
         pytest.param((24, 22), "neumann", 0.0, marks=pytest.mark.slow),
         ((24, 22), ("dirichlet", "neumann"), 1.2),
         pytest.param((22, 18), "dirichlet", 0.4, marks=pytest.mark.slow),
-        ((16, 18), "mirror", 1.2),
-        ((8, 9, 7), (("neumann", "dirichlet"), "periodic", "neumann"), 0.4),
+        pytest.param((16, 18), "mirror", 1.2, marks=pytest.mark.slow),
+        pytest.param((8, 9, 7), (("neumann", "dirichlet"), "periodic", "neumann"), 0.4, marks=pytest.mark.slow),
     ],
     ids=str,
 )

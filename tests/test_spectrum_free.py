@@ -76,7 +76,7 @@ def test_colouring_keeps_its_bound(shape, boundary, mass, times):
     ("mass", "sigma", "seed"),
     [
         ("lumped", 2.5, 1),
-        ("consistent", 6.0, 2),
+        pytest.param("consistent", 6.0, 2, marks=pytest.mark.slow),
         pytest.param("lumped", 6.0, 2, marks=pytest.mark.slow),
         pytest.param("consistent", 2.5, 1, marks=pytest.mark.slow),
     ],
@@ -99,6 +99,7 @@ def test_the_bound_holds_on_rough_fields_and_in_single_precision(mass, sigma, se
         assert max(settings.error) <= tolerance
 
 
+@pytest.mark.slow
 def test_tolerances_below_rounding_are_refused():
     field = random_field((16, 15))
     single = hj.TensorField(field.grid, jnp.asarray(field.tensors, jnp.float32))
@@ -119,6 +120,7 @@ def test_tolerances_below_rounding_are_refused():
     assert np.isfinite(hj.hks_spectrum_free(single, [0.005], tolerance=1e-7)).all()
 
 
+@pytest.mark.slow
 def test_few_vectors_serve_a_large_grid_and_the_bound_is_not_absurd():
     field, t = flat((64, 60), (1.0, 1.0), (False, True)), 3 / 63**2
     pencil = hj.assemble(field, ("neumann", "periodic"), "lumped")
@@ -172,7 +174,7 @@ def derivatives_by_all_pairs(mass):
     [
         ("colouring", "lumped"),
         pytest.param("colouring", "consistent", marks=pytest.mark.slow),
-        ("selected-inversion", "consistent"),
+        pytest.param("selected-inversion", "consistent", marks=pytest.mark.slow),
     ],
 )
 def test_derivatives(method, mass):
@@ -194,6 +196,7 @@ def test_derivatives(method, mass):
         np.testing.assert_allclose(forward, found, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_memory_of_a_gradient_does_not_grow_with_the_degree():
     field, times = random_field((20, 22)), jnp.array([0.01])
     settings = hj.colouring(field, times, mass="lumped")
@@ -212,6 +215,7 @@ def test_memory_of_a_gradient_does_not_grow_with_the_degree():
     assert bytes_of(200) - bytes_of(20) < one_block
 
 
+@pytest.mark.slow
 def test_traced_values_need_settings_and_settings_must_fit():
     field, times = random_field((9, 10)), jnp.array([0.01])
 
@@ -235,6 +239,7 @@ def test_traced_values_need_settings_and_settings_must_fit():
         jax.grad(jax.grad(lambda s: loss(s, method=settings)))(1.0)
 
 
+@pytest.mark.slow
 def test_float32():
     shape, times = (24, 22), [0.005, 0.01]
     field = random_field(shape)
@@ -282,6 +287,7 @@ def test_sources_of_a_colour_are_apart_also_around_a_periodic_axis():
         assert far[~np.eye(i.size, dtype=bool)].all()
 
 
+@pytest.mark.slow
 def test_auto_takes_each_time_from_the_method_that_reaches_it():
     field, times = random_field((24, 22)), [0.02, 0.5, 1.0]
     pairs = hj.eigenpairs(field, 60)

@@ -11,6 +11,7 @@ KINDS = sorted(path.stem for path in Path(stress.__file__).parent.glob("*.py") i
 SEEDS, SECONDS = 20, 2.5
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("always")
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_first_seeds_are_right_told_or_refused(kind):
@@ -30,4 +31,4 @@ def test_what_is_wrong_fails_with_its_reproducer():
     tally = run("numbers", check, seeds(0, 5), 60.0, said.append)
     assert dict(tally.outcomes) == {"refused": 1, "right": 2, "failed": 2}
     assert tally.failures == ["numbers 2: AssertionError: two", "numbers 3: KeyError: 'three'"]
-    assert any("python -m tests.stress numbers --seed 2" in text for text in said)
+    assert any("PYTHONPATH=tests python -m stress numbers --seed 2" in text for text in said)

@@ -54,7 +54,11 @@ def test_the_identity_is_the_metric_of_space(metric):
 
 @pytest.mark.parametrize(
     ("metric", "at"),
-    [pytest.param("inverse", "vertices", marks=pytest.mark.slow), ("tensor", "faces"), ("adjugate", "vertices")],
+    [
+        pytest.param("inverse", "vertices", marks=pytest.mark.slow),
+        pytest.param("tensor", "faces", marks=pytest.mark.slow),
+        ("adjugate", "vertices"),
+    ],
 )
 def test_a_planar_square_converges_to_the_grid(metric, at):
     times, differences = [0.2, 0.5], []
@@ -85,6 +89,7 @@ def test_nothing_depends_on_how_the_surface_lies_in_space(rng):
     np.testing.assert_allclose(hj.eigenpairs(turned, 10).eigenvalues, hj.eigenpairs(plain, 10).eigenvalues, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:k = 8 cuts")
 @pytest.mark.parametrize("metric", [pytest.param("tensor", marks=pytest.mark.slow), "inverse"])
 def test_an_anisotropic_torus_converges_to_its_chart(metric):

@@ -126,7 +126,7 @@ def test_integer_tensors_become_floating(rng):
     assert hj.TensorField(hj.Grid((2, 2)), np.broadcast_to(np.eye(2, dtype=int), (2, 2, 2, 2))).tensors.dtype == float
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_traced_tensors_that_are_not_positive_definite_give_nan(d):
     """Among them −I, whose determinant is positive in the plane, and whose adjugate is I in space."""
     mask = np.ones((9,) * d, dtype=bool)
@@ -151,3 +151,24 @@ def test_traced_tensors_that_are_not_positive_definite_give_nan(d):
     for found in (values, *others, *jnp.moveaxis(gradients[(slice(None), *node)].reshape(6, -1), 1, 0)):
         np.testing.assert_array_equal(np.isfinite(found), good)
     np.testing.assert_allclose(gradients[0], gradients[-1], atol=1e-15)
+
+
+def test_descriptions_are_one_line(rng):
+    field = hj.TensorField(hj.Grid((4, 5)), random_spd(rng, (4, 5)))
+    pairs = hj.eigenpairs(field, 3)
+    surface = hj.examples.sphere_mesh(2)
+    volume = hj.io.TensorVolume(np.array(field.tensors), (1.0, 1.0), (0.0, 0.0))
+    for thing, word in (
+        (field, "float64 (4, 5, 2, 2)"),
+        (pairs, "k=3 of 20"),
+        (pairs.pencil, "20 unknowns"),
+        (surface, "80 triangles"),
+        (volume, "float64 (4, 5, 2, 2)"),
+    ):
+        text = repr(thing)
+        assert word in text
+        assert "\n" not in text
+        assert len(text) < 300
+    traced = []
+    jax.make_jaxpr(lambda f: traced.append(repr(f)))(field)
+    assert traced == [repr(field)]

@@ -101,6 +101,7 @@ def test_ball_converges_at_second_order(boundary):
     assert errors[1] < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("metric", "at", "way"),
     [
@@ -161,7 +162,12 @@ def test_isometries(rng, small):
 
 
 @pytest.mark.parametrize(
-    ("at", "way", "k"), [("cells", "linear", 55), ("vertices", "log-euclidean", 20), ("vertices", "linear", 20)]
+    ("at", "way", "k"),
+    [
+        pytest.param("cells", "linear", 55, marks=pytest.mark.slow),
+        pytest.param("vertices", "log-euclidean", 20, marks=pytest.mark.slow),
+        ("vertices", "linear", 20),
+    ],
 )
 def test_gradients_with_respect_to_tensors_and_vertices(rng, small, at, way, k):
     vertices, cells = small

@@ -58,6 +58,7 @@ def test_what_is_not_resolved_is_nan_and_said(torus):
     assert np.median((np.abs(-4 * t * np.log(np.abs(kernel)) - exact**2) / size)[hidden]) > 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 def test_curved_distances_converge_with_the_known_first_order():
     """On the unit sphere u₀ = √(d/sin d): the squared distance errs by −2t log(d/sin d) + O(t²)."""
@@ -148,6 +149,7 @@ def shortest_way(field: hj.TensorField, start: tuple[int, int], end: tuple[int, 
     return dijkstra(coo_array(entries, (number.size,) * 2), directed=False, indices=number[start])[number[end]]
 
 
+@pytest.mark.slow
 def test_a_tunnel_changes_distances_but_hardly_the_signature():
     start, end, times = (5, 8), (5, 18), jnp.array([16.0, 64.0])
     without, thin, wide = (halls(width) for width in (0, 1, 12))

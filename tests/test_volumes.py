@@ -30,6 +30,7 @@ def unit_cube(n: int) -> hj.Grid:
     return hj.Grid((n, n, n), 1 / (n - 1))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:k = 60 cuts")
 @pytest.mark.parametrize("boundary", [("neumann",) * 3, (("neumann", "dirichlet"), "dirichlet", "neumann")])
 def test_second_order_convergence_to_the_exact_spectrum(boundary):
@@ -42,6 +43,7 @@ def test_second_order_convergence_to_the_exact_spectrum(boundary):
     assert np.log(errors[0] / errors[1]) / np.log(9 / 6) == pytest.approx(2, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_constant_anisotropic_metric_on_the_three_torus():
     """g = AᵀA on the periodic cube: plane waves exp(2πi n·x), λ = 4π² n·g⁻¹n."""
     A = np.array([[1.0, 0.3, -0.2], [0.0, 1.2, 0.25], [0.0, 0.0, 0.8]])
@@ -154,6 +156,7 @@ def test_outside_a_mask_there_is_nothing(rng):
 # ---------------------------------------------------------------------------------------------------- derivatives
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 @pytest.mark.parametrize(
     ("solver", "boundary"),

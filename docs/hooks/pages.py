@@ -1,7 +1,7 @@
 """Pages from files elsewhere in the repository, whose links work in the repository and on the site alike.
 
-README.md becomes the home page, the notebooks become tutorials, and the results of the benchmarks become tables and
-plots. Every page keeps the links that it has in its place in the repository; they are turned to the site's here.
+README.md becomes the home page, and the notebooks become tutorials. Every page keeps the links that it has in its place
+in the repository; they are turned to the site's here.
 """
 
 import posixpath
@@ -12,7 +12,6 @@ from pathlib import Path
 import commands
 import names
 import percent
-import performance
 import references
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -35,14 +34,21 @@ FOLDERS = {
 }
 """Where a link to a folder leads."""
 
-FILES = ("notebooks/*.py", "benchmarks/*.py", "benchmarks/results/*.json", "references.bib", "CITATION.cff", "LICENSE")
+FILES = (
+    "notebooks/*.py",
+    "benchmarks/*.py",
+    "benchmarks/results/*.json",
+    "references.bib",
+    "CITATION.cff",
+    "LICENSE",
+    "pyproject.toml",
+)
 """Files that are on the site as they are, under the path that they have in the repository."""
 
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 
 MARKERS: dict[str, Callable[[str], str]] = {
     "commands": commands.reference,
-    "measured": performance.section,
     "references": references.listing,
 }
 """What replaces ``<!-- name: argument -->`` in a page, and needs the argument."""
@@ -83,8 +89,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         for path in sorted(ROOT.glob(pattern)):
             name = path.relative_to(ROOT).as_posix()
             files.append(File.generated(config, name, abs_src_path=str(path)))
-    for name, picture in performance.plots().items():
-        files.append(File.generated(config, f"images/measured/{name}.svg", content=picture))
     return files
 
 

@@ -6,23 +6,25 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
 from hks_jax import __version__
-from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum
+from hks_jax.cli import batch, convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum, stats
 from hks_jax.cli.cache import keep_compiled
+from hks_jax.cli.spelling import OPTIONS, as_options
 
 EPILOG = """\
 examples:
   hks-jax demo
   hks-jax info tensor.nii.gz
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
+  hks-jax batch subjects.tsv -o study --metric inverse --boundary mean --atlas atlas.nii.gz
   hks-jax hks --help
 """
 
-SUBCOMMANDS = (hks, spectrum, curvature, fit, plot, explore, info, convert, demo, paper)
+SUBCOMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
@@ -70,7 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
     0: done; 1: the computation failed; 2: bad input; 130: interrupted. Output files appear whole
-    and, but for `paper` and the checkpoint of `fit`, all at the end: unless it is 0, there are none.
+    and, but for `paper`, `batch`, the checkpoint of `fit` and the pairs that `hks` keeps, all at the end: unless it is
+    0, there are none.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
     if not argv:
@@ -90,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except np.linalg.LinAlgError as error:
         return _fail(args, str(error), FAILED, error)
     except INPUT_ERRORS as error:
-        return _fail(args, str(error), BAD_INPUT, error)
+        return _fail(args, as_options(str(error), [name for name in OPTIONS if name in args]), BAD_INPUT, error)
     except Exception as error:
         return _fail(args, f"{type(error).__name__}: {error}", FAILED, error)
     return 0
@@ -110,7 +113,7 @@ def run_and_exit() -> NoReturn:
     sys.exit(code)
 
 
-def _interrupt_again(unraisable: "sys.UnraisableHookArgs") -> None:
+def _interrupt_again(unraisable: Any) -> None:
     # Python discards what is raised in finalisers and in callbacks of the garbage collector (JAX has one). An interrupt
     # that lands there comes again a moment later, when the callback is over.
     if isinstance(unraisable.exc_value, KeyboardInterrupt):

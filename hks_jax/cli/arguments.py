@@ -4,6 +4,7 @@ import math
 from argparse import ArgumentTypeError
 from typing import NamedTuple, cast
 
+from hks_jax.domain.indefinite import MAPS, PositiveMap
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.repair import REPAIRS, Repair
 
@@ -40,6 +41,21 @@ def parse_repair(text: str) -> tuple[Repair, float | None]:
     if name not in REPAIRS or not (floor is None or 0 < floor < math.inf):
         raise ArgumentTypeError(f"got {text!r}; expected {', '.join(REPAIRS)}, or one with a floor, such as clip:1e-4")
     return cast(Repair, name), floor
+
+
+def parse_positive(text: str) -> tuple[PositiveMap, float]:
+    """Read ``exp:2e6`` or ``shift:5e6``."""
+    name, _, number = text.partition(":")
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if name not in MAPS or not math.isfinite(value) or (name == "exp" and value <= 0):
+        raise ArgumentTypeError(
+            f"got {text!r}; expected exp:S for exp(T/S), or shift:C for T + C·I, with a number in the tensors' units, "
+            "such as exp:2e6"
+        )
+    return cast(PositiveMap, name), value
 
 
 def parse_voxel(text: str) -> tuple[int, int, int]:

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
         from hks_jax.cli.job import describe_input
         from hks_jax.cli.outputs import plain
 
-        found = {**describe_input(volume, volume.mask), "not_positive_definite": invalid, "files": [str(args.output)]}
-        print(json.dumps(plain(found), ensure_ascii=False))
+        report = {**describe_input(volume, volume.mask), "not_positive_definite": invalid, "files": [str(args.output)]}
+        print(json.dumps(plain(report), ensure_ascii=False))
     elif not args.quiet:
         print(args.output)

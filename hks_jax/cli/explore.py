@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
         ValueError: a result that cannot be shown, or labels that do not fit it.
     """
     from hks_jax.cli.outputs import check_folder
-    from hks_jax.io.labels import read_labels
+    from hks_jax.io.labels import read_labels, read_names
     from hks_jax.plot import explore
 
     source = args.result / "hks.npz" if args.result.is_dir() else args.result
@@ -77,12 +77,12 @@ def run(args: argparse.Namespace) -> None:
         with progress.stage("reading", str(source)):
             more = load_npz(source)
             values, times, domain = _read(source, more)
-            place = _Place.of(more, values.ndim - 1)
+            place = Place.of(more, values.ndim - 1)
             labels = None
             if args.labels is not None:
                 labels = read_labels(args.labels, values.shape[1:], place.affine, place.slice_axis)
             names = None if args.names is None else read_names(args.names)
-        about = _About.of(more)
+        about = About.of(more)
         with progress.stage("writing", str(page)):
             explore(
                 values,
@@ -118,7 +118,7 @@ def _read(source: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
     return saved.values, saved.times, saved.grid
 
 
-class _Place(NamedTuple):
+class Place(NamedTuple):
     """Where the grid lies in space: the affine of its volume, the axis that it cuts, and what its indices become."""
 
     affine: np.ndarray | None
@@ -126,7 +126,8 @@ class _Place(NamedTuple):
     world: np.ndarray | None
 
     @classmethod
-    def of(cls, arrays: dict[str, np.ndarray], dimension: int) -> "_Place":
+    def of(cls, arrays: dict[str, np.ndarray], dimension: int) -> "Place":
+        """Return where the grid of a saved result lies."""
         affine = arrays.get("affine")
         slice_axis = int(arrays["slice_axis"]) if "slice_axis" in arrays else None
         if affine is None:
@@ -135,7 +136,7 @@ class _Place(NamedTuple):
         return cls(affine, slice_axis, affine[:3, [a for a in range(4) if dimension == 3 or a != thin]])
 
 
-class _About(NamedTuple):
+class About(NamedTuple):
     """What the result says of its origin."""
 
     settings: dict[str, Any]
@@ -145,7 +146,8 @@ class _About(NamedTuple):
     k: int | None
 
     @classmethod
-    def of(cls, arrays: dict[str, np.ndarray]) -> "_About":
+    def of(cls, arrays: dict[str, np.ndarray]) -> "About":
+        """Return what a saved result says."""
         record = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
         settings = record.get("settings") or {}
         # Fitted tensors are in mm²/s, and their grids in mm.
@@ -157,7 +159,7 @@ class _About(NamedTuple):
         return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", "".join(cuts[-1:]), k)
 
 
-def _spread(tensors: np.ndarray | None, values: np.ndarray, times: np.ndarray, about: _About) -> np.ndarray | None:
+def _spread(tensors: np.ndarray | None, values: np.ndarray, times: np.ndarray, about: About) -> np.ndarray | None:
     """Return √(Dt), where t is the time of a diffusion: with the median of the mean diffusivity inside."""
     if tensors is None or about.settings.get("metric") != "inverse":
         return None
@@ -166,7 +168,7 @@ def _spread(tensors: np.ndarray | None, values: np.ndarray, times: np.ndarray, a
     return np.sqrt(diffusivity * times) if diffusivity > 0 else None
 
 
-def _facts(about: _About, domain: Grid | SurfaceMesh) -> dict[str, Any]:
+def _facts(about: About, domain: Grid | SurfaceMesh) -> dict[str, Any]:
     settings, words = about.settings, {"tensor": "D itself", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
     facts: dict[str, Any] = {}
     if isinstance(domain, Grid):
@@ -183,22 +185,3 @@ def _facts(about: _About, domain: Grid | SurfaceMesh) -> dict[str, Any]:
     if about.k is not None and settings.get("method", "spectral") == "spectral":
         facts["eigenpairs"] = about.k
     return facts
-
-
-def read_names(path: Path) -> dict[int, str]:
-    """Read lines of a number and a name, which may have several words.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no line begins with a number.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    names = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        number, *words = line.split(None, 1)[:2] or [""]
-        if number.lstrip("-").isdecimal() and words:
-            names[int(number)] = words[0].strip()
-    if not names:
-        raise ValueError(f"{path}: no line has a number and a name; expected lines such as '17 left hippocampus'")
-    return names

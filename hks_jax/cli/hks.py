@@ -5,11 +5,11 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import parse_times, parse_voxel
+from hks_jax.cli.arguments import Times, parse_times, parse_voxel
 from hks_jax.cli.inputs import (
     add_eigenpair_arguments,
     add_json_argument,
@@ -19,8 +19,12 @@ from hks_jax.cli.inputs import (
 )
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
+from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.io import TensorVolume
 from hks_jax.io.mesh import is_mesh
+
+if TYPE_CHECKING:
+    from hks_jax.cli.job import Settings
 
 DESCRIPTION = """\
 Compute the heat kernel signature of a field of diffusion tensors. FILE holds tensors: NIfTI, NRRD, VTK image data, npz
@@ -28,6 +32,8 @@ with 'tensors' (*shape, d, d) and, optional, 'spacing', 'origin', 'mask', 'affin
 images, with --bval and --bvec.
 
 A volume is computed whole, in three dimensions, unless --slice cuts it.
+
+FILE may also be the eigenpairs that --save-pairs has kept, for other times, or another normalisation or method.
 
 FILE may also be a mesh of triangles or tetrahedra (see hks-jax info), with the metric of space, or with that of the
 tensors at its vertices that --array names.
@@ -40,6 +46,7 @@ report.json.
 EPILOG = """\
 examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 100 --times auto:8
+  hks-jax hks out/pairs.npz -o later --times auto:24 --normalisation flat
   hks-jax hks heart.vtu -o out --array D --metric inverse -k 50
   hks-jax hks dwi.nii.gz --bval dwi.bval --bvec dwi.bvec -o out --slice z=10 --metric inverse --components largest
 """
@@ -63,6 +70,19 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         metavar="I,J,K",
         help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
     )
+    add_signature_arguments(parser)
+    add(
+        "--save-pairs",
+        action="store_true",
+        help="keep the eigenpairs, in OUT as pairs.npz: 'hks-jax hks OUT/pairs.npz --times …' solves nothing again",
+    )
+    add_json_argument(parser)
+    return parser
+
+
+def add_signature_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that say which signature is computed of the eigenpairs."""
+    add = parser.add_argument
     add(
         "--times",
         nargs="+",
@@ -82,26 +102,14 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="sum over eigenpairs (default), do without them, or choose by t, k and the spacing: auto reports which "
         "times came from where and how the two agree",
     )
-    add_json_argument(parser)
-    return parser
 
 
-def run(args: argparse.Namespace) -> None:
-    """Run the subcommand."""
-    times = parse_times(args.times)
-    on_mesh = is_mesh(args.file)
-    if not on_mesh:
-        require_metric(args)
-    from hks_jax.cli import mesh as meshes
-    from hks_jax.cli.job import Settings, compute, compute_on_mesh
-    from hks_jax.cli.outputs import check_folder, show_files, write_outputs
-    from hks_jax.cli.picture import draw, draw_volume
+def settings_of(args: argparse.Namespace, times: Times, metric: MetricChoice | None) -> "Settings":
+    """Return what the arguments ask for."""
+    from hks_jax.cli.job import Settings
 
-    if on_mesh:
-        meshes.check_options(args)
-    check_folder(args.output)
-    settings = Settings(
-        metric=args.metric if on_mesh else args.metric or "tensor",
+    return Settings(
+        metric=metric,
         interpolation=args.interpolation,
         k=args.k,
         boundary=args.boundary,
@@ -112,6 +120,28 @@ def run(args: argparse.Namespace) -> None:
         method=args.method,
         dtype=args.dtype,
     )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the subcommand."""
+    times = parse_times(args.times)
+    from hks_jax.cli.saved_pairs import is_saved_pairs
+
+    on_mesh, saved = is_mesh(args.file), is_saved_pairs(args.file)
+    if not (on_mesh or saved):
+        require_metric(args)
+    from hks_jax.cli import mesh as meshes
+    from hks_jax.cli import saved_pairs
+    from hks_jax.cli.job import compute_on_mesh, compute_pairs, signature_of
+    from hks_jax.cli.outputs import check_folder, show_files, write_outputs
+    from hks_jax.cli.picture import draw, draw_volume
+
+    if on_mesh:
+        meshes.check_options(args)
+    if saved:
+        saved_pairs.check_options(args)
+    check_folder(args.output)
+    settings = settings_of(args, times, args.metric if on_mesh else args.metric or "tensor")
     progress = Progress(args.quiet)
     with progress.catching_warnings():
         draw_to: Callable[[Path], None]
@@ -121,12 +151,22 @@ def run(args: argparse.Namespace) -> None:
             result = compute_on_mesh(mesh, meshes.describe_mesh(args.file, mesh), settings, progress)
             image, draw_to = meshes.mesh_suffix(args.file, mesh), partial(meshes.draw, result)
         else:
-            with progress.stage("reading", str(args.file)):
-                volume = read_volume(args, progress)
-                if args.through is not None:
-                    _check_voxel(args.through, volume)
-            result = compute(volume, settings, progress)
-            image = image_suffix(args.file)
+            if saved:
+                volume, field, pairs, settings, image = saved_pairs.read_pairs(args.file, settings, progress)
+            else:
+                with progress.stage("reading", str(args.file)):
+                    volume, image = read_volume(args, progress), image_suffix(args.file)
+            if args.through is not None:
+                _check_voxel(args.through, volume)
+            if not saved:
+                field, pairs = compute_pairs(volume, settings, progress)
+            if args.save_pairs:  # at once: what comes after may fail, or be interrupted
+                with progress.stage("writing", str(args.output / saved_pairs.NAME)):
+                    domain = volume.with_mask(field.grid.mask)
+                    saved_pairs.write_pairs(
+                        args.output / saved_pairs.NAME, domain, pairs, settings, image, progress.warnings
+                    )
+            result = signature_of(volume, field, pairs, settings, progress)
             flat = volume.dimension == 2
             draw_to = partial(draw, result) if flat else partial(draw_volume, result, through=args.through)
         files = write_outputs(args.output, result, progress, draw=draw_to, image=image, command=sys.argv)

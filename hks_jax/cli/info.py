@@ -13,7 +13,10 @@ from jaxtyping import Float
 from hks_jax.cli.arguments import DEFAULT_K, RESOLVED
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
+from hks_jax.cli.spelling import READING, as_options
+from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
+from hks_jax.domain.tensor_checks import MANY
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
@@ -55,21 +58,19 @@ def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     progress = Progress(quiet=True)
     with progress.catching_warnings():
-        found = describe_mesh(args.file) if is_mesh(args.file) else describe(args.file, read(args, progress))
+        description = describe_mesh(args.file) if is_mesh(args.file) else describe(args.file, read(args, progress))
     if args.json:
-        print(json.dumps(found, indent=2, ensure_ascii=False))
+        print(json.dumps(description, indent=2, ensure_ascii=False))
     else:
-        print("\n".join(_lines(found)))
+        print("\n".join(_lines(description)))
 
 
 def describe(path: Path, volume: TensorVolume) -> dict[str, Any]:
     """Return what there is to say of a volume, in plain numbers."""
-    from hks_jax.domain.components import label_nodes
-
     inside, bad = volume.inside, find_invalid(volume)
     good = inside & ~bad
     labels, count = label_nodes(inside, (False,) * volume.dimension)
-    found: dict[str, Any] = {
+    description: dict[str, Any] = {
         "file": str(path),
         "sha256": volume.digest,
         "format": "".join(path.suffixes[-2:] if path.suffix == ".gz" else path.suffixes[-1:]),
@@ -83,22 +84,29 @@ def describe(path: Path, volume: TensorVolume) -> dict[str, Any]:
         "inside": int(inside.sum()),
         "masked": volume.mask is not None,
         "components": count,
+        "without_element": int((inside & (labels == 0)).sum()),
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
         "not_positive_definite": int(bad.sum()),
         "not_symmetric": int(find_unsymmetric(volume).sum()),
     }
+    wrong = volume.invalid_by_order
+    if bad.any() and wrong is not None and wrong.fewer:
+        description["invalid_by_order"] = wrong.counts
+        description["question"] = wrong.question
     if good.any():
         tensors = volume.tensors[good].astype(np.float64)
         values = np.linalg.eigvalsh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)))
-        found["eigenvalues"] = {"least": float(values.min()), "median": float(np.median(values))}
-        found["eigenvalues"]["largest"] = float(values.max())
-        found["median_mean_diffusivity"] = float(np.median(values.mean(axis=-1)))
+        description["eigenvalues"] = {"least": float(values.min()), "median": float(np.median(values))}
+        description["eigenvalues"]["largest"] = float(values.max())
+        description["median_mean_diffusivity"] = float(np.median(values.mean(axis=-1)))
+    # Of a few valid ones among indefinite tensors nothing can be told that suits.
+    if good.any() and bad.sum() <= MANY * inside.sum():
         metrics = {"inverse": np.linalg.inv(tensors), "tensor": tensors}
-        found["suits"] = {
+        description["suits"] = {
             name: _suits(g, np.array(volume.spacing), volume.shape, inside.sum() / good.sum())
             for name, g in metrics.items()
         }
-    return found
+    return description
 
 
 def describe_mesh(path: Path) -> dict[str, Any]:
@@ -143,50 +151,66 @@ def _times(d: int, volume: float, width2: float, size: float, nodes: int) -> dic
         "least_time": least,
         "k_for_least_time": math.ceil(weyl_number(RESOLVED[d] / least, volume, d)),
         "k": k,
+        "nodes": nodes,
         "least_time_of_k": RESOLVED[d] / weyl(k, volume, d),
         "largest_time": 4 * np.log(10) * (size / np.pi) ** 2,  # 4 ln 10 / λ₁ of an interval of this length
     }
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
+def _lines(description: dict[str, Any]) -> list[str]:
     """Return the description as lines of text."""
 
     def numbers(values: Any) -> str:
         return " × ".join(f"{v:.5g}" for v in values)
 
-    lines = [f"{found['file']}: {found['format']}, SHA-256 {found['sha256'][:16]}…"]
-    words = next((words for words in WORDS.values() if words.simplices in found), None)
+    lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
+    words = next((words for words in WORDS.values() if words.simplices in description), None)
     if words is not None:
         lines += [
-            f"mesh            {found['vertices']} vertices, {found[words.simplices]} {words.simplices}",
-            f"boundary        {found['boundary_vertices']} vertices",
-            f"components      {found['components']}",
-            f"{words.measure:<16}{found[words.measure]:.5g}",
-            f"median edge     {found['median_edge']:.5g}",
+            f"mesh            {description['vertices']} vertices, {description[words.simplices]} {words.simplices}",
+            f"boundary        {description['boundary_vertices']} vertices",
+            f"components      {description['components']}",
+            f"{words.measure:<16}{description[words.measure]:.5g}",
+            f"median edge     {description['median_edge']:.5g}",
         ]
     else:
-        bad, sizes = found["not_positive_definite"], ", ".join(map(str, found["component_sizes"]))
-        placed = "without an affine" if found["affine"] is None else "placed by an affine"
+        bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
+        placed = "without an affine" if description["affine"] is None else "placed by an affine"
         lines += [
-            f"tensors         {numbers(found['shape'])}, {found['dtype']}, {placed}",
-            f"spacing         {numbers(found['spacing'])}",
-            f"order, frame    {found['order']}, {found['frame']} axes",
-            *(f"                {note}" for note in found["notes"]),
-            f"inside          {found['inside']} voxels{'' if found['masked'] else ' (no mask)'}",
-            f"components      {found['components']} ({sizes} nodes)",
-            f"invalid         {bad} tensors are not positive definite" + (": see --repair" if bad else ""),
+            f"tensors         {numbers(description['shape'])}, {description['dtype']}, {placed}",
+            f"spacing         {numbers(description['spacing'])}",
+            f"order, frame    {description['order']}, {description['frame']} axes",
+            *(f"                {as_options(note, READING)}" for note in description["notes"]),
+            f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",
+            f"components      {description['components']} ({sizes} nodes)",
         ]
-        if found["not_symmetric"]:
-            lines.append(f"                {found['not_symmetric']} tensors are not symmetric")
-    if "eigenvalues" in found:
-        e = found["eigenvalues"]
+        if description["without_element"]:
+            lines.append(
+                f"                {description['without_element']} voxels inside belong to no element, a cube of "
+                "neighbours (in a slice a square) that are all inside, and are left out"
+            )
+        lines.append(f"invalid         {bad} tensors are not positive definite")
+        if "question" in description:
+            lines.append(f"                {as_options(description['question'], READING)}")
+        elif bad > MANY * description["inside"]:
+            lines.append("                so many are no noise: of tensors indefinite by nature see --positive")
+        elif bad:
+            lines[-1] += ": see --repair"
+        if description["not_symmetric"]:
+            lines.append(f"                {description['not_symmetric']} tensors are not symmetric")
+    if "eigenvalues" in description:
+        e = description["eigenvalues"]
         lines += [
             f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g}",
-            f"diffusivity     {found['median_mean_diffusivity']:.3g}, the median of the tensors' mean eigenvalues",
+            f"diffusivity     {description['median_mean_diffusivity']:.3g}, the median of the tensors' mean "
+            "eigenvalues",
         ]
-    for name, s in found.get("suits", {}).items():
+    for name, s in description.get("suits", {}).items():
+        takes = f"takes k ≈ {s['k_for_least_time']}"
+        if s["k_for_least_time"] > s["nodes"] / 4:
+            takes = "takes more pairs than are worth computing: see --method auto"
         lines += [
-            f"metric {name:<8} t ≥ {s['least_time']:.3g} by the spacing (to 1 %; takes k ≈ {s['k_for_least_time']}); "
+            f"metric {name:<8} t ≥ {s['least_time']:.3g} by the spacing (to 1 %; {takes}); "
             f"t ≥ {s['least_time_of_k']:.3g} by k = {s['k']}; t ≤ {s['largest_time']:.3g} by the size"
         ]
     return lines

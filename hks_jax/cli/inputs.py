@@ -5,8 +5,7 @@ from pathlib import Path
 
 from hks_jax.cli.arguments import parse_boundary
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import add_arguments as add_reading_arguments
-from hks_jax.cli.reading import image_suffix, read
+from hks_jax.cli.reading import add_file_argument, add_options, image_suffix, read
 from hks_jax.eigen.choice import SOLVERS
 from hks_jax.io import TensorVolume
 from hks_jax.io.repair import require_valid
@@ -14,9 +13,15 @@ from hks_jax.io.repair import require_valid
 
 def add_tensor_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say which tensors are read, and where the results go."""
-    add_reading_arguments(parser)
+    add_file_argument(parser)
+    add_tensor_options(parser)
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, required=True, help="folder for the results")
+
+
+def add_tensor_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how tensors are read, and what metric they make."""
+    add_options(parser)
     add = parser.add_argument
-    add("-o", "--output", metavar="OUT", type=Path, required=True, help="folder for the results")
     add(
         "--metric",
         choices=("tensor", "inverse", "adjugate"),

@@ -73,7 +73,17 @@ def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Res
         ValueError: tensors, mask or settings that cannot be computed with.
         ComputationError: eigenpairs that did not converge.
     """
-    field, pairs = compute_pairs(volume, settings, progress)
+    return signature_of(volume, *compute_pairs(volume, settings, progress), settings, progress)
+
+
+def signature_of(
+    volume: TensorVolume, field: TensorField, pairs: Eigenpairs, settings: Settings, progress: Progress
+) -> Result:
+    """Compute the signature of a volume or slice whose metric and eigenpairs are known.
+
+    Raises:
+        ValueError: settings that cannot be computed with.
+    """
     mask = field.grid.mask
     return _result(volume.with_mask(mask), describe_input(volume, mask), pairs, settings, progress)
 
@@ -153,22 +163,22 @@ def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) 
     """Return the signature and, where methods were chosen from, what the report says of the choice."""
     if settings.method != "auto":
         return np.asarray(hks(pairs, times, settings.normalisation, settings.method)), {}
-    found = hks_auto(pairs, times, settings.normalisation)
+    result = hks_auto(pairs, times, settings.normalisation)
     agreement = None
-    if np.isfinite(float(found.overlap_time)):
-        agreement = {"t": float(found.overlap_time), "difference": float(found.overlap_difference)}
-    of_pairs = np.asarray(found.spectral)
+    if np.isfinite(float(result.overlap_time)):
+        agreement = {"t": float(result.overlap_time), "difference": float(result.overlap_difference)}
+    of_pairs = np.asarray(result.spectral)
     origin = {
         "eigenpairs": [t for t, yes in zip(times, of_pairs, strict=True) if yes],
-        found.method: [t for t, yes in zip(times, of_pairs, strict=True) if not yes],
+        result.method: [t for t, yes in zip(times, of_pairs, strict=True) if not yes],
         "agreement": agreement,
     }
-    return np.asarray(found.values), {"method": {name: value for name, value in origin.items() if name != "none"}}
+    return np.asarray(result.values), {"method": {name: value for name, value in origin.items() if name != "none"}}
 
 
 def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
     """Say which conditions have no effect, because the mask does not reach the side of the grid that they are for."""
-    found = []
+    warned = []
     *axes, rim = normalise_boundary(boundary, inside.ndim)
     on_rim = {
         "neumann": 'the mask\'s own rim is natural (Neumann); "dirichlet-rim" and "mean" take it in',
@@ -178,11 +188,11 @@ def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
     for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False)):
         for index, condition in zip((0, -1), conditions, strict=True):
             if condition not in ("neumann", rim[0]) and not np.take(inside, index, axis).any():
-                found.append(
+                warned.append(
                     f'boundary: "{condition}" has no effect at the {"low" if index == 0 else "high"} side of {name}, '
                     f"which the mask does not reach; {on_rim}"
                 )
-    return found
+    return warned
 
 
 def _report(settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]) -> dict[str, Any]:

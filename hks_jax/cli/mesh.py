@@ -31,6 +31,7 @@ _OF_GRIDS = {
     "bvec": None,
     "b_max": None,
     "through": None,
+    "save_pairs": False,
     "components": "raise",
     "method": "spectral",
 }

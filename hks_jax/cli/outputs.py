@@ -37,18 +37,36 @@ def write_outputs(
 ) -> list[Path]:
     """Write hks.npz, hks.png (by `draw`), report.json and, unless its suffix is empty, an image; return their paths."""
     with progress.stage("writing", str(folder)), atomic_folder(folder) as temporary:
-        extra = {"times": result.times, "eigenvalues": result.eigenvalues}
         origin = {"command": command, "settings": plain(result.report["settings"]), "times": result.times}
-        for suffix in filter(None, (".npz", image)):
-            more: dict[str, Any] | None = None if suffix == ".nii.gz" else extra
-            if suffix == ".npz" and isinstance(result.volume, TensorVolume):
-                # What the signature was computed from, to be shown beside it.
-                more = {**extra, "input_tensors": result.volume.tensors.astype(np.float32)}
-            save(temporary / f"hks{suffix}", result.values, result.volume, name="hks", extra=more, provenance=origin)
+        save_result(temporary / "hks", result, image, origin)
         draw(temporary / "hks.png")
         write_report(temporary / "report.json", result.report, progress, command)
         names = sorted(file.name for file in temporary.iterdir())
     return [folder / name for name in names]
+
+
+def save_result(
+    stem: Path, result: Result, image: str, origin: dict[str, Any], more: dict[str, Any] | None = None
+) -> None:
+    """Write a signature as `stem` with ``.npz`` after it and, unless it is empty, with the suffix of an image.
+
+    The former also has the times, the eigenvalues, the tensors that the signature is of, to be shown beside it, and
+    `more`.
+    """
+    values = as_precise_as_the_data(result)
+    extra = {"times": result.times, "eigenvalues": result.eigenvalues, **(more or {})}
+    for suffix in filter(None, (".npz", image)):
+        given: dict[str, Any] = {"times": result.times} if suffix == ".nii.gz" else extra
+        if suffix == ".npz" and isinstance(result.volume, TensorVolume):
+            given = {**extra, "input_tensors": result.volume.tensors.astype(np.float32)}
+        path = stem.with_name(stem.name + suffix)
+        save(path, values, result.volume, name="hks", extra=given, provenance=origin)
+
+
+def as_precise_as_the_data(result: Result) -> np.ndarray:
+    """Return the signature in single precision if the tensors are: more digits mean nothing and take room."""
+    single = isinstance(result.volume, TensorVolume) and result.volume.tensors.dtype == np.float32
+    return result.values.astype(np.float32) if single else result.values
 
 
 def write_report(path: Path, report: dict[str, Any], progress: Progress, command: list[str]) -> None:
@@ -78,7 +96,11 @@ def versions() -> dict[str, str]:
     """Return the versions of what took part, and the device."""
     import jax
 
-    found = {"python": platform.python_version(), "system": platform.platform(), "device": jax.devices()[0].device_kind}
+    versions = {
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "device": jax.devices()[0].device_kind,
+    }
     for package in (
         "hks-jax",
         "jax",
@@ -94,10 +116,10 @@ def versions() -> dict[str, str]:
         "meshio",
     ):
         try:
-            found[package] = importlib.metadata.version(package)
+            versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def plain(value: Any) -> Any:

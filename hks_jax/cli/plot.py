@@ -135,25 +135,25 @@ def read_saved(path: Path, name: str | None = None) -> Saved:
         ValueError: no npz; arrays that are missing or of shapes that disagree.
     """
     arrays = load_npz(path)
-    found = next((n for n in NAMES if n in arrays), None) if name is None else name
-    lacking = [n for n in (found, "spacing", "origin") if n not in arrays]
-    if found is None or lacking:
+    chosen = next((n for n in NAMES if n in arrays), None) if name is None else name
+    lacking = [n for n in (chosen, "spacing", "origin") if n not in arrays]
+    if chosen is None or lacking:
         expected = " or ".join(NAMES) if name is None else name
         raise ValueError(
             f"{path}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {expected}, spacing and origin, "
             "as 'hks-jax hks' and 'hks-jax curvature' write them"
         )
-    values, spacing = np.asarray(arrays[found]), np.atleast_1d(arrays["spacing"])
+    values, spacing = np.asarray(arrays[chosen]), np.atleast_1d(arrays["spacing"])
     if values.dtype.kind not in "fiu" or values.ndim - spacing.size not in (0, 1) or spacing.size not in (2, 3):
         raise ValueError(
-            f"{path}: got {found} of shape {values.shape}, dtype {values.dtype}, and spacing of shape {spacing.shape}; "
-            "expected real numbers, one per node or (n_times, *shape)"
+            f"{path}: got {chosen} of shape {values.shape}, dtype {values.dtype}, and spacing of shape "
+            f"{spacing.shape}; expected real numbers, one per node or (n_times, *shape)"
         )
     times = None
     if values.ndim > spacing.size:
         times = np.asarray(arrays.get("times", np.arange(len(values))), dtype=np.float64)
         if times.shape != values.shape[:1]:
-            raise ValueError(f"{path}: got {found} of shape {values.shape} and times of shape {times.shape}")
+            raise ValueError(f"{path}: got {chosen} of shape {values.shape} and times of shape {times.shape}")
     shape = values.shape[values.ndim - spacing.size :]
     grid = Grid(shape, spacing.tolist(), arrays["origin"].tolist(), arrays.get("mask"), "all")
     values = values.reshape(-1, *grid.shape).astype(np.float64)

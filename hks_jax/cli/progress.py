@@ -1,14 +1,21 @@
 """Progress on stderr: what is being done, and since when."""
 
+import shutil
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
+from hks_jax.cli.bar import bar, duration
+from hks_jax.cli.spelling import READING, as_options
+
 INTERVAL = 5.0
 """Seconds between updates within a stage where stderr is no terminal."""
+TICK = 0.5
+"""Seconds after which a terminal's line is drawn again, with the time that has passed."""
 
 
 class Progress:
@@ -24,35 +31,47 @@ class Progress:
         self.stream = sys.stderr if stream is None else stream
         self.timings: dict[str, float] = {}
         self.warnings: list[str] = []
-        self._start = self._last = time.perf_counter()
-        self._stage = ""
+        self._start = self._last = self._begin = time.perf_counter()
+        self._stage = self._text = ""
+        self._end: float | None = None
         self._open_line = False
+        self._lock = threading.RLock()
 
     @contextmanager
     def stage(self, name: str, detail: str = "") -> Iterator[None]:
         """Announce a stage and time it."""
-        begin = self._last = time.perf_counter()
-        self._stage = f"{name}: {detail}" if detail else name
-        self._print(self._stage)
+        begin = self._begin = self._last = time.perf_counter()
+        self._stage, self._text, self._end = f"{name}: {detail}" if detail else name, "", None
+        over = threading.Event()
+        if self.stream.isatty() and not self.quiet:
+            self._draw()
+            threading.Thread(target=self._tick, args=(over,), daemon=True).start()
+        else:
+            self._print(self._stage)
         try:
             yield
         finally:
+            over.set()
             self.timings[name] = time.perf_counter() - begin
             self._close_line()
 
     def update(self, text: str) -> None:
-        """Show how far the present stage is: in place on a terminal, else every few seconds."""
+        """Show how far the present stage is: in place on a terminal, else every few seconds.
+
+        A text that comes with an estimate of what is left (`hks_jax.eigen.solver.Status`) is shown with it, and with a
+        bar of the time that has passed in all.
+        """
         now = time.perf_counter()
-        terminal = self.stream.isatty()
-        if self.quiet or (not terminal and now - self._last < INTERVAL):
+        left = getattr(text, "seconds_left", None)
+        with self._lock:
+            self._text, self._end = str(text), None if left is None else now + left
+        if self.quiet:
             return
-        self._last = now
-        if terminal:
-            self.stream.write(f"\r[{now - self._start:7.1f} s] {self._stage}, {text}\x1b[K")
-            self.stream.flush()
-            self._open_line = True
-        else:
-            self._print(f"{self._stage}, {text}")
+        if self.stream.isatty():
+            self._draw()
+        elif now - self._last >= INTERVAL:
+            self._last = now
+            self._print(f"{self._stage}, {self._text}{'' if left is None else f', about {duration(left)} left'}")
 
     def note(self, text: str) -> None:
         """Say something that is no warning."""
@@ -69,14 +88,34 @@ class Progress:
     def catching_warnings(self) -> Iterator[None]:
         """Show the library's warnings as one line each."""
 
-        def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        def show(message: Warning | str, category: type[Warning], *_position: Any, **more: Any) -> None:
             if issubclass(category, UserWarning):
-                self.warn(str(message))
+                self.warn(as_options(str(message), READING))
 
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show
             yield
+
+    def _tick(self, over: threading.Event) -> None:
+        while not over.wait(TICK):
+            with self._lock:
+                if not over.is_set():
+                    self._draw()
+
+    def _draw(self) -> None:
+        """Draw the terminal's last line: the time, the stage, a bar, what is left, and the text."""
+        with self._lock:
+            now, shown = time.perf_counter(), f"{self._stage}, {self._text}" if self._text else self._stage
+            if self._end is not None:
+                left = max(self._end - now, 0.0)
+                done = (now - self._begin) / max(now - self._begin + left, 1e-9)
+                remaining = f"about {duration(left)} left" if left else "longer than estimated"
+                shown = f"{bar(done)} {remaining}, {self._text}, {self._stage}"
+            line = f"[{now - self._start:7.1f} s] {shown}"[: shutil.get_terminal_size().columns - 1]
+            self.stream.write(f"\r{line}\x1b[K")
+            self.stream.flush()
+            self._open_line = True
 
     def _print(self, text: str) -> None:
         if not self.quiet:
@@ -84,6 +123,7 @@ class Progress:
             print(f"[{time.perf_counter() - self._start:7.1f} s] {text}", file=self.stream, flush=True)
 
     def _close_line(self) -> None:
-        if self._open_line:
-            self.stream.write("\n")
-            self._open_line = False
+        with self._lock:
+            if self._open_line:
+                self.stream.write("\n")
+                self._open_line = False

@@ -66,10 +66,10 @@ def differentiate(
     expand = tuple(range(d, jnp.ndim(values)))
     rows = np.expand_dims(choice, expand)
     nodes = np.expand_dims(np.arange(n, dtype=np.int32).reshape(along), expand)
-    table, here = jnp.asarray(weights / spacing**order, values.dtype), jnp.asarray(offsets)
+    table, shifts = jnp.asarray(weights / spacing**order, values.dtype), jnp.asarray(offsets)
     total = jnp.zeros_like(values)
     for column in range(MINIMUM_NODES):
-        index = (nodes + here[rows, column]) % n
+        index = (nodes + shifts[rows, column]) % n
         total += table[rows, column] * jnp.take_along_axis(values, index, axis=axis)
     valid = np.broadcast_to(valid, inside.shape)
     # Zero and not NaN where nothing is known: NaN here would survive, as 0·NaN, in the gradient of what is known.

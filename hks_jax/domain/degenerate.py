@@ -78,10 +78,10 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     weights = np.where(exact, shared, np.sign(turns) == np.sign(index[cluster])).astype(float)
     zeros = cells + _zeros_in_cells(v, cells)
     middle = np.stack([np.bincount(cluster, weights * z, count) for z in zeros.T], axis=-1)
-    found = settled & (index != 0)
-    middle = middle[found] / np.bincount(cluster, weights, count)[found, None]
+    kept = settled & (index != 0)
+    middle = middle[kept] / np.bincount(cluster, weights, count)[kept, None]
     order = np.lexsort((middle[:, 1], middle[:, 0]))
-    return DegeneratePoints((grid.origin + middle * grid.spacing)[order], index[found][order])
+    return DegeneratePoints((grid.origin + middle * grid.spacing)[order], index[kept][order])
 
 
 def _windings(

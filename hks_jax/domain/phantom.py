@@ -30,8 +30,8 @@ def phantom(
     if d not in (2, 3):
         raise ValueError(f"shape: got {tuple(shape)}; expected 2 or 3 axes")
     axes = [np.linspace(-1, 1, n) for n in shape]
-    x, y, *rest = np.meshgrid(*axes, indexing="ij")
-    z = rest[0] if rest else np.zeros_like(x)
+    x, y, *third = np.meshgrid(*axes, indexing="ij")
+    z = third[0] if third else np.zeros_like(x)
     # Higher and lower slices through an ellipsoid are smaller ones.
     shrink = np.sqrt(np.clip(1 - 0.8 * z**2, 0.1, None))
     x, y = x / shrink, y / shrink

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.checks import real_array
+from hks_jax.describe import describe_array
 from hks_jax.domain import spd
 from hks_jax.domain.mesh_tensors import metric_of_tensors
 from hks_jax.domain.simplices import WORDS, check_places, checked_cells
@@ -34,6 +35,12 @@ class SimplicialMesh(eqx.Module):
         self.triangulation = triangulation
         self._metric = None if metric is None else _checked_metric(metric, triangulation)
 
+    def __repr__(self) -> str:
+        """Return one line: the sizes, and where the metric comes from."""
+        metric = "that of space" if self._metric is None else describe_array(self._metric)
+        cells = f"{len(self.triangulation.cells)} {WORDS[self.triangulation.dimension].simplices}"
+        return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"
+
     @property
     def metric(self) -> Float[Array, "n d d"]:
         """The metric of each cell in the basis of its edges v₁ − v₀, v₂ − v₀ …; NaN if not positive definite."""
@@ -59,8 +66,8 @@ def with_tensors(
     mesh: Mesh, tensors: Any, metric: MetricChoice | None, at: str | None, interpolation: Interpolation
 ) -> Mesh:
     """Return a mesh with the metric of tensors in space; see `SurfaceMesh.from_tensors`, `TetMesh.from_tensors`."""
-    found = metric_of_tensors(mesh._edges, mesh.triangulation, tensors, metric, at, interpolation)
-    given = _checked_metric(found, mesh.triangulation)  # such as an inverse that overflows
+    metric_tensors = metric_of_tensors(mesh._edges, mesh.triangulation, tensors, metric, at, interpolation)
+    given = _checked_metric(metric_tensors, mesh.triangulation)  # such as an inverse that overflows
     return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 
 

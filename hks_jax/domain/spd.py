@@ -93,15 +93,15 @@ def _exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     d, tensors = tensors.shape[-1], symmetrise(tensors)
     eye = jnp.eye(d, dtype=tensors.dtype)
     mean = jnp.trace(tensors, axis1=-2, axis2=-1) / d
-    rest = tensors - mean[..., None, None] * eye
-    powers, coefficients = (_exp_in_2d if d == 2 else _exp_in_3d)(rest)
+    deviator = tensors - mean[..., None, None] * eye
+    powers, coefficients = (_exp_in_2d if d == 2 else _exp_in_3d)(deviator)
     total = eye + sum(c[..., None, None] * power for c, power in zip(coefficients, (eye, *powers), strict=True))
     return jnp.exp(mean)[..., None, None] * total
 
 
-def _exp_in_2d(rest: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Array]]:
+def _exp_in_2d(deviator: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Array]]:
     """Return [S] and the coefficients of I and S in exp S − I; tr S = 0."""
-    q = jnp.square(rest[..., 0, 0]) + jnp.square(rest[..., 0, 1])
+    q = jnp.square(deviator[..., 0, 0]) + jnp.square(deviator[..., 0, 1])
     small = q / 4**_SQUARINGS
     a = b = jnp.zeros_like(q)
     for n in range(_TERMS // 2, 0, -1):  # Horner's scheme
@@ -110,13 +110,13 @@ def _exp_in_2d(rest: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Array]]
     b = (1 + b) / 2**_SQUARINGS
     for _ in range(_SQUARINGS):
         a, b = 2 * a + a * a + b * b * q, 2 * b * (1 + a)
-    return [rest], [a, b]
+    return [deviator], [a, b]
 
 
-def _exp_in_3d(rest: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]:
+def _exp_in_3d(deviator: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]:
     """Return [S, S²] and the coefficients of I, S and S² in exp S − I; tr S = 0."""
-    square = _matmul(rest, rest)
-    p, r = 0.5 * jnp.trace(square, axis1=-2, axis2=-1), determinant(rest)
+    square = _matmul(deviator, deviator)
+    p, r = 0.5 * jnp.trace(square, axis1=-2, axis2=-1), determinant(deviator)
     small_p, small_r = p / 4**_SQUARINGS, r / 8**_SQUARINGS
     a = b = c = jnp.zeros_like(p)
     for n in range(_TERMS, 0, -1):  # Horner's scheme: x ↦ S (1/n! + x), S³ = pS + rI
@@ -128,7 +128,7 @@ def _exp_in_3d(rest: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]
             2 * b + 2 * a * b + 2 * b * c * p + c * c * r,
             2 * c + b * b + 2 * a * c + c * c * p,
         )
-    return [rest, square], [a, b, c]
+    return [deviator, square], [a, b, c]
 
 
 @jax.jit
@@ -144,8 +144,8 @@ def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
     eye = jnp.eye(2, dtype=tensors.dtype)
     mean = jnp.trace(tensors, axis1=-2, axis2=-1) / 2
     scaled = tensors / mean[..., None, None]
-    rest = scaled - eye
-    square = jnp.square(rest[..., 0, 0]) + jnp.square(rest[..., 0, 1])
+    deviator = scaled - eye
+    square = jnp.square(deviator[..., 0, 0]) + jnp.square(deviator[..., 0, 1])
     half = 0.5 * jnp.log(determinant(scaled))
     small = square < 0.04
     series = jnp.zeros_like(square)
@@ -154,7 +154,7 @@ def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
     root = jnp.sqrt(jnp.where(small, 0.04, square))
     # atanh x = log(1 + x) − ½ log(1 − x²), and 1 − x² is the scaled determinant, which is accurate also near zero.
     factor = jnp.where(small, series, (jnp.log1p(root) - half) / root)
-    return (jnp.log(mean) + half)[..., None, None] * eye + factor[..., None, None] * rest
+    return (jnp.log(mean) + half)[..., None, None] * eye + factor[..., None, None] * deviator
 
 
 @jax.custom_jvp

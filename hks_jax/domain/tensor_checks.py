@@ -12,6 +12,9 @@ from hks_jax.traced import is_traced
 MetricChoice = Literal["tensor", "inverse", "adjugate"]
 Interpolation = Literal["linear", "log-euclidean"]
 
+MANY = 0.05
+"""The part of invalid tensors from which on they are no exceptions: noise at a mask's rim is fewer."""
+
 
 def check_metric_choice(metric: str | None) -> None:
     """Raise ValueError unless it names what metric diffusion tensors stand for."""
@@ -57,6 +60,11 @@ def require_spd(
     if bad.any():
         what = f"not positive definite, worst eigenvalue {least_eigenvalue(tensors[bad]):.3g}"
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
+        if bad.sum() > MANY * inside.sum():
+            of_grids = (
+                "So many are no noise: tensors that are indefinite by nature, such as stress, become a metric by "
+                f"hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside"
+            )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
 
 

@@ -11,8 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.checks import real_array
+from hks_jax.describe import describe_array
 from hks_jax.domain import spd
+from hks_jax.domain.deformation import right_cauchy_green
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.indefinite import PositiveMap, checked_map, positive_map
 from hks_jax.domain.tensor_checks import (
     Interpolation,
     MetricChoice,
@@ -103,6 +106,83 @@ class TensorField(eqx.Module):
         tensors = spd.positive_or_nan(_identity_outside(grid, tensors))
         return cls(grid, spd.inverse(tensors) if metric == "inverse" else spd.adjugate(tensors), interpolation)
 
+    @classmethod
+    def from_deformation(
+        cls, grid: Grid, F: Any, *, interpolation: Interpolation = "linear", name: str = "F"
+    ) -> "TensorField":
+        """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
+
+        ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, y the place to which what is at x goes, or wants to go. Lengths are those after the
+        deformation. F enters by C alone: rotations, also such as vary from node to node, change nothing.
+
+        Where F is the gradient of a map, it is compatible: the metric is flat, and the signature that of the deformed
+        body. Growth, plastic and elastic strain need not be. The curvature of C is then the incompatibility, which no
+        shape in the plane (of a volume, in space) undoes: residual strain. See docs/strain.md.
+
+        Args:
+            grid: of the undeformed coordinates x.
+            F: (*shape, d, d), of positive determinant inside the mask; or (*shape, m, d), m > d, such as the Jacobian
+                of a surface in space. Values outside the mask are ignored.
+            interpolation: of C between the nodes, as for the tensors of a field.
+            name: of F in messages.
+
+        Raises:
+            ValueError: wrong shape; NaN or infinite; a determinant that is not positive, or no full rank.
+        """
+        _require_grid(grid)
+        C = right_cauchy_green(name, grid, F)
+        return cls(grid, _checked_tensors(f"{name}ᵀ{name}", grid, C), interpolation)
+
+    @classmethod
+    def from_indefinite(
+        cls,
+        grid: Grid,
+        S: Any,
+        how: PositiveMap | None = None,
+        number: Any = None,
+        *,
+        interpolation: Interpolation = "linear",
+        name: str = "S",
+    ) -> "TensorField":
+        """Return a metric made of symmetric tensors S (*shape, d, d) with eigenvalues of either sign, such as stress.
+
+        They are no metric themselves, and there are several ways to one: there is no default. Both keep the
+        eigenvectors and the order of the eigenvalues (Hotz and others 2004):
+
+        - ``"exp"``: g = exp(S/s); `number` is the scale s > 0, in the units of S. An eigenvalue σ becomes exp(σ/s):
+          squared lengths grow by a factor under tension and shrink by the same under as much compression, and where
+          S = 0 they are those of the coordinates. A scale near the largest |σ| shows S well.
+        - ``"shift"``: g = S + c·I; `number` is the shift c, larger than minus the least eigenvalue. Linear in S; where
+          S = 0 it is c·I. The signature depends on c: it flattens as c grows, and near its limit the direction
+          of the strongest compression has almost no length.
+
+        See docs/strain.md for what their signatures show.
+
+        Args:
+            grid: the grid.
+            S: the tensors; values outside the mask are ignored.
+            how: ``"exp"`` or ``"shift"``.
+            number: the scale or the shift; may be traced.
+            interpolation: of g between the nodes. Of ``"exp"``, ``"log-euclidean"`` interpolates S linearly.
+            name: of S in messages.
+
+        Raises:
+            ValueError: no map or number, or an unknown map; wrong shape; NaN, infinite or unsymmetric tensors; a scale
+                or a shift that is so small that the metric is singular.
+        """
+        _require_grid(grid)
+        chosen = checked_map(how)
+        tensors = real_array(name, S)
+        if tensors.shape != (*grid.shape, grid.dimension, grid.dimension):
+            expected = (*grid.shape, grid.dimension, grid.dimension)
+            raise ValueError(f"{name}: got shape {tensors.shape}; expected (*grid.shape, d, d) = {expected}")
+        return cls(grid, positive_map(name, tensors, chosen, number, grid.inside), interpolation)
+
+    def __repr__(self) -> str:
+        """Return one line: the grid, and where the metric comes from."""
+        values = "a function" if self.function is not None else describe_array(self._tensors)
+        return f"TensorField({values} on {self.grid!r}, interpolation={self.interpolation!r})"
+
     @property
     def tensors(self) -> Float[Array, "*shape d d"]:
         """The tensors at the nodes, symmetric."""
@@ -132,9 +212,13 @@ def _identity_outside(grid: Grid, tensors: Float[Array, "*shape d d"]) -> Float[
     return spd.identity_outside(tensors, grid.mask)
 
 
-def _checked_tensors(name: str, grid: Grid, tensors: Any) -> Float[Array, "*shape d d"]:
+def _require_grid(grid: Any) -> None:
     if not isinstance(grid, Grid):
         raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
+
+
+def _checked_tensors(name: str, grid: Grid, tensors: Any) -> Float[Array, "*shape d d"]:
+    _require_grid(grid)
     d = grid.dimension
     expected = f"(*grid.shape, d, d) = {(*grid.shape, d, d)}, one tensor per node"
     return checked_tensors(name, tensors, grid.inside, d, expected)

@@ -91,6 +91,10 @@ class Triangulation:
         count, labels = connected_components(graph, directed=False)
         return labels + 1, int(count)
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"Triangulation({len(self.cells)} cells of dimension {self.dimension}, {self.n_vertices} vertices)"
+
     def __eq__(self, other: object) -> bool:
         return self is other or (
             isinstance(other, Triangulation) and self.n_vertices == other.n_vertices and self._cells == other._cells

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from hks_jax.eigen.complement.factorised import FactorisedAdjoint
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.host.shift_invert import ShiftInvert
@@ -66,7 +67,7 @@ def choose_for_fit(pencil: Pencil | MirrorPencil, k: int) -> Eigensolver:
 
     Factorisations serve them all, which the filter does not have; and as fits are traced, none runs on the host.
     """
-    n, fitting = pencil.space.n_dof, BlockLanczos(derivative_tolerance=1e-7)
+    n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-7))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()
 
 

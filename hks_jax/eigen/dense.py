@@ -18,6 +18,7 @@ class Dense(Eigensolver[SymmetricPencil]):
     """Cholesky reduction M = LLᵀ to L⁻¹KL⁻ᵀ, then `eigh`: O(n³) time, O(n²) memory, exact multiplicities."""
 
     name: ClassVar[str] = "dense"
+    batches: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
 
     def __check_init__(self) -> None:

@@ -1,7 +1,7 @@
 """The lowest eigenpairs of a pencil, and their derivatives with respect to stiffness and mass."""
 
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.first_order import first_order_only
+from hks_jax.eigen.in_turn import in_turn
 from hks_jax.eigen.quality import indistinct
-from hks_jax.eigen.solver import Eigensolver, Report, silent
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
@@ -34,7 +36,7 @@ def lowest(
     of the last ``extra`` are set to zero. Where the derivative does not converge it is NaN: an error, if ``throw``;
     else a warning where values are concrete.
     """
-    values, vectors, complete_below = solver.lowest(pencil, k + extra, report)
+    values, vectors, complete_below = _solve_pencil(solver, pencil, k + extra, report)
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
     return values, vectors, vectors, complete_below
 
@@ -70,13 +72,18 @@ def _lowest_jvp(
     pencil, change = first_order_only(primals[0]), changes[0]
     n_dof = pencil.size
     total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
-    values, vectors, complete_below = solver.lowest(pencil, total, report)
+    values, vectors, complete_below = _solve_pencil(solver, pencil, total, report)
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
-    quiet = is_traced(primals) or solver.warns
+    quiet = is_traced(primals) or solver.adjoint.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
     tangents = *_tangents(solver, k, extra, telling, pencil, change, values, vectors), jnp.zeros_like(complete_below)
     values, vectors = _leading(values, vectors, k + extra)
     return (values, vectors, vectors, complete_below), tangents
+
+
+def _solve_pencil(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: Report) -> RawPairs:
+    """Return the solver's k lowest pairs."""
+    return solver.lowest(pencil, k, report) if solver.batches else in_turn(_lowest, (solver, k, report), pencil)
 
 
 @partial(jax.jit, static_argnames="size")
@@ -133,15 +140,28 @@ def _outside(
         return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
 
     # Outside the linear solve, so that many products with one Jacobian share it.
-    prepared = solver.prepare_complement(pencil, values, k)
+    prepared = in_turn(_prepare, (solver.adjoint, k), pencil, values)
 
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return _told(telling, solver.solve_complement(prepared, pencil, values, vectors, b))
+        return _told(telling, in_turn(_solve, (solver.adjoint,), prepared, pencil, values, vectors, b))
 
     # No force acts on the constants: they stay in the kernel of the stiffness. In reverse mode, where their rows are
     # cotangents, it is their solutions that do not count.
     x = jax.lax.custom_linear_solve(matvec, rhs.at[:n_null].set(0), solve, symmetric=True)
     return x.at[:n_null].set(0)
+
+
+# What `in_turn` calls are functions of the module, not methods, so that they are the same objects in every call.
+def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
+    return solver.lowest(pencil, k, report)
+
+
+def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Array, " p"]) -> Any:
+    return adjoint.prepare(pencil, values, k)
+
+
+def _solve(adjoint: Adjoint, *args: Any) -> Float[Array, "k n_dof"]:
+    return adjoint.solve(*args)
 
 
 def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:

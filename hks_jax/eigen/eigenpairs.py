@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.describe import describe_array
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.pencil import SymmetricPencil
@@ -78,6 +79,14 @@ class Eigenpairs(eqx.Module):
     pencil: Pencil | MirrorPencil
     solver_name: str = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        """Return one line; `summary` says more."""
+        unknowns = sum(part.space.n_dof for part in self.pencil.parts)
+        return (
+            f"Eigenpairs(k={self.k} of {unknowns}, eigenvalues {describe_array(self.eigenvalues)}, "
+            f"vectors {describe_array(self.vectors)}, solver_name={self.solver_name!r})"
+        )
+
     @property
     def eigenfunctions(self) -> Float[Array, "k *shape"]:
         """The eigenfunctions at the nodes: NaN outside the mask, zero at Dirichlet nodes."""
@@ -143,8 +152,8 @@ class Eigenpairs(eqx.Module):
             remedy = f"Take k = {kept - cut} or a larger one" if cut < kept else "Take a larger k"
             sentences.append(
                 f"k = {kept} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = "
-                f"{float(self.last_eigenvalue):.6g}, have equals beyond k, and which of them are here is arbitrary. "
-                f"{remedy}"
+                f"{float(self.last_eigenvalue):.6g}, have equals beyond k, and which of them are among the k is "
+                f"arbitrary. {remedy}"
             )
         return sentences
 

@@ -284,5 +284,5 @@ def _report(pairs: MatrixEigenpairs, following: Float[Array, ""]) -> None:
         remedy = f"Take k = {pairs.k - cut} or a larger one" if cut < pairs.k else "Take a larger k"
         warn_of_accuracy(
             f"k = {pairs.k} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = {values[-1]:.6g}, have equals "
-            f"beyond k, and which of them are these is arbitrary. {remedy}"
+            f"beyond k, and which of them are among the k is arbitrary. {remedy}"
         )

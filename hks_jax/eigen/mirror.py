@@ -1,6 +1,7 @@
 """The problems of a doubled domain, reflected or glued along its rim, their spectra merged into one."""
 
 import math
+import time
 from functools import partial
 
 import jax
@@ -12,7 +13,7 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.part import solve_part
-from hks_jax.eigen.solver import Eigensolver, Report
+from hks_jax.eigen.solver import Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
@@ -38,7 +39,10 @@ def solve_mirror(
         for solver, part, limit in zip(solvers, parts, limits, strict=True)
     ]
     problems = zip(parts, solvers, wanted, strict=True)
-    solved = [solve_part(part, solver, size, 0, name, throw, report) for part, solver, size in problems]
+    solved = [
+        solve_part(part, solver, size, 0, name, throw, _of_problem(report, number, len(parts)))
+        for number, (part, solver, size) in enumerate(problems)
+    ]
     while not traced:
         spectra = [np.asarray(jax.lax.stop_gradient(pairs.eigenvalues)) for pairs in solved]
         merged = np.sort(np.concatenate(spectra))
@@ -54,6 +58,19 @@ def solve_mirror(
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name, throw, report)
     return _merge(pencil, tuple(solved), k, extra, name)
+
+
+def _of_problem(report: Report, number: int, of: int) -> Report:
+    """Return what tells which problem is being solved; those to come are taken to last as long as this one."""
+    begin = time.perf_counter()
+
+    def tell(text: str) -> None:
+        left = getattr(text, "seconds_left", None)
+        if left is not None:
+            left += (of - 1 - number) * (time.perf_counter() - begin + left)
+        report(Status(f"problem {number + 1} of {of}: {text}", left))
+
+    return tell
 
 
 # In units of the spacing a part's volume is its number of nodes, and a rim of r nodes that is Dirichlet and not natural

@@ -38,7 +38,7 @@ def solve_part(
         kept=kept,
         part=part,
         next_eigenvalue=next_eigenvalue,
-        complete_below=complete_below,
+        complete_below=jnp.asarray(complete_below),  # of a constant JAX makes a number where it differentiates
         multiplet_tolerance=multiplet_tolerance,
         pencil=pencil,
         solver_name=name,

@@ -7,6 +7,8 @@ from typing import Any, ClassVar, Generic, TypeVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from hks_jax.eigen.complement.adjoint import Adjoint
+from hks_jax.eigen.complement.factorised import FactorisedAdjoint
 from hks_jax.linear.pencil import SymmetricPencil
 
 P = TypeVar("P", bound=SymmetricPencil)
@@ -15,7 +17,23 @@ P = TypeVar("P", bound=SymmetricPencil)
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 Report = Callable[[str], Any]
-"""Told in short texts how far a computation is."""
+"""Told in short texts how far a computation is; some of them are a `Status`."""
+
+
+class Status(str):
+    """A text that says how far a computation is, with how long the rest takes.
+
+    Attributes:
+        seconds_left: an estimate; None where there is none.
+    """
+
+    seconds_left: float | None
+
+    def __new__(cls, text: str, seconds_left: float | None = None) -> "Status":
+        """Return the text with the estimate."""
+        status = super().__new__(cls, text)
+        status.seconds_left = seconds_left
+        return status
 
 
 def silent(text: str) -> None:
@@ -27,14 +45,16 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     Attributes:
         name: what reports call the method.
-        warns: whether `solve_complement` warns of what does not converge, traced or not.
+        batches: whether a batch under `vmap` is solved together on CPUs too, and not one problem after another.
+        adjoint: what derivatives solve linear systems with; by default for any pencil that can be factorised.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, unless
             rounding in the matrices' dtype forbids it.
     """
 
     name: ClassVar[str]
-    warns: ClassVar[bool] = False
+    batches: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
+    adjoint: Adjoint = eqx.field(default=FactorisedAdjoint(), static=True, kw_only=True)
 
     @abstractmethod
     def lowest(self, pencil: P, k: int, report: Report = silent) -> RawPairs:
@@ -44,26 +64,6 @@ class Eigensolver(eqx.Module, Generic[P]):
         the bound where nothing is certain. Traceable: works under `jit` and `vmap`. Called plainly, it may report
         progress.
         """
-
-    def prepare_complement(self, pencil: P, values: Float[Array, " p"], k: int) -> Any:
-        """Return what `solve_complement` for the first k of p eigenvalues needs and no right-hand side changes."""
-        return None
-
-    def solve_complement(
-        self,
-        prepared: Any,
-        pencil: P,
-        values: Float[Array, " p"],
-        vectors: Float[Array, "p n_dof"],
-        rhs: Float[Array, "k n_dof"],
-    ) -> Float[Array, "k n_dof"]:
-        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0, Φ the p ≥ k given eigenvectors, p < n_dof.
-
-        Derivatives need it, unless `guards` are all the other pairs. What did not converge is NaN. Traceable.
-        """
-        raise NotImplementedError(
-            f"eigenpairs: the {self.name} solver has no solve_complement, which derivatives need; use another solver"
-        )
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return how many pairs beyond k to compute where derivatives are wanted."""

@@ -27,6 +27,10 @@ class Pencil(SymmetricPencil):
     volume: Float[Array, ""]
     space: FunctionSpace = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        """Return one line: how many unknowns on what, and under which boundary."""
+        return f"Pencil({self.space!r})"
+
     @property
     def mesh_width(self) -> Float[Array, " n_dof"]:
         """The local distance of neighbouring nodes in the units of the metric, (n_dof,)."""

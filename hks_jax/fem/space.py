@@ -35,6 +35,13 @@ class FunctionSpace:
     _labels: Int[np.ndarray, "*node_shape"]
     _key: tuple
 
+    def __repr__(self) -> str:
+        """Return one line: the degrees of freedom, the nodes and the boundary."""
+        return (
+            f"{type(self).__name__}({self.n_dof} unknowns, nodes={self.node_shape}, boundary={self.boundary}, "
+            f"n_components={self.n_components})"
+        )
+
     @property
     def n_dof(self) -> int:
         """The number of degrees of freedom."""

@@ -76,11 +76,8 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
 
     def init(self, y: Values, f_info_struct: Any) -> _State:
         """Return a state of the right shape."""
-        empty = jax.tree.map(
-            lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, f_info_struct
-        )
         far, no = jnp.asarray(jnp.inf, y.dtype), jnp.zeros((), bool)
-        return _State(y, empty, jnp.zeros_like(y), far, far, no, no)
+        return _State(y, _empty(f_info_struct), jnp.zeros_like(y), far, far, no, no)
 
     def query(self, y: Values, f_info: Any, state: _State) -> _State:
         """Return the gradient Jᵀr with the linearisation, and what the step that led here tells."""
@@ -120,21 +117,52 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
         steps = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
         size = jnp.linalg.norm(gradient)
         scaled = gradient / jnp.where(size > 0, size, 1)
-        found = lx.linear_solve(
+        solution = lx.linear_solve(
             operator,
             scaled,
             lx.CG(0.0, tolerance, optx.two_norm, stabilise_every=None, max_steps=steps),
             options={"preconditioner": preconditioner},
             throw=False,
         )
-        return -size * _SCALE * found.value
+        return -size * _SCALE * solution.value
 
 
-def _silent(**_: Any) -> None:
-    pass
+class _Progress(eqx.Module):
+    """The state of the solver.
+
+    Attributes:
+        first: whether no step was taken yet.
+        trial: the unknowns to be looked at next.
+        step_size: 1/μ, relative to the first.
+        search: what the search keeps, which is its own affair.
+        linearised: residuals and Jacobian at the last accepted unknowns.
+        aux: what the residuals tell beside, there.
+        descent: what the descent knows, there.
+        result: whether all is finite.
+    """
+
+    first: Bool[Array, ""]
+    trial: Values
+    step_size: Float[Array, ""]
+    search: Any
+    linearised: Any
+    aux: Any
+    descent: _State
+    result: optx.RESULTS
 
 
-class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
+def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:
+    """Return residuals with the products with their Jacobian, and what they tell beside."""
+    residual, product, aux = jax.linearize(lambda v: fn(v, args), values, has_aux=True)
+    jacobian = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: values))
+    return optx.FunctionInfo.ResidualJac(residual, jacobian), aux
+
+
+def _empty(structure: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, structure)
+
+
+class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     """The default solver of `hks_jax.fit_metric`.
 
     Its settings are arrays: steps compiled for some serve all others.
@@ -154,7 +182,6 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
     norm: Callable[[Any], Array]
     descent: DampedDescent
     search: optx.ClassicalTrustRegion
-    verbose: Callable[..., None]
 
     def __init__(
         self,
@@ -180,10 +207,70 @@ class GaussNewton(optx.AbstractGaussNewton[Values, Any, Any]):
             jnp.asarray(inner_steps),
         )
         self.search = optx.ClassicalTrustRegion(high_cutoff=0.5, high_constant=jnp.asarray(growth))
-        self.verbose = _silent
+
+    def init(
+        self,
+        fn: Callable,
+        y: Values,
+        args: Any,
+        options: dict[str, Any],
+        f_struct: Any,
+        aux_struct: Any,
+        tags: frozenset[object],
+    ) -> _Progress:
+        """Return the state before the first step, in which ``y`` is looked at."""
+        structure, _ = eqx.filter_eval_shape(_linearise, fn, y, args)
+        return _Progress(
+            jnp.asarray(True),
+            y,
+            jnp.ones((), y.dtype),
+            self.search.init(y, structure),
+            _empty(structure),
+            _empty(aux_struct),
+            self.descent.init(y, structure),
+            optx.RESULTS.successful,  # type: ignore[arg-type]
+        )
+
+    def step(
+        self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
+    ) -> tuple[Values, _Progress, Any]:
+        """Look at the trial, take it or not, and choose the next; return the unknowns and what is told of them."""
+        linearised, aux = _linearise(fn, state.trial, args)
+        # Traces are compared by identity: the one of the state stands for all.
+        linearised = eqx.combine(
+            eqx.filter(linearised, eqx.is_array), eqx.filter(state.linearised, eqx.is_array, inverse=True)
+        )
+        step_size, accept, search_result, search = self.search.step(
+            state.first, y, state.trial, state.linearised, linearised, state.search
+        )
+        before, static = eqx.partition((y, state.linearised, state.aux, state.descent), eqx.is_array)
+
+        def taken() -> Any:
+            descent = self.descent.query(state.trial, linearised, state.descent)
+            return eqx.filter((state.trial, linearised, aux, descent), eqx.is_array)
+
+        values, linearised, aux, descent = eqx.combine(jax.lax.cond(accept, taken, lambda: before), static)
+        step, result = self.descent.step(step_size, descent)
+        result = optx.RESULTS.where(search_result == optx.RESULTS.successful, result, search_result)
+        no = jnp.asarray(False)
+        return values, _Progress(no, values + step, step_size, search, linearised, aux, descent, result), aux
 
     def terminate(
-        self, fn: Any, y: Values, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
+        self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Tell whether the unknowns have converged."""
-        return self.descent.done(state.search_state.step_size, state.descent_state), state.result
+        return self.descent.done(state.step_size, state.descent), state.result
+
+    def postprocess(
+        self,
+        fn: Callable,
+        y: Values,
+        aux: Any,
+        args: Any,
+        options: dict[str, Any],
+        state: _Progress,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[Values, Any, dict[str, Any]]:
+        """Return the unknowns and what is told of them as they are."""
+        return y, aux, {}

@@ -153,8 +153,8 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
     product = _information(problem, values)
     shape = start.shape
 
-    def improve(_: Any, found: tuple[Array, Array]) -> tuple[Array, Array]:
-        values, block = found
+    def improve(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        values, block = state
         # A Chebyshev polynomial that is small between what is weak as far as is known and the top, and grows below.
         cut = jnp.mean(values)
         centre, half = (1.1 * top + cut) / 2, (1.1 * top - cut) / 2
@@ -178,7 +178,7 @@ def _ritz(block: Array, image: Array, largest: bool) -> tuple[Array, Array]:
     """Return Ritz values and vectors in the span of orthonormal directions."""
     flat, images = block.reshape(len(block), -1), image.reshape(len(block), -1)
     projected = jnp.matmul(flat, images.T, precision="highest")
-    found, mix = jnp.linalg.eigh((projected + projected.T) / 2)
+    values, mix = jnp.linalg.eigh((projected + projected.T) / 2)
     mix = mix[:, ::-1] if largest else mix
-    found = found[::-1] if largest else found
-    return found, jnp.matmul(mix.T, flat, precision="highest").reshape(block.shape)
+    values = values[::-1] if largest else values
+    return values, jnp.matmul(mix.T, flat, precision="highest").reshape(block.shape)

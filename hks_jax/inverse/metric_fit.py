@@ -23,10 +23,11 @@ class Step:
     """One step of a fit.
 
     Attributes:
-        step: its number, from 0: what was known before any change.
+        step: its number, from 0: what was known before any change. Of solvers of optimistix only steps that were taken
+            are told, not those that were tried.
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the part of the data.
-        gradient: the norm of the loss's gradient; NaN where the solver does not tell.
+        gradient: the norm of the loss's gradient; NaN where nobody computed it (least squares solvers of optimistix).
         accepted: whether the step was taken.
         seconds: since the start.
         stage: which part of the continuation.

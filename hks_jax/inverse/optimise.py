@@ -5,11 +5,13 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
@@ -19,20 +21,52 @@ _REJECTIONS = 12
 """Rejected steps in a row after which a fit counts as stalled."""
 
 
-def _residuals(values: Values, problem: Problem) -> tuple[Array, tuple[Array, Array]]:
-    """Return residuals, with the loss and the misfit of the data.
+class _Told(eqx.Module):
+    """What residuals and objective tell a solver beside their value, with the unknowns to which it belongs.
+
+    Attributes:
+        values: the unknowns.
+        loss: half the weighted mean square, plus the penalties.
+        misfit: the part of the data.
+        gradient: the norm of the objective's gradient; NaN where it was not computed.
+    """
+
+    values: Values
+    loss: Float[Array, ""]
+    misfit: Float[Array, ""]
+    gradient: Float[Array, ""]
+
+
+def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
+    """Return residuals, and what is told beside.
 
     They are scaled by the number of nodes, so that a step's curvature is of order one whatever the grid.
     """
     data, penalties = problem.residuals(values)
     misfit = jnp.sum(data**2) / 2
     everything = jnp.sqrt(len(values)) * jnp.concatenate([data, penalties])
-    return everything, (misfit + jnp.sum(penalties**2) / 2, misfit)
+    unknown = jnp.full((), jnp.nan, misfit.dtype)
+    return everything, _Told(values, misfit + jnp.sum(penalties**2) / 2, misfit, unknown)
 
 
-def _objective(values: Values, problem: Problem) -> tuple[Float[Array, ""], tuple[Array, Array]]:
-    residuals, aux = _residuals(values, problem)
-    return jnp.sum(residuals**2) / 2, aux
+@eqx.filter_custom_jvp
+def _objective(values: Values, problem: Problem) -> tuple[Float[Array, ""], _Told]:
+    residuals, told = _residuals(values, problem)
+    return jnp.sum(residuals**2) / 2, told
+
+
+@_objective.def_jvp
+def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """Compute the gradient with the value, so that it can be told: whoever differentiates needs it anyway."""
+    (values, problem), (direction, _) = primals, tangents
+
+    def objective(values: Values) -> tuple[Float[Array, ""], _Told]:
+        residuals, told = _residuals(values, problem)
+        return jnp.sum(residuals**2) / 2, told
+
+    (value, told), gradient = jax.value_and_grad(objective, has_aux=True)(values)
+    told = _Told(told.values, told.loss, told.misfit, jnp.linalg.norm(jnp.ravel(gradient)))
+    return (value, told), (jnp.sum(gradient * direction), jax.tree.map(jnp.zeros_like, told))
 
 
 # A solver's state holds the residuals' trace, and the same one, out of this function's cache, for every fit of the same
@@ -46,25 +80,20 @@ def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem)
 
 @eqx.filter_jit
 def _advance(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem, state: Any) -> tuple:
-    values, state, aux = optimiser.step(fn, values, problem, {}, state, frozenset())
+    values, state, told = optimiser.step(fn, values, problem, {}, state, frozenset())
     done, result = optimiser.terminate(fn, values, problem, {}, state, frozenset())
-    # What the step before knew, where the solver does not keep what belongs to the unknowns.
-    aux = getattr(state, "aux", aux)
-    return values, state, aux, done, result == optx.RESULTS.successful, _gradient(state)
-
-
-def _gradient(state: Any) -> Float[Array, ""]:
-    """Return the norm of the gradient, where the solver's state has it."""
-    gradient = getattr(getattr(state, "descent_state", None), "gradient", None)
-    if gradient is None:
-        gradient = getattr(getattr(state, "f_info", None), "grad", None)
-    return jnp.asarray(jnp.nan) if gradient is None else jnp.linalg.norm(jnp.ravel(gradient))
+    step_size = jnp.ones(())
+    if isinstance(optimiser, GaussNewton):
+        told = _Told(told.values, told.loss, told.misfit, jnp.linalg.norm(jnp.ravel(state.descent.gradient)))
+        step_size = state.step_size
+    return values, state, told, done, result == optx.RESULTS.successful, step_size
 
 
 @eqx.filter_jit
 def loss_of(problem: Problem, values: Values) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the loss and the misfit."""
-    return _objective(values, problem)[1]
+    told = _residuals(values, problem)[1]
+    return told.loss, told.misfit
 
 
 def optimise(
@@ -95,33 +124,41 @@ def optimise(
         The best unknowns seen, and one of the keys of `metric_fit.RESULTS`.
     """
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
-    best, least = values, np.inf
-    rejected = 0
+    best, least, seen = values, np.inf, None
+    rejected, number, end = 0, 0, ""
     try:
         state = _begin(optimiser, fn, values, problem)
-        for step in range(max_steps + 1):
+        # One step more than asked for: many solvers tell of their unknowns one step later.
+        for count in range(max_steps + 2):
             before = values
-            values, state, (loss, misfit), done, fine, gradient = _advance(optimiser, fn, values, problem, state)
-            accepted = step == 0 or bool(jnp.any(values != before))
+            values, state, told, done, fine, size = _advance(optimiser, fn, values, problem, state)
+            accepted = count == 0 or bool(jnp.any(values != before))
             rejected = 0 if accepted else rejected + 1
-            gradient = float(gradient) / np.sqrt(len(values))
-            record = Step(
-                step, float(loss), float(misfit), gradient, accepted, time.perf_counter() - clock, stage, start
-            )
-            if not np.isfinite(record.loss):
-                return best, "not finite"
-            if record.loss <= least:
-                best, least = values, record.loss
-            size = getattr(getattr(state, "search_state", None), "step_size", 1.0)
-            report(record, values, float(size))
-            if noise is not None and record.misfit <= noise**2 / 2:
-                return best, "noise level reached"
+            new = seen is None or bool(jnp.any(told.values != seen))
+            if new or isinstance(optimiser, GaussNewton):
+                seen, loss, misfit = told.values, float(told.loss), float(told.misfit)
+                gradient = float(told.gradient) / np.sqrt(len(values))
+                record = Step(number, loss, misfit, gradient, new, time.perf_counter() - clock, stage, start)
+                if not np.isfinite(loss):
+                    return best, "not finite"
+                if loss <= least:
+                    best, least = seen, loss
+                report(record, seen, float(size))
+                number += 1
+                if noise is not None and misfit <= noise**2 / 2:
+                    return best, "noise level reached"
+            if end:
+                return best, end
             if not bool(fine):
                 return best, "not finite"
             if bool(done):
-                return best, "converged"
-            if rejected >= _REJECTIONS:
-                return best, "stalled"
+                end = "converged"
+            elif rejected >= _REJECTIONS:
+                end = "stalled"
+            elif count == max_steps:
+                end = "steps exhausted"
+            if end and not bool(jnp.any(values != seen)):
+                return best, end
     except KeyboardInterrupt:
         return best, "interrupted"
-    return best, "steps exhausted"
+    return best, end

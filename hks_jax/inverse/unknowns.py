@@ -84,12 +84,12 @@ class Nodal(Unknowns):
         domain = np.zeros(grid.size, dtype=bool)
         domain[self.nodes.value] = True
         fields = jnp.zeros((values.shape[1], grid.size), values.dtype).at[:, self.nodes.value].set(values.T)
-        fields, found = fields.reshape(-1, *grid.shape), []
+        fields, differences = fields.reshape(-1, *grid.shape), []
         for axis in range(grid.dimension):
             inside = np.moveaxis(domain.reshape(grid.shape), axis, 0)
             both = np.moveaxis(inside[1:] & inside[:-1], 0, axis)
-            found.append(jnp.where(both, jnp.diff(fields, axis=axis + 1) / grid.spacing[axis], 0))
-        return found
+            differences.append(jnp.where(both, jnp.diff(fields, axis=axis + 1) / grid.spacing[axis], 0))
+        return differences
 
 
 class Free(Unknowns):
@@ -120,10 +120,10 @@ class Free(Unknowns):
 
     def field(self, values: Values) -> TensorField:
         """Return the field with these parameters."""
-        found = self.function(self.unravel(values))
-        if isinstance(found, TensorField):
-            return found
-        return TensorField(self.init.grid, found, self.init.interpolation)
+        tensors = self.function(self.unravel(values))
+        if isinstance(tensors, TensorField):
+            return tensors
+        return TensorField(self.init.grid, tensors, self.init.interpolation)
 
 
 def nodes_of(domain: np.ndarray) -> StaticArray:

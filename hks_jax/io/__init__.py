@@ -9,6 +9,9 @@ from hks_jax.io.masks import erode as erode
 from hks_jax.io.masks import read_mask as read_mask
 from hks_jax.io.mesh import read_mesh as read_mesh
 from hks_jax.io.mesh import read_mesh_arrays as read_mesh_arrays
+from hks_jax.io.pairs import load_pairs as load_pairs
+from hks_jax.io.pairs import save_pairs as save_pairs
+from hks_jax.io.positive import positive_tensors as positive_tensors
 from hks_jax.io.read import read_tensors as read_tensors
 from hks_jax.io.repair import REPAIRS as REPAIRS
 from hks_jax.io.repair import find_invalid as find_invalid

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.io.masks import as_mask
+from hks_jax.io.order_check import invalid_by_order
 from hks_jax.io.tensor_order import choices, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npy, load_npz
@@ -51,6 +52,7 @@ def read_tensors(
         order=order,
         frame=frame,
         source=name,
+        invalid_by_order=None if order == "matrix" else invalid_by_order(values, order),
     )
 
 

@@ -52,11 +52,11 @@ def load_gifti(path: Path) -> Loaded:
         if max(axes, default=0) > _AXES:
             raise ValueError(f"an array of {max(axes)} axes")
         image = library.gifti.GiftiImage.from_bytes(content)
-        found = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
-        if [len(arrays) for arrays in found] != [1, 1]:
-            numbers = " and ".join(str(len(arrays)) for arrays in found)
+        arrays_of_kinds = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
+        if [len(arrays) for arrays in arrays_of_kinds] != [1, 1]:
+            numbers = " and ".join(str(len(arrays)) for arrays in arrays_of_kinds)
             raise ValueError(f"it has {numbers} arrays of points and of triangles; expected one of each")
-        vertices, faces = (np.asarray(arrays[0].data) for arrays in found)
+        vertices, faces = (np.asarray(arrays[0].data) for arrays in arrays_of_kinds)
         if vertices.ndim != 2 or faces.ndim != 2 or faces.dtype.kind not in "iu":
             raise ValueError(f"points of shape {vertices.shape}, triangles of shape {faces.shape} and {faces.dtype}")
     return Loaded(vertices.astype(np.float64), faces.astype(np.int64), {})

@@ -39,10 +39,10 @@ def find_example_brain() -> ExampleBrain | None:
         files = importlib.metadata.files("mdt") or []
     except importlib.metadata.PackageNotFoundError:
         return None
-    found = {file.name: Path(str(file.locate())) for file in files if file.name in names}
-    if any(name not in found or not found[name].is_file() for name in names):
+    paths = {file.name: Path(str(file.locate())) for file in files if file.name in names}
+    if any(name not in paths or not paths[name].is_file() for name in names):
         return None
-    return ExampleBrain(*(found[name] for name in names))
+    return ExampleBrain(*(paths[name] for name in names))
 
 
 def fit_dwi(
@@ -92,12 +92,12 @@ def fit_dwi(
             "at least 6 and 1"
         )
     signal = nifti.voxels(path, image)[..., used]
-    inside, found = _inside(mask, signal[..., b[used] <= threshold], affine, segmentation)
+    inside, remarks = _inside(mask, signal[..., b[used] <= threshold], affine, segmentation)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
     tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fsl", affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
-    notes = [f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)", *found]
+    notes = [f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)", *remarks]
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
     return TensorVolume(
@@ -123,11 +123,11 @@ def _inside(
     """Return the mask, given or found, and a note of how it was found."""
     if mask is None:
         with np.errstate(invalid="ignore"):  # where its median filter leaves nothing, it divides by zero
-            _, found = segmentation.median_otsu(unweighted.mean(axis=-1))
-        if not found.any():
+            _, brain = segmentation.median_otsu(unweighted.mean(axis=-1))
+        if not brain.any():
             raise ValueError("mask: DIPY's median_otsu finds nothing in the unweighted images; pass a mask")
-        return found.astype(bool), [
-            f"no mask: DIPY's median_otsu of the unweighted images keeps {int(found.sum())} voxels"
+        return brain.astype(bool), [
+            f"no mask: DIPY's median_otsu of the unweighted images keeps {int(brain.sum())} voxels"
         ]
     inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
     if inside.shape != unweighted.shape[:3]:

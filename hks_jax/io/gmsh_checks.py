@@ -99,8 +99,8 @@ def _check_data(section: bytes) -> None:
     """Raise ValueError where values at nodes or elements are declared for which there is no room."""
     lines = iter(section.split(b"\n"))
     for _ in range(3):  # names, real numbers, whole numbers: how many, and they
-        here = [next(lines, b"") for _ in range(min(int(next(lines, b"0")), len(section)))]
-    numbers = [int(line) for line in here]
+        listed = [next(lines, b"") for _ in range(min(int(next(lines, b"0")), len(section)))]
+    numbers = [int(line) for line in listed]
     if len(numbers) < 3 or min(numbers[1:3]) < 0 or numbers[1] * numbers[2] > len(section):
         raise ValueError(f"values declared by the numbers {numbers[:3]} in {len(section)} bytes")
 

@@ -1,12 +1,14 @@
-"""Label maps: to which region each voxel belongs."""
+"""Label maps: to which region each voxel belongs, and the regions' names."""
 
 import os
+import re
 
 import numpy as np
 from jaxtyping import Integer
 
 from hks_jax.io import nifti
 from hks_jax.npz import load_npy
+from hks_jax.reading import existing, reading
 
 NEAR = 0.1
 """By how many voxels two images may lie apart and still be on the same voxels."""
@@ -51,6 +53,47 @@ def read_labels(
     if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
         raise ValueError(f"{name}: got numbers that are not whole; expected labels. Resample by the nearest neighbour")
     return np.asarray(values).astype(np.int32)
+
+
+def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
+    """Read names of labels: a table with the columns ``index`` and ``name`` (BIDS), or lines of a number and a name.
+
+    Of a line without such a table, the name is what follows the number: up to the next tab if there is one before it,
+    and without the four numbers of a colour that FreeSurfer's tables end in.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no text in UTF-8; no line begins with a number.
+    """
+    file = existing(path)
+    with reading(file, "a text in UTF-8"):
+        lines = [line.strip("\r\n") for line in file.read_text(encoding="utf-8-sig").splitlines()]
+    names = {}
+    header = lines[0].split("\t") if lines else []
+    if {"index", "name"} <= set(header):
+        at = header.index("index"), header.index("name")
+        for line in lines[1:]:
+            cells = line.split("\t")
+            if len(cells) > max(at) and cells[at[0]].strip().lstrip("-").isdecimal():
+                names[int(cells[at[0]])] = cells[at[1]].strip()
+    else:
+        for line in lines:
+            number, *words = line.split(None, 1)[:2] or [""]
+            if number.lstrip("-").isdecimal() and words:
+                names[int(number)] = re.sub(r"(\s+\d+){4}$", "", words[0].split("\t")[0].strip())
+    if not names:
+        raise ValueError(f"{file}: no line has a number and a name; expected lines such as '17 left hippocampus'")
+    return names
+
+
+def names_beside(path: str | os.PathLike[str]) -> str | None:
+    """Return the table of names beside a label map, in BIDS ``…_dseg.tsv`` for ``…_dseg.nii.gz``, if it is there."""
+    name = os.fspath(path)
+    for suffix in (*nifti.SUFFIXES[::-1], ".npy"):
+        if name.lower().endswith(suffix):
+            table = name[: -len(suffix)] + ".tsv"
+            return table if os.path.isfile(table) else None
+    return None
 
 
 def _at_voxels(

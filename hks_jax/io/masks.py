@@ -8,12 +8,12 @@ from jaxtyping import Bool
 from scipy import ndimage
 
 from hks_jax.checks import require_real
-from hks_jax.io import nifti, nrrd
+from hks_jax.io import mrtrix, nifti, nrrd
 from hks_jax.npz import load_npy, load_npz
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
-    """Read a mask of zeros and ones: NIfTI, NRRD, ``.npy``, or the array ``mask`` of an ``.npz``.
+    """Read a mask of zeros and ones: NIfTI, MRtrix, NRRD, ``.npy``, or the array ``mask`` of an ``.npz``.
 
     Args:
         path: the file.
@@ -32,6 +32,11 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
             values = values[..., 0]
         if affine is not None:
             _check_same_place(name, image.affine, affine, values.shape)
+    elif mrtrix.is_mrtrix(path):
+        mask = mrtrix.load(path)
+        values = mask.values[..., 0] if mask.values.ndim == 4 and mask.values.shape[-1] == 1 else mask.values
+        if affine is not None:
+            _check_same_place(name, mask.affine, affine, values.shape)
     elif name.endswith(".npz"):
         arrays = load_npz(path)
         if "mask" not in arrays:
@@ -44,8 +49,15 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
     elif name.endswith(".npy"):
         values = load_npy(path)
     else:
-        raise ValueError(f"{name}: unknown kind of file; expected .nii, .nii.gz, .nrrd, .nhdr, .npz or .npy")
+        expected = ".nii, .nii.gz, .mif, .mif.gz, .nrrd, .nhdr, .npz or .npy"
+        raise ValueError(f"{name}: unknown kind of file; expected {expected}{of_mrtrix(name)}")
     return as_mask(name, values)
+
+
+def of_mrtrix(name: str) -> str:
+    """Return the advice for images of MRtrix in two files, which are not read; the empty text for others."""
+    stem, _, suffix = name.rpartition(".")
+    return "" if suffix.lower() != "mih" else f". MRtrix makes one file of it: mrconvert {name} {stem}.mif"
 
 
 def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:

@@ -58,13 +58,13 @@ class MeshChecks:
 
     def compare(self, mesh: Any) -> None:
         """Raise ValueError unless meshio found as many points and cells, and nothing follows them."""
-        found = (len(mesh.points), sum(len(block.data) for block in mesh.cells))
-        if self._declared and self._declared != found:
+        counts = (len(mesh.points), sum(len(block.data) for block in mesh.cells))
+        if self._declared and self._declared != counts:
             what = "it declares {} points and {} cells, of which {} and {} are there"
-            raise ValueError(what.format(*self._declared, *found))
+            raise ValueError(what.format(*self._declared, *counts))
         if self._suffix == ".off":
             lines = (line.partition(b"#")[0] for line in self._content.splitlines())
-            _same("words", 4 + 3 * found[0] + 4 * found[1], len(b" ".join(lines).split()))
+            _same("words", 4 + 3 * counts[0] + 4 * counts[1], len(b" ".join(lines).split()))
         if self._suffix == ".ply":
             self._compare_ply(mesh)
         corners = sum(block.data.size for block in mesh.cells)
@@ -92,6 +92,6 @@ class MeshChecks:
         _same("words" if ascii_ else "bytes", wanted, len(body.split() if ascii_ else body))
 
 
-def _same(unit: str, wanted: int, found: int) -> None:
-    if wanted != found:
-        raise ValueError(f"its points and cells take {wanted} {unit}, and there are {found}")
+def _same(unit: str, wanted: int, got: int) -> None:
+    if wanted != got:
+        raise ValueError(f"its points and cells take {wanted} {unit}, and there are {got}")

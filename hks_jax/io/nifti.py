@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.checks import require_real
+from hks_jax.io.order_check import invalid_by_order
 from hks_jax.io.tensor_order import FRAMES, choices, pack, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
@@ -91,7 +92,11 @@ def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
     """Read tensors; see `hks_jax.io.read_tensors`."""
-    image = load(name)
+    return tensors_of(name, load(name), order, frame)
+
+
+def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> TensorVolume:
+    """Return the tensors of an image that was loaded."""
     shape = image.shape
     if shape[3:] not in ((6,), (1, 6)):
         raise ValueError(
@@ -109,7 +114,8 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
         order = "nifti"
     elif declared and order != "nifti":
         notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
-    tensors = unpack(voxels(name, image).reshape(*shape[:3], 6), order)
+    components = voxels(name, image).reshape(*shape[:3], 6)
+    tensors = unpack(components, order)
     frame = FRAMES[order] if frame is None else frame
     affine = np.asarray(image.affine, np.float64)
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
@@ -136,6 +142,7 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
         frame=frame,
         notes=tuple(notes),
         source=name,
+        invalid_by_order=invalid_by_order(components, order),
     )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import check_data, check_header
+from hks_jax.io.order_check import invalid_by_order
 from hks_jax.io.tensor_order import choices, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
@@ -171,6 +172,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
         frame=frame,
         notes=tuple(notes),
         source=name,
+        invalid_by_order=invalid_by_order(components, order) if order is not None else None,
     )
 
 
@@ -232,9 +234,9 @@ def write_tensors(path: str | os.PathLike[str], volume: TensorVolume, record: st
 def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -> tuple[int, str | None]:
     """Return the axis of the components, and its kind; None where the file leaves the kind open."""
     kinds = header.get("kinds", ["???"] * len(shape))
-    found = [(axis, kind) for axis, kind in enumerate(kinds) if kind in KINDS]
-    if len(found) == 1:
-        axis, kind = found[0]
+    matrix_axes = [(axis, kind) for axis, kind in enumerate(kinds) if kind in KINDS]
+    if len(matrix_axes) == 1:
+        axis, kind = matrix_axes[0]
         n = KINDS[kind].d
         expected = (n * (n + 1) // 2 if KINDS[kind].symmetric else n * n) + KINDS[kind].masked
         if shape[axis] != expected:
@@ -244,7 +246,7 @@ def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -
     rows = _rows(header, len(shape))
     outside = [a for a in range(len(shape)) if shape[a] == count and rows is not None and np.isnan(rows[a]).all()]
     outside = outside or [a for a in (0, len(shape) - 1) if shape[a] == count]
-    if found or len(outside) != 1:
+    if matrix_axes or len(outside) != 1:
         raise ValueError(
             f"{name}: got axes of sizes {tuple(shape)} and kinds {list(kinds)}; expected one axis of components, "
             f"whose kind is one of {', '.join(KINDS)}; or one of six components, or three in the plane"

@@ -50,8 +50,8 @@ def check_header(text: bytes, header: Mapping[str, Any]) -> None:
     for line in text.splitlines()[1:]:
         if line.startswith(b"#") or not line:
             continue
-        key, colon, rest = line.partition(b":")
-        name, is_key = key.decode("latin-1"), rest.startswith(b"=")
+        key, colon, value = line.partition(b":")
+        name, is_key = key.decode("latin-1"), value.startswith(b"=")
         if not colon or (name in _FIELDS) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
             raise ValueError(f"the header's line {line[:60]!r} is neither a field of the format nor a key with a value")
     n = int(header["dimension"])
@@ -96,8 +96,8 @@ def _check_stream(source: BufferedReader, decompressor: Any) -> None:
 
 
 def _check_length(source: BufferedReader, header: Mapping[str, Any]) -> None:
-    here = source.tell()
-    held, count = source.seek(0, os.SEEK_END) - here, 1
+    start = source.tell()
+    held, count = source.seek(0, os.SEEK_END) - start, 1
     for size in header["sizes"]:
         count *= int(size)
     if count <= 0 or held % count:

@@ -9,19 +9,19 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.checks import require_number
-from hks_jax.io import arrays, nifti, nrrd, vtk_image
-from hks_jax.io.masks import as_mask, read_mask
+from hks_jax.io import arrays, components, mrtrix, nifti, nrrd, vtk_image
+from hks_jax.io.masks import as_mask, of_mrtrix, read_mask
 from hks_jax.io.provenance import digest
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.volume import TensorVolume
 
-SUFFIXES = (*nifti.SUFFIXES, *nrrd.SUFFIXES, *vtk_image.SUFFIXES, ".npz", ".npy")
+SUFFIXES = (*nifti.SUFFIXES, *mrtrix.SUFFIXES, *nrrd.SUFFIXES, *vtk_image.SUFFIXES, ".npz", ".npy")
 """What tensors are read from."""
 
 
 def read_tensors(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     order: Order | None = None,
     mask: str | os.PathLike[str] | Bool[np.ndarray, "*shape"] | None = None,
     *,
@@ -39,6 +39,11 @@ def read_tensors(
     are xx xy yy xz yz zz; or any (nx, ny, nz, 6) or (nx, ny, nz, 1, 6) image whose `order` is given, because
     programs differ. The distance between voxels is that of the affine.
 
+    Six NIfTI images, one for each component, as BIDS's ``param-txx`` … ``param-tzz``, DSI Studio and ANTs have them:
+    all six, or one, whose siblings are found by its name.
+
+    MRtrix (``.mif``, ``.mif.gz``): the six components of its dwi2tensor, along the scanner's axes.
+
     NRRD (``.nrrd``, ``.nhdr``): an axis of any of the format's kinds of matrix, 2D or 3D, symmetric or whole, masked or
     not, at any place; or an axis of six (in the plane three) components whose `order` is given. The measurement frame
     is heeded. The affine's axes are right, anterior, superior where the file's space is patient-based.
@@ -51,7 +56,7 @@ def read_tensors(
     = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``order``, ``frame``. npy: the tensors alone.
 
     Args:
-        path: the file.
+        path: the file, or six.
         order: ``"nifti"`` (xx xy yy xz yz zz), ``"fsl"`` (xx xy xz yy yz zz), ``"mrtrix"`` (xx yy zz xy xz yz) or
             ``"vtk"`` (xx yy zz xy yz xz); None: as the file declares. Not for whole matrices.
         mask: a file (see `read_mask`) or a bool array of the volume's shape; None: the file's own, or no mask.
@@ -75,14 +80,23 @@ def read_tensors(
         ImportError: an optional library is missing; says what to install.
     """
     require_number("confidence", confidence, above=-math.inf)
+    if not isinstance(path, str | os.PathLike):
+        if array is not None or spacing is not None:
+            raise ValueError("array, spacing: they are for NumPy's and VTK's files; leave them out for six images")
+        volume = components.read_tensors(list(path), order, frame)
+        return _finished(volume, mask, repair)
     name = os.fspath(path)
     numpys = name.lower().endswith((".npz", ".npy"))
     if array is not None and not (numpys or vtk_image.is_vtk_image(name)):
         raise ValueError(f"array: got {array!r}; only npz and VTK files have arrays by name")
     if spacing is not None and not numpys:
         raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
+    if nifti.is_nifti(path) and components.is_one_of_six(path):
+        return _finished(components.read_tensors(components.siblings(path), order, frame), mask, repair)
     if nifti.is_nifti(path):
         volume = nifti.read_tensors(name, order, frame)
+    elif mrtrix.is_mrtrix(path):
+        volume = mrtrix.read_tensors(name, order, frame)
     elif nrrd.is_nrrd(path):
         volume = nrrd.read_tensors(name, order, frame, confidence)
     elif vtk_image.is_vtk_image(path):
@@ -90,9 +104,16 @@ def read_tensors(
     elif numpys:
         volume = arrays.read_tensors(name, order, frame, array, spacing)
     else:
-        raise ValueError(f"{name}: unknown kind of file; expected {', '.join(SUFFIXES)}")
+        raise ValueError(f"{name}: unknown kind of file; expected {', '.join(SUFFIXES)}{of_mrtrix(name)}")
     if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
         volume = replace(volume, digest=digest(name))
+    return _finished(volume, mask, repair)
+
+
+def _finished(
+    volume: TensorVolume, mask: str | os.PathLike[str] | np.ndarray | None, repair: Repair | None
+) -> TensorVolume:
+    """Return the volume with the mask, and repaired if asked to."""
     if mask is not None:
         inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, volume.affine)
         if inside.shape != volume.shape:

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_number
 from hks_jax.domain import spd
-from hks_jax.domain.tensor_checks import least_eigenvalue, refuse, unsymmetric
+from hks_jax.domain.tensor_checks import MANY, least_eigenvalue, refuse, unsymmetric
 from hks_jax.io.volume import TensorVolume
 
 Repair = Literal["clip", "mask", "nearest"]
@@ -55,7 +56,10 @@ def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
         if (bad & ~finite).any():
             what += f", {int((bad & ~finite).sum())} of them NaN or infinite"
         choices = ", ".join(f'"{name}" ({does})' for name, does in REPAIRS.items())
-        refuse("tensors", bad, volume.inside, "voxel", what, f"Choose {argument}: {choices}")
+        remedy = f"Choose {argument}: {choices}"
+        if bad.sum() > MANY * volume.inside.sum():
+            remedy = f"{_why_so_many(volume, finite)}. For a few exceptions c{remedy[1:]}"
+        refuse("tensors", bad, volume.inside, "voxel", what, remedy)
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
@@ -94,6 +98,12 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         typical = np.trace(volume.tensors[inside & ~bad], axis1=-2, axis2=-1) / volume.dimension
         floor = 0.01 * float(np.median(typical)) if floor is None else floor
     report = _report(volume, bad, method, floor)
+    if report["voxels"] > MANY * report["of"]:
+        finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
+        warn_of_accuracy(
+            f"repair: {report['voxels']} of {report['of']} tensors ({report['voxels'] / report['of']:.0%}) are not as "
+            "required, and the signature is to that part one of the repair. " + _why_so_many(volume, finite)
+        )
     wrong = f"have an eigenvalue below {lowest:g}" if lowest else "are not positive definite"
     worst = "" if report["worst_eigenvalue"] is None else f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})"
     done = {
@@ -120,6 +130,25 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         )
         tensors[bad] = volume.tensors[tuple(index[bad] for index in nearest)]
     return replace(changed, tensors=tensors)
+
+
+def _why_so_many(volume: TensorVolume, finite: Bool[np.ndarray, "*shape"]) -> str:
+    """Ask what is wrong where more than a few tensors are: the order, or that they are no diffusion tensors.
+
+    Args:
+        volume: the tensors.
+        finite: those that are finite, and yet not positive definite.
+    """
+    question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
+    if question or not finite.any():
+        return question or "So many are no noise: NaN is often what lies outside a mask"
+    sizes = np.abs(np.linalg.eigvalsh(volume.tensors[finite].astype(np.float64)))
+    return (
+        "So many are no noise. Tensors that are indefinite by nature, such as stress, become a metric by a map of all "
+        f"of them: exp(S/s) with a scale s (eigenvalues of the invalid ones reach {sizes.max():.3g} in size), or "
+        f"S + c·I with a shift c > {-least_eigenvalue(volume.tensors[finite]):.3g}; see positive_tensors, on the "
+        "command line --positive"
+    )
 
 
 def without_background(volume: TensorVolume) -> TensorVolume:

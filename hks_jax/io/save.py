@@ -1,5 +1,6 @@
 """Writing results and tensors, whole or not at all, with where they came from."""
 
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,7 +33,8 @@ def save(
     """Write scalars on the grid of a volume or slice, or at the vertices of a mesh: the format follows the suffix.
 
     ``.nii``, ``.nii.gz``: an image with the volume's affine, times along its fourth axis. A slice becomes an image one
-    voxel thick at its place in space. NaN outside the mask is kept.
+    voxel thick at its place in space. NaN outside the mask is kept. The header has no room for times: those in `extra`
+    are written beside the image, as BIDS does it, NAME.json with ``Times`` in the order of the fourth axis.
 
     ``.nrrd``: the same, times along the last axis; `extra` as text in the header.
 
@@ -55,7 +57,7 @@ def save(
         values: (*shape,) or (n_times, *shape); for a mesh (V,) or (n_times, V).
         volume: what the values belong to.
         name: what to call the values in the file.
-        extra: more arrays, such as the times; not for NIfTI.
+        extra: more arrays, such as the times; for NIfTI the times alone.
         provenance: what else the file should say of its origin, such as the settings of the computation.
 
     Returns:
@@ -82,13 +84,16 @@ def save(
     if vtk_image.is_vtk_image(path):
         return vtk_image.write(path, _by_time(name, array, n, extra), volume, record, extra)
     if nifti.is_nifti(path) or nrrd.is_nrrd(path):
-        if nifti.is_nifti(path) and extra:
-            raise ValueError(f"extra: got {', '.join(extra)}; NIfTI has no place for more arrays. Write an .npz too")
+        others = sorted(extra.keys() - {"times"})
+        if nifti.is_nifti(path) and others:
+            raise ValueError(f"extra: got {', '.join(others)}; NIfTI has no place for more arrays. Write an .npz too")
         if volume.dimension == 2 and (nifti.is_nifti(path) or volume.affine is not None):
             array = np.expand_dims(array, n + volume.thin_axis)
         array = np.moveaxis(array, 0, -1) if n else array
         if nrrd.is_nrrd(path):
             return nrrd.write(path, array, volume, record, more=extra)
+        if "times" in extra:
+            _write_times(path, np.ravel(extra["times"]), name, volume)
         return _write_nifti(path, array, volume, record, name=name)
     slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
     return _write_npz(path, {**_place(volume), name: array, **slice_axis, **extra, "provenance": record})
@@ -171,6 +176,20 @@ def _write_nifti(
     with atomic_path(path) as temporary:
         nib.save(image, temporary)
     return Path(path)
+
+
+def _write_times(path: str | os.PathLike[str], times: np.ndarray, name: str, volume: TensorVolume) -> None:
+    """Write the times of an image's fourth axis beside it, as JSON."""
+    file = Path(path)
+    suffix = next(s for s in sorted(nifti.SUFFIXES, key=len, reverse=True) if file.name.lower().endswith(s))
+    sidecar = file.with_name(file.name[: -len(suffix)] + ".json")
+    content = {
+        "Quantity": name,
+        "Times": times.tolist(),
+        "Sources": [Path(volume.source).name] if volume.source else [],
+    }
+    with atomic_path(sidecar) as temporary:
+        Path(temporary).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:

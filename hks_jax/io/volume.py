@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_real
+from hks_jax.describe import describe_array
 from hks_jax.domain.grid import Grid
+from hks_jax.io.order_check import InvalidByOrder
 
 AXES = "xyz"
 
@@ -30,6 +32,8 @@ class TensorVolume:
         source: the file.
         digest: the SHA-256 of the file; empty where the data are in more than one.
         repair: what was done to tensors that are not positive definite, for reports; empty if nothing was.
+        invalid_by_order: how many tensors of the file are not positive definite under each order of components, where
+            many are under the one in which they were read; else None.
 
     Raises:
         ValueError: shapes that do not agree; spacings that are not positive, numbers that are not finite.
@@ -47,6 +51,7 @@ class TensorVolume:
     source: str = ""
     digest: str = ""
     repair: Mapping[str, Any] = field(default_factory=dict)
+    invalid_by_order: InvalidByOrder | None = None
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
@@ -67,6 +72,15 @@ class TensorVolume:
             )
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
             raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected (4, 4), finite")
+
+    def __repr__(self) -> str:
+        """Return one line without the arrays."""
+        inside = "" if self.mask is None else f", mask={int(self.mask.sum())} of {self.mask.size} voxels"
+        cut = "" if self.slice_axis is None else f", slice_axis={self.slice_axis}"
+        return (
+            f"TensorVolume({describe_array(self.tensors)}, spacing={self.spacing}{inside}{cut}, order={self.order!r}, "
+            f"frame={self.frame!r}, source={self.source!r}, {len(self.notes)} notes)"
+        )
 
     @property
     def shape(self) -> tuple[int, ...]:

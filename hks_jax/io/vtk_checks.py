@@ -68,15 +68,15 @@ def check_legacy(path: Path) -> None:
     version = re.match(rb"# vtk DataFile Version (\d)\.\d\s*\n", content)
     if version is None:
         raise ValueError(f"it begins with {content[:30]!r}; expected the version, as in '# vtk DataFile Version 5.1'")
-    for found in _COUNTS.finditer(content):
-        numbers = [int(n) for n in (found[1] or found[2]).split()]
+    for match in _COUNTS.finditer(content):
+        numbers = [int(n) for n in (match[1] or match[2]).split()]
         # Numbers of tuples and components, or nodes along the axes, are of one array; others are each of one.
-        of_one = found[2] is not None or found[0][:10].upper() == b"DIMENSIONS"
+        of_one = match[2] is not None or match[0][:10].upper() == b"DIMENSIONS"
         if min(numbers) < 0 or (math.prod(numbers) if of_one else max(numbers)) > 8 * len(content):
-            raise ValueError(f"{found[0][:60]!r} declares what {len(content)} bytes cannot hold")
+            raise ValueError(f"{match[0][:60]!r} declares what {len(content)} bytes cannot hold")
     if int(version[1]) < 5:
-        for found in _LISTS.finditer(content):
-            _check_lists(content, found.end(), int(found[1]), int(found[2]))
+        for match in _LISTS.finditer(content):
+            _check_lists(content, match.end(), int(match[1]), int(match[2]))
 
 
 def _check_lists(content: bytes, start: int, cells: int, size: int) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.atomic import atomic_path
+from hks_jax.io.order_check import invalid_by_order
 from hks_jax.io.tensor_order import choices, nearest_rotation, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.io.vtk_checks import check_legacy, check_xml
@@ -132,6 +133,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
         frame=frame,
         notes=(note,),
         source=name,
+        invalid_by_order=None if order == "matrix" else invalid_by_order(components, order),
     )
     return _as_plane(volume)
 
@@ -227,18 +229,18 @@ def _has_candidates(attributes: Any, name: str | None) -> bool:
 def _tensor_array(name: str, attributes: Any, wanted: str | None) -> tuple[Any, bool]:
     """Return the array of tensors, and whether the file declares it as such."""
     declared = attributes.GetTensors()
-    found = {key: a for key, a in _arrays(attributes).items() if a.GetNumberOfComponents() in (6, 9)}
+    candidates = {key: a for key, a in _arrays(attributes).items() if a.GetNumberOfComponents() in (6, 9)}
     if wanted is None and declared is not None:
         return declared, True
     if wanted is not None:
-        found = {key: a for key, a in found.items() if key == wanted}
-    if len(found) != 1:
+        candidates = {key: a for key, a in candidates.items() if key == wanted}
+    if len(candidates) != 1:
         had = ", ".join(f"{key!r} ({a.GetNumberOfComponents()})" for key, a in _arrays(attributes).items()) or "none"
         asked = "" if wanted is None else f" named {wanted!r}"
         raise ValueError(
             f"{name}: expected one array of 6 or 9 components{asked}; it has (with components) {had}. Pass array"
         )
-    array = next(iter(found.values()))
+    array = next(iter(candidates.values()))
     return array, declared is not None and array.GetName() == declared.GetName()
 
 

@@ -81,8 +81,10 @@ def factorise(
         matrix: its entries at the places of the pattern: `SymmetricPencil.shifted`.
         least: the least pivot allowed, relative to the entries; smaller ones are replaced by it.
     """
+    # Where no pivot is replaced, the sizes of the fronts' entries are not needed.
+    least_or_none = None if isinstance(least, float) and least == 0 else jnp.asarray(least, matrix.dtype)
     # Compiled without its result's dissection: what a compiled function hands through is copied.
-    return Factorisation(dissection, *_eliminate(dissection, matrix, jnp.asarray(least, matrix.dtype)))
+    return Factorisation(dissection, *_eliminate(dissection, matrix, least_or_none))
 
 
 # What is factorised is F = A + E with A = K − σM. If the spectral radius of EF⁻¹ is below one, F − tE = (1 − tEF⁻¹)F is
@@ -122,13 +124,13 @@ def try_out(
 
 @jit_quickly()
 def _eliminate(
-    dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""]
+    dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | None
 ) -> tuple[tuple[Array, ...], tuple[Array, ...], Int[Array, ""]]:
     """Return the matrices downward and upward, and the count of negative eigenvalues."""
     pivots = []
 
     def inverted(blocks: Array, sizes: Array) -> Array:
-        inverses, some = symmetric_inverses(blocks, least * sizes)
+        inverses, some = symmetric_inverses(blocks, jnp.zeros_like(sizes) if least is None else least * sizes)
         pivots.append(some.ravel())
         return inverses
 

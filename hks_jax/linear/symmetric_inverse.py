@@ -4,8 +4,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from hks_jax.linear import accelerators, sweep_kernel
 from hks_jax.linear.lapack import at_once_or_in_turn
 from hks_jax.linear.products import batched, transposed
 
@@ -22,7 +23,8 @@ def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"
     matrix is not finite. On CPUs by LAPACK's eigenvalues, elsewhere by elimination, which takes far fewer of the
     operations that are slow there.
     """
-    return jax.lax.platform_dependent(matrices, least, cpu=by_eigenvalues, default=by_elimination)
+    ways = {"cpu": by_eigenvalues} | ({"cuda": by_kernels} if accelerators.kernels_compile() else {})
+    return jax.lax.platform_dependent(matrices, least, **ways, default=by_elimination)
 
 
 def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
@@ -47,12 +49,24 @@ def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -
     return whole, jnp.concatenate([values, others], axis=1)
 
 
-def by_elimination(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
-    """Sweep the matrices block by block.
+def by_kernels(matrices: Float[Array, "m n n"], least: Float[Array, " m"], interpret: bool = False) -> Inverses:
+    """Sweep the matrices block by block, these in one launch of a kernel each; ``interpret`` is for tests."""
+    n, size = matrices.shape[1], sweep_kernel.LARGEST
+    if n <= size:
+        return sweep_kernel.invert_in_registers(matrices, least, interpret=interpret)
+    a, pivots = matrices, []
+    # Written out, as a turn of XLA's loops is three launches more; behind the barrier, so that XLA compiles one kernel
+    # for all blocks, and not one for each.
+    for start in range(0, n, size):
+        at, rows = jax.lax.optimization_barrier(jnp.int32(start)), min(size, n - start)
+        inverses, of_block = sweep_kernel.invert_in_registers(a, least, at, rows, interpret)
+        a = _swept(a, jax.lax.dynamic_slice_in_dim(a, at, rows, axis=1), inverses, at)
+        pivots.append(of_block)
+    return -a, jnp.concatenate(pivots, axis=1)
 
-    Sweeping a block P of A turns it into −P⁻¹, and the rest into the Schur complement of P; once all blocks are swept,
-    A has become −A⁻¹. By Sylvester's law of inertia as many of the pivots are negative as eigenvalues of A.
-    """
+
+def by_elimination(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+    """Sweep the matrices block by block, and these row by row."""
     m, n, _ = matrices.shape
     size = min(n, _BLOCK)
     whole = -(-n // size) * size
@@ -62,19 +76,29 @@ def by_elimination(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -
         a, pivots = state
         at = number * size
         rows = jax.lax.dynamic_slice_in_dim(a, at, size, axis=1)
-        inverses, of_block = _sweep_rows(jax.lax.dynamic_slice_in_dim(rows, at, size, axis=2), least)
-        scaled = batched(inverses, rows)
-        a = a - batched(transposed(rows), scaled)
-        a = jax.lax.dynamic_update_slice_in_dim(a, scaled, at, axis=1)
-        a = jax.lax.dynamic_update_slice_in_dim(a, transposed(scaled), at, axis=2)
-        a = jax.lax.dynamic_update_slice(a, -inverses, (0, at, at))
-        return a, jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
+        inverses, of_block = sweep_rows(jax.lax.dynamic_slice_in_dim(rows, at, size, axis=2), least)
+        return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
     return -a[:, :n, :n], pivots[:, :n]
 
 
-def _sweep_rows(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+# Sweeping a block P of A turns it into −P⁻¹, and the rest into the Schur complement of P; once all blocks are swept, A
+# has become −A⁻¹. By Sylvester's law of inertia as many of the pivots are negative as eigenvalues of A. With R the rows
+# of P, and U what they are with −I in place of P, the swept matrix is A − UᵀP⁻¹U, in A zeros for the rows and columns
+# of P: two products, and one pass over A.
+def _swept(
+    a: Float[Array, "m n n"], rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]
+) -> Float[Array, "m n n"]:
+    """Sweep the block whose rows begin with number ``at``, given its inverse."""
+    index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
+    inside = (index >= at) & (index < at + rows.shape[1])
+    rows = jnp.where(inside, -(index == own[:, None]).astype(a.dtype), rows)
+    change = batched(transposed(rows), batched(inverses, rows))
+    return jnp.where(inside, 0, jnp.where(inside[:, None], 0, a)) - change
+
+
+def sweep_rows(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
     """Sweep one row at a time, always the one with the largest diagonal entry left; return with them the pivots."""
     m, n, _ = matrices.shape
     index = jnp.arange(n)

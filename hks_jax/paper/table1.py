@@ -84,9 +84,9 @@ def interpolate_periodic(values: Float[np.ndarray, "n n"], factor: int) -> Float
     """Return the bilinear interpolant of periodic node values on a grid `factor` times as fine."""
     weight = np.arange(factor) / factor
     for axis in (0, 1):
-        here = np.moveaxis(values, axis, 0)[:, None]
-        there = np.roll(here, -1, axis=0)
-        fine = (1 - weight)[:, None] * here + weight[:, None] * there
+        coarse = np.moveaxis(values, axis, 0)[:, None]
+        following = np.roll(coarse, -1, axis=0)
+        fine = (1 - weight)[:, None] * coarse + weight[:, None] * following
         values = np.moveaxis(fine.reshape(-1, fine.shape[-1]), 0, axis)
     return values
 

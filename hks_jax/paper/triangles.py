@@ -92,18 +92,18 @@ def _triangles(grid: Grid, periodic: bool) -> tuple[Int[np.ndarray, "n 3"], Floa
 def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
     """Return the paper's fields, and a phantom of a brain, with their names and whether they are periodic."""
     of_figures, of_torus = FULL if full else QUICK
-    found: list[tuple[str, TensorField, bool]] = []
+    cases: list[tuple[str, TensorField, bool]] = []
     for n in (COARSE, *of_figures):
-        found += [(f"Fig. 3, {name}, {n}²", field, False) for name, field in figure3_fields(n).items()]
-        found += [(f"Fig. 4, {name}, {n}²", field, False) for name, field in figure4_fields(n).items()]
-        found += [(f"Fig. 5, index {i}, {n}²", degenerate_point_field(float(i), n), False) for i in INDICES]
-    found += [(f"bumpy torus, {n}²", bumpy_torus_field(n), True) for n in of_torus]
+        cases += [(f"Fig. 3, {name}, {n}²", field, False) for name, field in figure3_fields(n).items()]
+        cases += [(f"Fig. 4, {name}, {n}²", field, False) for name, field in figure4_fields(n).items()]
+        cases += [(f"Fig. 5, index {i}, {n}²", degenerate_point_field(float(i), n), False) for i in INDICES]
+    cases += [(f"bumpy torus, {n}²", bumpy_torus_field(n), True) for n in of_torus]
     tensors, mask, spacing = phantom()
     metrics: dict[str, MetricChoice] = {"T = D": "tensor", "g = D⁻¹": "inverse"}
     for name, metric in metrics.items():
         field = TensorField.from_diffusion(Grid(mask.shape, spacing, mask=mask, components="largest"), tensors, metric)
-        found.append((f"phantom of a brain, {name}", field, False))
-    return found
+        cases.append((f"phantom of a brain, {name}", field, False))
+    return cases
 
 
 def triangles(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:

@@ -68,10 +68,10 @@ def lic_texture(
         position, heading = start[alive], heading[alive]
         for weight in bell.astype(np.float32):
             # The midpoint rule: Euler's would spiral out of circles.
-            middle, found = _onwards(along, position + 0.5 * heading, heading)
-            position = position + np.where(found, middle, heading)
-            heading, found = _onwards(along, position, heading)
-            alive, position, heading = alive[found], position[found], heading[found]
+            middle, onwards = _onwards(along, position + 0.5 * heading, heading)
+            position = position + np.where(onwards, middle, heading)
+            heading, onwards = _onwards(along, position, heading)
+            alive, position, heading = alive[onwards], position[onwards], heading[onwards]
             total[alive] += weight * values[_pixel(position)]
             squares[alive] += weight**2
     return np.where(_inside(field, points), ndtr(total / np.sqrt(squares)), np.nan).reshape(shape)
@@ -149,8 +149,8 @@ def _onwards(
     """Return the direction at each position with the sign that goes on, and where it does go on."""
     there = along[_pixel(position)]
     product = (there * heading.conj()).real
-    found = np.abs(product) > LEAST_COSINE * np.abs(there) * np.abs(heading)  # False for NaN
-    return np.where(product < 0, -there, there), found
+    straight = np.abs(product) > LEAST_COSINE * np.abs(there) * np.abs(heading)  # False for NaN
+    return np.where(product < 0, -there, there), straight
 
 
 def _inside(field: TensorField, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:

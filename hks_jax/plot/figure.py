@@ -1,5 +1,6 @@
 """Figures, axes of grids and colour bars: what all pictures share."""
 
+import math
 import os
 import tempfile
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.ticker import FixedLocator, Locator, MaxNLocator, ScalarFormatter
 from matplotlib.transforms import ScaledTranslation
 
 from hks_jax.domain.grid import Grid
@@ -132,7 +133,7 @@ def colour_bar_in(bar_axes: Axes, mappable: ScalarMappable, label: str = "", **k
     formatter = ScalarFormatter(useOffset=False, useMathText=True)
     formatter.set_powerlimits((-3, 4))
     if "format" not in kwargs and "ticks" not in kwargs:
-        bar.locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
+        bar.locator = _colour_ticks(bar)
         bar.formatter = formatter
         bar.update_ticks()
     bar_axes.tick_params(labelsize=SMALL)
@@ -141,6 +142,16 @@ def colour_bar_in(bar_axes: Axes, mappable: ScalarMappable, label: str = "", **k
     if label:
         bar.set_label(label, fontsize=SMALL)
     return bar
+
+
+def _colour_ticks(bar: Colorbar) -> Locator:
+    """Return where a colour bar has ticks: two below a bar whose numbers take many digits, as at large t."""
+    low, high = sorted(float(end) for end in bar.mappable.get_clim() if end is not None)
+    largest = max(abs(low), abs(high))
+    step = 10.0 ** math.floor(math.log10(max((high - low) / 5, 1e-300)))
+    if bar.orientation == "vertical" or largest < 1e3 * step:
+        return MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
+    return FixedLocator([step * round((low + part * (high - low)) / step) for part in (0.22, 0.78)])
 
 
 def number_text(value: float) -> str:

@@ -17,9 +17,22 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
     The anisotropy is (λ₁ − λ₂)/(λ₁ + λ₂) in 2D and the fractional anisotropy (Basser and Pierpaoli 1996) in 3D, both 0
     for multiples of the identity and below 1.
 
+    Args:
+        field: the tensors on a grid. Of an array T (*shape, d, d) take ``TensorField(Grid(shape), T)``; of diffusion
+            tensors D, whose invariants are not those of the metric, ``TensorField(grid, D)`` or
+            ``from_diffusion(grid, D, "tensor")``.
+
     Returns:
         ``"trace"``, ``"determinant"`` and ``"anisotropy"``, each (*shape), NaN outside the mask; on the host.
+
+    Raises:
+        TypeError: anything but a field.
     """
+    if not isinstance(field, TensorField):
+        raise TypeError(
+            f"field: got {type(field).__name__}; expected hks_jax.TensorField. Of an array T (*shape, d, d) pass "
+            "TensorField(Grid(shape), T)"
+        )
     tensors = np.asarray(field.domain_tensors, np.float64)
     d = field.grid.dimension
     trace = np.trace(tensors, axis1=-2, axis2=-1)

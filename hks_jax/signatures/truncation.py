@@ -47,11 +47,11 @@ class Truncation(eqx.Module):
 
     def messages(self) -> list[str]:
         """Say in sentences which times are under-resolved; empty if none is. Needs concrete values."""
-        times, found = np.asarray(self.times), []
+        times, messages = np.asarray(self.times), []
         smallest = f"t = {times.min():.4g}"
         tail, bias = np.asarray(self.tail), np.asarray(self.resolution_bias)
         if (tail > TAIL_LIMIT).any():
-            found.append(
+            messages.append(
                 f"{int((tail > TAIL_LIMIT).sum())} of {times.size} times are too small for k: an estimated "
                 f"{tail.max():.1%} of the signature at {smallest}, in the mean over the domain, lies beyond the "
                 "computed eigenpairs (single nodes lack several times as much: see hks_jax.truncation_map). Use "
@@ -61,18 +61,18 @@ class Truncation(eqx.Module):
         early = (bias > BIAS_LIMIT) & (lasting <= BIAS_LIMIT)
         if early.any():
             first = times[early].min()
-            found.append(
+            messages.append(
                 f"{int(early.sum())} of {times.size} times are too small for the grid: the discretisation biases the "
                 f"signature at t = {first:.4g} by about {bias[early].max():.1%} at half of the nodes. "
                 f"Use times from about {first * bias[early].max() / BIAS_LIMIT:.4g}, or a finer grid"
             )
         if (lasting > BIAS_LIMIT).any():
-            found.append(
+            messages.append(
                 f"the tensors turn or stretch too much from node to node: the discretisation biases the signature at "
                 f"{int((lasting > BIAS_LIMIT).sum())} of {times.size} times by about {lasting.max():.1%}, which does "
                 'not fall as t grows. Use a finer grid; interpolation="log-euclidean" keeps the volume at least'
             )
-        return found
+        return messages
 
 
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:

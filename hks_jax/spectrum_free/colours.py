@@ -60,8 +60,8 @@ class Colouring:
         counts = [int(axis.max()) + 1 for axis in axes]
         number = np.asarray(np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), counts))
         result = np.full(space.node_shape, -1, np.int32)
-        found = np.unique(number[space.free])
-        result[space.free] = np.searchsorted(found, number[space.free])
+        used = np.unique(number[space.free])
+        result[space.free] = np.searchsorted(used, number[space.free])
         return StaticArray(result)
 
     def n_vectors(self, space: GridSpace) -> int:

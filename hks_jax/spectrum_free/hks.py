@@ -148,8 +148,8 @@ def _by_colours(settings: Colouring, part: Pencil, times: Float[Array, " m"]) ->
 def _fits(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Array:
     """Tell whether given settings were made for this pencil and these times, or larger ones."""
     low = jnp.asarray(settings.low, times.dtype)
-    found, rounding = bounds(part, low, settings.mass_degree), 1.001
-    fits = found.top <= rounding * settings.top
-    fits &= jnp.all(found.reach * jnp.max(times) <= rounding * jnp.asarray(settings.reach, times.dtype))
-    fits &= jnp.all(found.across <= rounding * jnp.asarray(settings.across, times.dtype))
+    actual, rounding = bounds(part, low, settings.mass_degree), 1.001
+    fits = actual.top <= rounding * settings.top
+    fits &= jnp.all(actual.reach * jnp.max(times) <= rounding * jnp.asarray(settings.reach, times.dtype))
+    fits &= jnp.all(actual.across <= rounding * jnp.asarray(settings.across, times.dtype))
     return fits & (mass_bound(part) * rounding >= low)

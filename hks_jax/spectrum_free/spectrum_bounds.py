@@ -51,10 +51,10 @@ def mass_bound(pencil: Pencil) -> Float[Array, ""]:
 
     products = operator.products()
 
-    def rest(x: Array) -> Array:
+    def remainder(x: Array) -> Array:
         return sums * x - products.apply_mass(x)
 
-    greatest = lanczos_bound(rest, lambda r: scaled * r, sums, pencil.space.n_dof, _MASS_STEPS)
+    greatest = lanczos_bound(remainder, lambda r: scaled * r, sums, pencil.space.n_dof, _MASS_STEPS)
     return jnp.clip(1 - greatest, 1e-3, 0.9)
 
 

@@ -1,4 +1,4 @@
 """Random problems against independent answers: whatever is wrong must be refused or told, never silent.
 
-`python -m tests.stress --help`; `make stress` runs all of it for an hour.
+`PYTHONPATH=tests python -m stress --help`; `make stress` runs all of it for an hour.
 """

@@ -18,7 +18,8 @@ KINDS = ("eigenproblems", "matrices", "gradients", "counts", "files")
 
 def main() -> int:
     """Run the kinds that are named; return 1 if anything failed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.stress", description=sys.modules[__package__].__doc__)
+    program = "PYTHONPATH=tests python -m stress"
+    parser = argparse.ArgumentParser(prog=program, description=sys.modules[__package__].__doc__)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)} (default: all)")
     parser.add_argument("--seed", type=int, help="one seed alone: the reproducer of a failure")
     parser.add_argument("--first", type=int, default=0, help="the seed to begin with")

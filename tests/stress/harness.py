@@ -48,7 +48,7 @@ def run(kind: str, check: Check, seeds: Iterator[int], seconds: float, report: C
             tally.failures.append(f"{kind} {seed}: {type(error).__name__}: {error}")
             if not isinstance(error, AssertionError):
                 report(traceback.format_exc(limit=-3))
-            report(f"{tally.failures[-1]}\n    python -m tests.stress {kind} --seed {seed}")
+            report(f"{tally.failures[-1]}\n    PYTHONPATH=tests python -m stress {kind} --seed {seed}")
         tally.seconds = time.perf_counter() - start
         if tally.seconds > seconds:
             break

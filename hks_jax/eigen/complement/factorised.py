@@ -9,11 +9,13 @@ all products with a Jacobian at one point.
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import (
     attainable,
     definite_product,
@@ -50,18 +52,48 @@ class _Groups(NamedTuple):
     last: Int[np.ndarray, " groups"]
 
 
-def prepare(pencil: SymmetricPencil, values: Float[Array, " p"], k: int, tolerance: float) -> Factorisation:
-    """Factorise K − σM for each group of the first k of p eigenvalues; the results are stacked."""
-    dissection = dissect(pencil.pattern)
+class FactorisedAdjoint(Adjoint[SymmetricPencil]):
+    """Conjugate gradients, preconditioned with a factorisation of K − σM for each group of neighbouring eigenvalues.
+
+    For any pencil that can be factorised: grids, above all in 2D, meshes, sparse matrices.
+
+    Attributes:
+        tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
+    """
+
+    tolerance: float = eqx.field(default=1e-9, static=True)
+
+    def prepare(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Factorisation:
+        """Factorise K − σM for each group of the first k of p eigenvalues; the results are stacked."""
+        dissection = dissect(pencil.pattern)
+        # Compiled without the dissection: what a compiled function hands through is copied.
+        return Factorisation(dissection, *_factorise(dissection, pencil, values, k, self.tolerance))
+
+    def solve(
+        self,
+        prepared: Factorisation,
+        pencil: SymmetricPencil,
+        values: Float[Array, " p"],
+        vectors: Float[Array, "p n_dof"],
+        rhs: Float[Array, "k n_dof"],
+    ) -> Float[Array, "k n_dof"]:
+        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
+        return _solve(prepared, pencil, values, vectors, rhs, self.tolerance)
+
+
+@partial(jax.jit, static_argnames=("k", "tolerance"))
+def _factorise(
+    dissection: Dissection, pencil: SymmetricPencil, values: Float[Array, " p"], k: int, tolerance: float
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Int[Array, " groups"]]:
     groups = _group(dissection, values, k, tolerance)
     beyond = first_beyond(values)
     shifts = shifts_between(values, beyond - values[groups.last], beyond - values[groups.first])
     factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
-    return Factorisation(dissection, factors.downward, factors.upward, factors.negative)
+    return factors.downward, factors.upward, factors.negative
 
 
 @partial(jax.jit, static_argnames="tolerance")
-def solve(
+def _solve(
     factors: Factorisation,
     pencil: SymmetricPencil,
     values: Float[Array, " p"],
@@ -69,16 +101,6 @@ def solve(
     rhs: Float[Array, "k n_dof"],
     tolerance: float,
 ) -> Float[Array, "k n_dof"]:
-    """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; rows that do not converge are NaN.
-
-    Args:
-        factors: from `prepare`, for as many rows.
-        pencil: K and M.
-        values: (p,) the lowest eigenvalues, ascending.
-        vectors: (p, n_dof) their M-orthonormal eigenvectors Φ; Q = I − MΦΦᵀ.
-        rhs: (k, n_dof), k ≤ p; row i belongs to λᵢ.
-        tolerance: reduction of the error in the energy norm, relative to the largest row.
-    """
     k, beyond, window = rhs.shape[0], first_beyond(values), min(_WINDOW, values.size)
     tolerance = attainable(tolerance, rhs.dtype)
     images = jax.lax.map(pencil.mass.apply, vectors, batch_size=_BLOCK)

@@ -1,19 +1,24 @@
 """Solves with K − λᵢM on the complement of known eigenvectors, matrix-free: conjugate gradients with a polynomial.
 
-The filter of `hks_jax.eigen.filter.damping`, with its sign changed, is the preconditioner; the known eigenvectors are
-taken out after each step, by products of matrices for a block of right-hand sides at once.
+The filter of `hks_jax.eigen.filter.damping`, with its sign changed, is the preconditioner, in single precision;
+residuals and steps are computed in the rows' own. The known eigenvectors are taken out after each step, by products of
+matrices for a block of right-hand sides at once.
 """
 
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import require_count
+from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import attainable, definite_product, first_beyond, wanted_errors
 from hks_jax.eigen.filter.coarsening import finest_level
 from hks_jax.eigen.filter.damping import Band, correction, degree_for, upper_end
 from hks_jax.fem.columns import to_columns, to_rows
+from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
@@ -26,13 +31,41 @@ _WIDEST = 0.9
 """Where the band of the polynomial begins at the latest, as a part of its upper end."""
 
 
-def prepare(pencil: Pencil) -> Float[Array, ""]:
-    """Return the upper end of the spectrum of D⁻¹K."""
-    assert isinstance(pencil.space, GridSpace)
-    return upper_end(finest_level(pencil), pencil.space.periodic)
+class FilteredAdjoint(Adjoint[Pencil]):
+    """Conjugate gradients, preconditioned with a Chebyshev polynomial: no factorisation. For grids, above all in 3D.
+
+    Attributes:
+        tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
+        block: right-hand sides solved at once.
+    """
+
+    tolerance: float = eqx.field(default=1e-10, static=True)
+    block: int = eqx.field(default=32, static=True)
+
+    def __check_init__(self) -> None:
+        """Check the block's size."""
+        require_count("block", self.block)
+
+    def prepare(self, pencil: Pencil, values: Float[Array, " p"], k: int) -> Float[Array, ""]:
+        """Return the upper end of the spectrum of D⁻¹K."""
+        if not isinstance(pencil.stiffness, StencilOperator):
+            raise ValueError("adjoint: FilteredAdjoint needs a grid; use FactorisedAdjoint for a mesh")
+        assert isinstance(pencil.space, GridSpace)
+        return upper_end(finest_level(pencil), pencil.space.periodic)
+
+    def solve(
+        self,
+        prepared: Float[Array, ""],
+        pencil: Pencil,
+        values: Float[Array, " p"],
+        vectors: Float[Array, "p n_dof"],
+        rhs: Float[Array, "k n_dof"],
+    ) -> Float[Array, "k n_dof"]:
+        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
+        return _solve(prepared, pencil, values, vectors, rhs, self.tolerance, self.block)
 
 
-def solve(
+def _solve(
     high: Float[Array, ""],
     pencil: Pencil,
     values: Float[Array, " p"],
@@ -41,10 +74,6 @@ def solve(
     tolerance: float,
     block: int,
 ) -> Float[Array, "k n_dof"]:
-    """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; NaN where it does not converge.
-
-    The tolerance is for the error in the energy norm, relative to the largest row.
-    """
     space = pencil.space
     assert isinstance(space, GridSpace)
     level, periodic = finest_level(pencil), space.periodic
@@ -67,7 +96,7 @@ def solve(
 
         def precondition(r: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
             columns = to_columns(space.extend(r, outside=0.0).reshape(r.shape[0], -1), level.shape)
-            z = correction(level, periodic, band, columns, references, degree)
+            z = correction(level, periodic, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
             return without_known(-space.restrict(to_rows(z).reshape(-1, *level.shape)))
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)

@@ -11,13 +11,24 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.eigen.complement import filtered
+from hks_jax.eigen.complement.adjoint import Adjoint
+from hks_jax.eigen.complement.filtered import FilteredAdjoint
 from hks_jax.eigen.filter.coarsening import GridLevel, coarsen, finest_level
 from hks_jax.eigen.filter.damping import upper_end
-from hks_jax.eigen.filter.rounds import Plan, from_coarse, from_random, improve, unconverged
+from hks_jax.eigen.filter.pace import Pace
+from hks_jax.eigen.filter.rounds import (
+    FilterState,
+    Plan,
+    excess,
+    from_coarse,
+    from_random,
+    improve,
+    unconverged,
+)
 from hks_jax.eigen.filter.sharing import replicate
+from hks_jax.eigen.filter.steps import improve_in_steps
 from hks_jax.eigen.quality import indistinct
-from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
@@ -30,6 +41,8 @@ _ROOM = 12
 """Degrees of freedom per vector that a coarse grid must have."""
 _LEAST_NODES = 6
 """Nodes along each axis below which a grid is not coarsened."""
+_LARGE = 1 << 21
+"""Numbers in all vectors from which on a round takes so long that its blocks are told one by one."""
 
 
 class ChebyshevFilter(Eigensolver[Pencil]):
@@ -46,8 +59,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         spare: how many vectors to iterate beyond k, as a part of k: more converge faster, and cost more.
         max_rounds: rounds on the finest grid before giving up.
         single_precision: whether filters run in float32.
-        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
-            below what the eigenvectors' dtype allows.
         mesh: devices to share the work among, a `jax.sharding.Mesh` with one axis: each filters some of the vectors,
             and holds all of them on a part of the grid (docs/devices.md). None: one device.
     """
@@ -58,7 +69,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     spare: float = eqx.field(default=0.35, static=True)
     max_rounds: int = eqx.field(default=60, static=True)
     single_precision: bool = eqx.field(default=True, static=True)
-    derivative_tolerance: float = eqx.field(default=1e-10, static=True)
+    adjoint: Adjoint = eqx.field(default=FilteredAdjoint(), static=True, kw_only=True)
     mesh: Mesh | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
@@ -67,7 +78,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         require_count("block", self.block)
         require_number("spare", self.spare)
         require_count("max_rounds", self.max_rounds)
-        require_number("derivative_tolerance", self.derivative_tolerance, 1)
         if self.mesh is not None:
             checked_mesh(self.mesh)
 
@@ -82,21 +92,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         else:
             values, vectors = _lowest(pencil, plan, self.max_rounds, report)
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
-
-    def prepare_complement(self, pencil: Pencil, values: Float[Array, " p"], k: int) -> Float[Array, ""]:
-        """Return the upper end of the spectrum."""
-        return filtered.prepare(pencil)
-
-    def solve_complement(
-        self,
-        prepared: Float[Array, ""],
-        pencil: Pencil,
-        values: Float[Array, " p"],
-        vectors: Float[Array, "p n_dof"],
-        rhs: Float[Array, "k n_dof"],
-    ) -> Float[Array, "k n_dof"]:
-        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.filtered`."""
-        return filtered.solve(prepared, pencil, values, vectors, rhs, self.derivative_tolerance, self.block)
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return as many as are iterated anyway, so that what is left to linear solves is far away."""
@@ -137,9 +132,7 @@ def _lowest(
     assert state is not None
     rounding = indistinct(pencil, high.dtype)
     if report:
-        while (left := int(unconverged(plan, rounding, state))) and state.rounds < max_rounds:
-            report(f"round {int(state.rounds) + 1}, {plan.wanted - left} of {plan.wanted} pairs")
-            state = improve(level, space.periodic, plan, high, rounding, state)
+        state = _converge(level, space.periodic, plan, high, rounding, state, max_rounds, report)
     else:
         state = jax.lax.while_loop(
             lambda state: (unconverged(plan, rounding, state) > 0) & (state.rounds < max_rounds),
@@ -150,6 +143,37 @@ def _lowest(
     vectors = vectors.reshape(plan.wanted, *(level.shape if slabs is None else slabs.padded_shape))
     vectors = vectors if slabs is None else slabs.join(vectors, axis=1)
     return state.values[: plan.wanted], space.restrict(vectors)
+
+
+def _converge(
+    level: GridLevel,
+    periodic: tuple[bool, ...],
+    plan: Plan,
+    high: Float[Array, ""],
+    rounding: Float[Array, ""],
+    state: FilterState,
+    max_rounds: int,
+    report: Report,
+) -> FilterState:
+    """Return the state after rounds on the finest grid, each told, and of large problems the blocks of each."""
+    in_steps = plan.mesh is None and state.vectors.size >= _LARGE
+    pace = Pace(float(excess(plan, rounding, state)))
+    while (left := int(unconverged(plan, rounding, state))) and state.rounds < max_rounds:
+        text = f"{plan.wanted - left} of {plan.wanted} pairs, round {int(state.rounds) + 1}"
+        report(Status(text, pace.seconds_left()))
+        work = 1
+        if in_steps:
+
+            def tell(done: int, of: int, text: str = text) -> None:
+                nonlocal work
+                work = of
+                report(Status(f"{text}, {done / of:.0%} of it filtered", pace.seconds_left(done, of)))
+
+            state = improve_in_steps(level, periodic, plan, high, rounding, state, tell)
+        else:
+            state = improve(level, periodic, plan, high, rounding, state)
+        pace.round_done(float(excess(plan, rounding, state)), work)
+    return state
 
 
 @partial(jax.jit, static_argnames=("plan", "max_rounds"))

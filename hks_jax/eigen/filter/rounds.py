@@ -13,8 +13,9 @@ from hks_jax.eigen.filter.damping import Band, correction, degree_for
 from hks_jax.eigen.filter.sharing import EVERYWHERE, own_blocks, shared, to_own_rows, to_slabs
 from hks_jax.eigen.filter.subspace import block_of, local_level, measure, rayleigh_ritz
 from hks_jax.eigen.weyl import weyl
-from hks_jax.fem.columns import stencil, stencil_product, to_rows
+from hks_jax.fem.columns import stencil, stencil_product, to_columns, to_rows
 from hks_jax.fem.halo import Slabs
+from hks_jax.linear.accelerators import row_by_row
 
 _GAIN = 40.0
 """How far one round damps what is not wanted: much more, and the lumped mass in the filter is what limits it."""
@@ -76,14 +77,42 @@ class FilterState(NamedTuple):
     rounds: Int[Array, ""]
 
 
+class Filtering(NamedTuple):
+    """The polynomials of a round.
+
+    Attributes:
+        band: what they damp.
+        terms: further terms of the mass's inverse.
+        degrees: by block; 0 where all has converged.
+        values: (m,) ψ of each vector, at which its polynomial is scaled.
+        factor: (m,) by which corrections are multiplied.
+    """
+
+    band: Band
+    terms: Int[Array, ""]
+    degrees: Int[Array, " blocks"]
+    values: Float[Array, " m"]
+    factor: Float[Array, " m"]
+
+
 def unconverged(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Int[Array, ""]:
     """Return how many of the wanted pairs have not converged."""
     return jnp.sum(~_converged(plan, rounding, state)[: plan.wanted])
 
 
+@partial(jax.jit, static_argnames="plan")
+def excess(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Float[Array, ""]:
+    """Return the largest defect of the wanted pairs, as a multiple of what counts as converged."""
+    return jnp.max((state.defects / _allowed(plan, rounding, state))[: plan.wanted])
+
+
 def _converged(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Bool[Array, " m"]:
+    return state.defects <= _allowed(plan, rounding, state)
+
+
+def _allowed(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Float[Array, " m"]:
     scale = jnp.maximum(state.values, state.values[plan.n_null])
-    return state.defects <= jnp.maximum(plan.tolerance * scale, jnp.minimum(rounding, 0.01 * scale))
+    return jnp.maximum(plan.tolerance * scale, jnp.minimum(rounding, 0.01 * scale))
 
 
 @partial(jax.jit, static_argnames=("periodic", "plan"))
@@ -106,7 +135,7 @@ def from_random(
         numbers = own_blocks(slabs, plan.size // plan.block)
         keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
         rows = jax.lax.map(damped, keys).reshape(-1, level.lumped.size)
-        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, rows), jnp.zeros((), int), jnp.zeros((), int))
+        return ritz(level, periodic, plan, to_slabs(slabs, plan.block, rows), jnp.zeros((), int), jnp.zeros((), int))
 
     return shared(slabs, run, EVERYWHERE, _layout(slabs))(level, low, high)
 
@@ -125,7 +154,7 @@ def from_coarse(
             return to_rows(interpolate(block_of(rows, number, plan.block, coarse_shape), level, periodic))
 
         fine = jax.lax.map(of_block, jnp.arange(rows.shape[0] // plan.block)).reshape(rows.shape[0], -1)
-        return _ritz(level, periodic, plan, to_slabs(slabs, plan.block, fine), jnp.zeros((), int), jnp.zeros((), int))
+        return ritz(level, periodic, plan, to_slabs(slabs, plan.block, fine), jnp.zeros((), int), jnp.zeros((), int))
 
     layout = _layout(slabs)
     return shared(slabs, run, (EVERYWHERE, layout.vectors), layout)(level, coarse.vectors)
@@ -156,6 +185,20 @@ def _improve(
     rounding: Float[Array, ""] | None,
     state: FilterState,
 ) -> FilterState:
+    numbers = own_blocks(slabs, plan.size // plan.block)
+    chosen = plan_round(plan, level, high, rounding, state)
+    step = partial(filter_block, level, periodic, plan, chosen, state.values)
+    rows = to_own_rows(slabs, plan.block, state.vectors)
+    filtered = jax.lax.fori_loop(0, numbers.size, lambda own, rows: step(numbers[own], own, rows), rows)
+    vectors = to_slabs(slabs, plan.block, filtered)
+    return ritz(level, periodic, plan, vectors, chosen.terms, state.rounds + 1)
+
+
+@partial(jax.jit, static_argnames="plan")
+def plan_round(
+    plan: Plan, level: GridLevel, high: Float[Array, ""], rounding: Float[Array, ""] | None, state: FilterState
+) -> Filtering:
+    """Return the polynomials of a round: the band that they damp, and their degrees."""
     spare = jnp.arange(plan.size) >= plan.wanted
     terms, filtered_values, factor = _lumping(plan, state)
     high = (1 + terms).astype(high.dtype) * high
@@ -169,34 +212,43 @@ def _improve(
     most = degree_for(band, jnp.zeros_like(low), _SPREAD)
     degrees = jnp.ceil(jnp.clip(degree_for(band, goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
     degrees = jnp.max(jnp.where(left, degrees, 0).reshape(-1, plan.block), axis=1).astype(int)
-    dtype = jnp.float32 if plan.single_precision else state.values.dtype
+    return Filtering(band, terms, degrees, filtered_values, factor)
 
-    numbers = own_blocks(slabs, plan.size // plan.block)
+
+def filter_block(
+    level: GridLevel,
+    periodic: tuple[bool, ...],
+    plan: Plan,
+    chosen: Filtering,
+    values: Float[Array, " m"],
+    number: Int[Array, ""],
+    own: Int[Array, ""],
+    vectors: Float[Array, "own nodes"],
+) -> Float[Array, "own nodes"]:
+    """Return the rows with a block filtered: the one of this number among all, the `own`th among these rows."""
     stiffness, mass = stencil(level.stiffness, periodic), stencil(level.mass, periodic)
+    dtype = jnp.float32 if plan.single_precision else values.dtype
+    band, degree = chosen.band, chosen.degrees[number]
 
-    def filtered(own: Array, vectors: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
-        number = numbers[own]
-        x = block_of(vectors, own, plan.block, level.shape)
+    def filtered(rows: Float[Array, "b nodes"]) -> Float[Array, "b nodes"]:
+        x = to_columns(rows, level.shape)
         theta, zeta, scale = (
             jax.lax.dynamic_slice_in_dim(v, number * plan.block, plan.block)
-            for v in (state.values, filtered_values, factor)
+            for v in (values, chosen.values, chosen.factor)
         )
         # What is in the band itself has no residual worth the name: it is damped as it is.
-        inside = zeta > low
+        inside = zeta > band.low
         moved = jnp.where(inside, 0, theta * mass(x))
         residual = stiffness(x) - moved
         whole = jnp.where(inside, x, 0).astype(dtype)
-        z = correction(level, periodic, band, residual.astype(dtype), zeta, degrees[number], whole, terms)
+        z = correction(level, periodic, band, residual.astype(dtype), zeta, degree, whole, chosen.terms)
         z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
-        rows = jax.lax.dynamic_slice_in_dim(vectors, own * plan.block, plan.block) + to_rows(z)
-        return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * plan.block, axis=0)
+        return rows + row_by_row(to_rows(z))
 
-    def step(own: Array, vectors: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
-        return jax.lax.cond(degrees[numbers[own]] > 0, filtered, lambda _, unchanged: unchanged, own, vectors)
-
-    rows = to_own_rows(slabs, plan.block, state.vectors)
-    vectors = to_slabs(slabs, plan.block, jax.lax.fori_loop(0, numbers.size, step, rows))
-    return _ritz(level, periodic, plan, vectors, terms, state.rounds + 1)
+    # The condition has nothing but the block: what goes through one is copied.
+    rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * plan.block, plan.block))
+    rows = jax.lax.cond(degree > 0, filtered, lambda unchanged: unchanged, rows)
+    return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * plan.block, axis=0)
 
 
 def _lumping(plan: Plan, state: FilterState) -> tuple[Int[Array, ""], Float[Array, " m"], Float[Array, " m"]]:
@@ -215,7 +267,7 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Int[Array, ""], Float[Arra
     return terms, (1 - lost[terms]) * values, 1 - (terms + 1).astype(values.dtype) * lost[terms]
 
 
-def _ritz(
+def ritz(
     level: GridLevel,
     periodic: tuple[bool, ...],
     plan: Plan,
@@ -223,6 +275,7 @@ def _ritz(
     terms: Int[Array, ""],
     rounds: Int[Array, ""],
 ) -> FilterState:
+    """Return the state whose vectors are the Ritz vectors of the rows."""
     slabs = plan.slabs(level.shape, periodic)
     level = local_level(level, slabs)
     values, vectors = rayleigh_ritz(level, periodic, plan.block, vectors, slabs)

@@ -12,6 +12,7 @@ from hks_jax.eigen.filter.coarsening import GridLevel
 from hks_jax.eigen.filter.sharing import first_of, total
 from hks_jax.fem.columns import product_with_rim, side_by_side, stencil, to_columns
 from hks_jax.fem.halo import Slabs
+from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.products import combine
 
 _CHUNK = 1 << 14
@@ -27,7 +28,7 @@ class Measured(NamedTuple):
 
 def block_of(x: Float[Array, "m nodes"], number: Array, block: int, shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
     """Return a block of the rows as columns."""
-    return to_columns(jax.lax.dynamic_slice_in_dim(x, number * block, block), shape)
+    return to_columns(row_by_row(jax.lax.dynamic_slice_in_dim(x, number * block, block)), shape)
 
 
 def local_level(level: GridLevel, slabs: Slabs | None) -> GridLevel:

@@ -5,36 +5,91 @@ Conjugate gradients, preconditioned with SciPy's factorisations of K − σM: th
 """
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
+from typing import ClassVar
 
+import equinox as eqx
+import jax
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 from threadpoolctl import threadpool_limits
 
+from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import (
     SINGULAR,
+    attainable,
     first_beyond,
     group_numbers,
     shifts_between,
     wanted_errors,
 )
+from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices
+from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.conjugate_gradients import MAX_ITERATIONS
 
 _BLOCK = 16
 """Columns solved at once: enough for fast products, few enough for the cache."""
 
 
-def solve_complement(
+class HostAdjoint(Adjoint[Pencil]):
+    """Conjugate gradients, preconditioned with SciPy's factorisations, in float64 on the host.
+
+    Under `jit` and `vmap` it runs through a host callback, one problem at a time.
+
+    Attributes:
+        tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
+    """
+
+    warns: ClassVar[bool] = True
+    tolerance: float = eqx.field(default=1e-12, static=True)
+
+    def solve(
+        self,
+        prepared: None,
+        pencil: Pencil,
+        values: Float[Array, " p"],
+        vectors: Float[Array, "p n_dof"],
+        rhs: Float[Array, "k n_dof"],
+    ) -> Float[Array, "k n_dof"]:
+        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`. It warns of what does not converge."""
+        data, matrices = host_matrices(pencil)
+        tolerance = attainable(self.tolerance, rhs.dtype)
+
+        def on_host(data_k: ArrayLike, data_m: ArrayLike, *arrays: ArrayLike) -> np.ndarray:
+            values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
+            if not all(np.isfinite(array).all() for array in (values, vectors, b)):
+                warn_of_accuracy(
+                    f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
+                    "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
+                )
+                return np.full(rhs.shape, np.nan, rhs.dtype)
+            K, M = matrices(data_k, data_m)
+            x, errors = _solve(K, M, values, vectors, b, tolerance, rhs.dtype)
+            failed = ~(errors <= 1)
+            if failed.any():
+                warn_of_accuracy(
+                    f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
+                    f"converge, and their part is NaN. k may cut a cluster of eigenvalues: take another k, or set "
+                    "multiplet='drop' in `eigenpairs`",
+                )
+                x[failed] = np.nan
+            return x.astype(rhs.dtype)
+
+        shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
+        return jax.pure_callback(on_host, shape, *data, values, vectors, rhs, vmap_method="sequential")
+
+
+def _solve(
     K: csc_matrix,
     M: csc_matrix,
     values: np.ndarray,
     vectors: np.ndarray,
     rhs: np.ndarray,
-    *,
-    factorise: Callable[[csc_matrix], SuperLU],
     tolerance: float,
     dtype: np.dtype,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +101,6 @@ def solve_complement(
         values: (p,) the lowest eigenvalues, ascending.
         vectors: (p, n) their M-orthonormal eigenvectors Φ; Q = I − MΦΦᵀ.
         rhs: (k, n), k ≤ p; row i belongs to λᵢ.
-        factorise: factorises a symmetric, possibly indefinite matrix.
         tolerance: reduction of the error in the energy norm, relative to the largest row.
         dtype: what eigenvectors and right-hand sides were rounded to before they came here as float64.
 
@@ -72,7 +126,7 @@ def solve_complement(
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
         for rows, shift in _groups(values, beyond, active, tolerance):
             blocks = [rows[start : start + _BLOCK] for start in range(0, rows.size, _BLOCK)]
-            list(threads.map(solve, blocks, repeat(factorise(K - shift * M))))
+            list(threads.map(solve, blocks, repeat(factorise_on_host(K - shift * M))))
     return x, errors
 
 

@@ -2,66 +2,15 @@
 
 from collections.abc import Callable
 
-import jax
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import SuperLU, splu
 
-from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.eigen.complement.common import attainable
-from hks_jax.eigen.host.complement import solve_complement
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.multifrontal import CONTRACTION
 from hks_jax.linear.operators import Places
-
-
-def complement_on_host(
-    pencil: Pencil,
-    values: Float[Array, " p"],
-    vectors: Float[Array, "p n_dof"],
-    rhs: Float[Array, "k n_dof"],
-    tolerance: float,
-) -> Float[Array, "k n_dof"]:
-    """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.common`.
-
-    What does not converge is NaN, with a warning.
-    """
-    data, matrices = host_matrices(pencil)
-    tolerance = attainable(tolerance, rhs.dtype)
-
-    def solve(data_k: ArrayLike, data_m: ArrayLike, *arrays: ArrayLike) -> np.ndarray:
-        values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
-        if not all(np.isfinite(array).all() for array in (values, vectors, b)):
-            warn_of_accuracy(
-                f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
-                "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
-            )
-            return np.full(rhs.shape, np.nan, rhs.dtype)
-        K, M = matrices(data_k, data_m)
-        x, errors = solve_complement(
-            K,
-            M,
-            values,
-            vectors,
-            b,
-            factorise=factorise_on_host,
-            tolerance=tolerance,
-            dtype=rhs.dtype,
-        )
-        failed = ~(errors <= 1)
-        if failed.any():
-            warn_of_accuracy(
-                f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
-                f"converge, and their part is NaN. k may cut a cluster of eigenvalues: take another k, or set "
-                "multiplet='drop' in `eigenpairs`",
-            )
-            x[failed] = np.nan
-        return x.astype(rhs.dtype)
-
-    shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
-    return jax.pure_callback(solve, shape, *data, values, vectors, rhs, vmap_method="sequential")
 
 
 def factorise_on_host(matrix: csc_matrix) -> SuperLU:

@@ -7,17 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.eigen.host.matrices import complement_on_host, factorise_on_host, host_matrices, inertia_on_host
+from hks_jax.eigen.complement.adjoint import Adjoint
+from hks_jax.eigen.host.complement import HostAdjoint
+from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices, inertia_on_host
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.traced import is_traced
 
-Found = tuple[np.ndarray, np.ndarray, float]
+HostPairs = tuple[np.ndarray, np.ndarray, float]
 
 _ROUNDS = 20
 """How often to look for missed copies of a multiple eigenvalue; each round finds at least one."""
@@ -34,16 +35,13 @@ class ShiftInvert(Eigensolver[Pencil]):
         tolerance: relative residual that counts as converged; ARPACK itself runs to machine precision.
         max_restarts: implicit restarts before giving up.
         basis: size of the Lanczos basis, more than k (for derivatives, than 9 + k + k/20); None takes 2k + 20.
-        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
-            below what the eigenvectors' dtype allows.
     """
 
     name: ClassVar[str] = "shift-invert"
-    warns: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
     max_restarts: int = eqx.field(default=300, static=True)
     basis: int | None = eqx.field(default=None, static=True)
-    derivative_tolerance: float = eqx.field(default=1e-12, static=True)
+    adjoint: Adjoint = eqx.field(default=HostAdjoint(), static=True, kw_only=True)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return n_dof − 1: a Lanczos basis must be larger than what is wanted."""
@@ -55,7 +53,6 @@ class ShiftInvert(Eigensolver[Pencil]):
         require_count("max_restarts", self.max_restarts)
         if self.basis is not None:
             require_count("basis", self.basis, 2)
-        require_number("derivative_tolerance", self.derivative_tolerance, 1)
 
     def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs, and the shift at which inertia confirmed them."""
@@ -75,18 +72,7 @@ class ShiftInvert(Eigensolver[Pencil]):
         # Where JAX differentiates, `asarray` leaves them NumPy's, and the barrier makes JAX's arrays of them.
         return jax.lax.optimization_barrier(tuple(map(jnp.asarray, solve(*inputs))))
 
-    def solve_complement(
-        self,
-        prepared: None,
-        pencil: Pencil,
-        values: Float[Array, " p"],
-        vectors: Float[Array, "p n_dof"],
-        rhs: Float[Array, "k n_dof"],
-    ) -> Float[Array, "k n_dof"]:
-        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.common`."""
-        return complement_on_host(pencil, values, vectors, rhs, self.derivative_tolerance)
-
-    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float, report: Report) -> Found:
+    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float, report: Report) -> HostPairs:
         n = K.shape[0]
         nothing = np.full(k, np.nan), np.full((k, n), np.nan), np.nan
         if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
@@ -133,7 +119,7 @@ class ShiftInvert(Eigensolver[Pencil]):
         return nothing
 
 
-def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> Found:
+def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> HostPairs:
     """Return eigenvalues ascending and eigenvectors as rows, NaN where there are fewer than k."""
     order, missing = np.argsort(values), k - values.size
     return (

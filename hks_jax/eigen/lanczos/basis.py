@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.linear import accelerators
 from hks_jax.linear.products import combine, products_with_columns
 
 _PIECE = 128
@@ -32,8 +33,11 @@ Basis = tuple[Piece, ...]
 def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
     """Return a basis of the known vectors, with room for ``size`` rows in all; the others are zero.
 
-    Known vectors and size are multiples of ``block``, which is how many rows are written at once.
+    Known vectors and size are multiples of ``block``, which is how many rows are written at once. On accelerators it is
+    one piece in its own precision: to find out what may be left out, they wait longer than to compute it.
     """
+    if accelerators.at_hand():
+        return (Piece(jnp.pad(known, ((0, size - len(known)), (0, 0))), None),)
     step = max(_PIECE // block, 1) * block
     pieces = []
     for at in range(0, size, step):
@@ -61,6 +65,9 @@ def write(basis: Basis, block: Float[Array, "n_dof b"], row: Int[Array, ""]) -> 
 # eigenvalue that c is not small, V is taken in its own precision.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "c n_dof"]:
     """Return what columns x, given as Mx, have in the first rows of the basis, as rows: (VᵀMx)ᵀVᵀ."""
+    if accelerators.at_hand():
+        rows = basis[0].rows
+        return accelerators.row_by_row(combine(products_with_columns(rows, images).T, rows))
     used = [filled > at for at in _starts(basis)]
 
     def none(rows: Array, x: Array) -> Float[Array, "rows c"]:
@@ -89,15 +96,17 @@ def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]
 
 def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     """Return many linear combinations of all rows of the basis."""
+    if accelerators.at_hand():
+        return combine(mix, basis[0].rows)
     n = basis[0].rows.shape[1]
     width = min(_NODES, n)
     mixes = jnp.split(mix, _starts(basis)[1:], axis=1)
 
-    def some(number: Array, found: Float[Array, "q n_dof"]) -> Float[Array, "q n_dof"]:
+    def some(number: Array, sums_so_far: Float[Array, "q n_dof"]) -> Float[Array, "q n_dof"]:
         at = jnp.minimum(number * width, n - width)  # the last may overlap the one before
         parts = [jax.lax.dynamic_slice_in_dim(piece.rows, at, width, axis=1) for piece in basis]
         sums = sum(map(combine, mixes, parts), jnp.zeros((), mix.dtype))
-        return jax.lax.dynamic_update_slice_in_dim(found, sums, at, axis=1)
+        return jax.lax.dynamic_update_slice_in_dim(sums_so_far, sums, at, axis=1)
 
     return jax.lax.fori_loop(0, -(-n // width), some, jnp.zeros((len(mix), n), mix.dtype))
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.complement import factorised
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, crowded, first_state, make_room, unfinished
 from hks_jax.eigen.located import LocatedPencil
@@ -19,7 +18,6 @@ from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.dissection import Dissection, dissect
-from hks_jax.linear.multifrontal import Factorisation
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
@@ -37,15 +35,12 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         tolerance: relative residual that counts as converged.
         block: vectors per Lanczos block. Multiplicities may be larger.
         slice_size: eigenvalues per slice; None chooses.
-        derivative_tolerance: to what the linear solves for derivatives reduce their error, in the energy norm; not
-            below what the eigenvectors' dtype allows.
     """
 
     name: ClassVar[str] = "block-lanczos"
     tolerance: float = eqx.field(default=1e-8, static=True)
     block: int = eqx.field(default=8, static=True)
     slice_size: int | None = eqx.field(default=None, static=True)
-    derivative_tolerance: float = eqx.field(default=1e-9, static=True)
 
     def __check_init__(self) -> None:
         """Check the settings."""
@@ -53,7 +48,6 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         require_count("block", self.block)
         if self.slice_size is not None:
             require_count("slice_size", self.slice_size)
-        require_number("derivative_tolerance", self.derivative_tolerance, 1)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs; of a `LocatedPencil`, from its origin upwards."""
@@ -61,21 +55,6 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         state = self.slice(expected(pencil, plan), plan, report)
         assert state.vectors is not None
         return (*_lowest(state.values, state.vectors, k), state.complete_below)
-
-    def prepare_complement(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Factorisation:
-        """Factorise K − σM for each group of neighbouring eigenvalues."""
-        return factorised.prepare(pencil, values, k, self.derivative_tolerance)
-
-    def solve_complement(
-        self,
-        prepared: Factorisation,
-        pencil: SymmetricPencil,
-        values: Float[Array, " p"],
-        vectors: Float[Array, "p n_dof"],
-        rhs: Float[Array, "k n_dof"],
-    ) -> Float[Array, "k n_dof"]:
-        """Solve (K − λᵢM) xᵢ = (I − MΦΦᵀ) rhsᵢ with ΦᵀMxᵢ = 0; see `hks_jax.eigen.complement.factorised`."""
-        return factorised.solve(prepared, pencil, values, vectors, rhs, self.derivative_tolerance)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return how many pairs leave room for a Lanczos basis."""
@@ -96,14 +75,16 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         while _unfinished(plan, state):
             factor, searchable, state = cut(problem, dissection, plan, self.tolerance, state)
             if searchable:
-                state = _make_room(plan, state) if _crowded(plan, state) else state
+                if _crowded(plan, state):
+                    assert state.vectors is not None
+                    state = _make_room(plan, state.vectors, state._replace(vectors=None))
                 state = search(problem, factor, plan, self.tolerance, state)
-            report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
+            if report is not silent:  # to put numbers into words, the host waits for them
+                report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
         return state
 
 
 _first_state = jit_quickly(static_argnames="plan")(first_state)
-_make_room = jit_quickly(static_argnames="plan")(make_room)
 _unfinished = jit_quickly(static_argnames="plan")(unfinished)
 _crowded = jit_quickly(static_argnames="plan")(crowded)
 
@@ -120,6 +101,11 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
         weyl(j, pencil.volume, n).astype(dtype) for j in (min(plan.wanted, plan.slice_size) / 2 + 1, plan.slice_size, 1)
     )
     return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype), jnp.zeros((), int))
+
+
+@jit_quickly(static_argnames="plan", donate_argnames="vectors")
+def _make_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: SlicingState) -> SlicingState:
+    return make_room(plan, state._replace(vectors=vectors))
 
 
 def _slice_traced(problem: Problem, dissection: Dissection, plan: Plan, tolerance: float) -> SlicingState:

@@ -1,5 +1,6 @@
 """Block Lanczos for the eigenvalues nearest to a shift."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.basis import Basis, begin, combined, within, write
+from hks_jax.linear import accelerators, orthonormal_kernel
 from hks_jax.linear.multifrontal import Factorisation
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.pencil import SymmetricPencil
@@ -16,7 +18,7 @@ from hks_jax.linear.products import combine, gram, products_with_columns, times
 from hks_jax.traced import is_traced
 
 _STRETCH = 16
-"""Called plainly, how many steps are one computation, between which it can be interrupted."""
+"""Called plainly, how many steps are one computation on a CPU, between which it can be interrupted."""
 
 
 class ShiftedSolve(NamedTuple):
@@ -30,7 +32,7 @@ class ShiftedSolve(NamedTuple):
 
     factor: Factorisation
     shift: Float[Array, ""]
-    passes: Int[Array, ""]
+    passes: int | Int[Array, ""]
 
 
 class _Blocks(NamedTuple):
@@ -94,6 +96,10 @@ def block_lanczos(
     if is_traced(shifted):
         # All of them in one loop: were its length to differ within a batch, each turn would copy all of the state.
         steps, state = room, advance(state, 0, room)
+    elif accelerators.at_hand():
+        steps, passes = int(steps), int(shifted.passes)
+        for done in range(0, steps, 2):
+            state = _advance_by_two(pencil, shifted.factor, shifted.shift, state, len(known), done, passes)
     else:
         steps = int(steps)
         for done in range(0, steps, _STRETCH):
@@ -125,7 +131,36 @@ def _advance(
     last: int | Array,
 ) -> _Recurrence:
     """Take the steps from the first to before the last; their blocks begin at the basis' row ``offset``."""
-    stiffness, mass, b = pencil.stiffness.of_columns(), pencil.mass.of_columns(), state.blocks.block.shape[1]
+    step, every = _stepping(pencil, shifted, offset), _every(state.blocks.block.dtype)
+    if accelerators.at_hand():
+        # Whether to project is known of every step in two.
+        def two(number: Array, state: _Recurrence) -> _Recurrence:
+            return step(2 * number + 1, step(2 * number, state, every == 1), True)
+
+        return jax.lax.fori_loop(first // 2, last // 2, two, state)
+    return jax.lax.fori_loop(first, last, lambda number, state: step(number, state, (number + 1) % every == 0), state)
+
+
+@jit_quickly(static_argnames=("offset", "passes"), donate_argnames="state")
+def _advance_by_two(
+    pencil: SymmetricPencil,
+    factor: Factorisation,
+    shift: Float[Array, ""],
+    state: _Recurrence,
+    offset: int,
+    first: int | Array,
+    passes: int,
+) -> _Recurrence:
+    """Take two steps without a loop or a condition, so that nothing has to wait for the device."""
+    step, number = _stepping(pencil, ShiftedSolve(factor, shift, passes), offset), jnp.asarray(first)
+    return step(number + 1, step(number, state, _every(state.blocks.block.dtype) == 1), True)
+
+
+def _stepping(
+    pencil: SymmetricPencil, shifted: ShiftedSolve, offset: int
+) -> Callable[[Array, _Recurrence, bool | Array], _Recurrence]:
+    """Return how to take a step: of its number, the state, and whether to project on the whole basis."""
+    stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     factor, shift, passes = shifted
 
     def solve(rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
@@ -135,11 +170,17 @@ def _advance(
             again = done < passes - 1
             return x, jax.lax.cond(again, lambda: rhs - (stiffness(x) - shift * mass(x)), lambda: defect)
 
+        def refined(_: Array, x: Array) -> Array:
+            return x + factor.solve_columns(rhs - (stiffness(x) - shift * mass(x)))
+
+        if accelerators.at_hand():
+            return jax.lax.fori_loop(0, passes - 1, refined, factor.solve_columns(rhs))
         return jax.lax.fori_loop(0, passes, refine, (jnp.zeros_like(rhs), rhs))[0]
 
-    def step(number: Array, state: _Recurrence) -> _Recurrence:
+    def step(number: Array, state: _Recurrence, now: bool | Array) -> _Recurrence:
         # Write the last block into the basis, and find the one that follows it.
         _, block, image, _ = state.blocks
+        b = block.shape[1]
         solved = solve(image)
         diagonal, onward = _recur(state.blocks, solved)
         row = offset + b * number
@@ -149,8 +190,10 @@ def _advance(
             block, onward = block - parts[:b].T, onward - parts[b:].T
             return block, onward - times(block, gram(image, onward))
 
-        now = (number + 1) % _every(block.dtype) == 0
-        block, onward = jax.lax.cond(now, project, lambda block, onward: (block, onward), block, onward)
+        if not isinstance(now, bool):
+            block, onward = jax.lax.cond(now, project, lambda block, onward: (block, onward), block, onward)
+        elif now:
+            block, onward = project(block, onward)
         following, its_image, coupling = _orthonormal(mass, onward)
         return _Recurrence(
             write(state.basis, block, row),
@@ -159,7 +202,7 @@ def _advance(
             state.below.at[number].set(coupling),
         )
 
-    return jax.lax.fori_loop(first, last, step, state)
+    return step
 
 
 def _every(dtype: np.dtype) -> int:
@@ -187,14 +230,29 @@ def _orthonormal(
     for _ in range(2):
         image = mass(x)
         products = gram(x, image)
-        norms = jnp.sqrt(jnp.diagonal(products))
-        norms = jnp.where(norms > 0, norms, 1)
-        sizes, mix = jnp.linalg.eigh(products / norms / norms[:, None])
-        sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(x.dtype).eps * sizes[-1]))
-        change = mix / sizes / norms[:, None]
+        factor, change = _factored(products)
         x = times(x, change)
-        total = times(total, norms[:, None] * mix * sizes)
+        total = times(total, factor)
     return x, times(image, change), total
+
+
+def _factored(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float[Array, "b b"]]:
+    """Return F with FFᵀ = G, the inner products, and F⁻ᵀ, of what rounding leaves: nothing becomes infinite.
+
+    By eigenvalues; where kernels compile, for which these take long, by a pivoted Cholesky factorisation.
+    """
+    if accelerators.kernels_compile() and len(products) <= orthonormal_kernel.LARGEST:
+        kernel = orthonormal_kernel.cholesky_and_inverse
+        return jax.lax.platform_dependent(products, cuda=kernel, default=_factored_by_eigenvalues)
+    return _factored_by_eigenvalues(products)
+
+
+def _factored_by_eigenvalues(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float[Array, "b b"]]:
+    norms = jnp.sqrt(jnp.diagonal(products))
+    norms = jnp.where(norms > 0, norms, 1)
+    sizes, mix = jnp.linalg.eigh(products / norms / norms[:, None])
+    sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(products.dtype).eps * sizes[-1]))
+    return norms[:, None] * mix * sizes, mix / sizes / norms[:, None]
 
 
 @jit_quickly(static_argnames=("offset", "wanted"))

@@ -8,6 +8,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.linear.pencil import SymmetricPencil
 
+_NODES = 1 << 16
+"""Degrees of freedom of all eigenvectors that are moved at once."""
+
 
 class Problem(NamedTuple):
     """A pencil, and what is known of its spectrum beforehand. The eigenvalues sought are counted from zero upwards.
@@ -172,6 +175,22 @@ def make_room(plan: Plan, state: SlicingState) -> SlicingState:
     kept = jnp.arange(plan.capacity) < count
     return state._replace(
         values=jnp.where(kept, state.values[order], jnp.inf),
-        vectors=jnp.where(kept[:, None], state.vectors[order], 0),
+        vectors=_reordered(state.vectors, order, kept),
         known=count,
     )
+
+
+def _reordered(
+    vectors: Float[Array, "capacity n_dof"], order: Int[Array, " capacity"], kept: Bool[Array, " capacity"]
+) -> Float[Array, "capacity n_dof"]:
+    """Return the rows in that order, zero where none is kept: in place where they may be overwritten."""
+
+    def some(at: int | Array, width: int, vectors: Array) -> Array:
+        part = jax.lax.dynamic_slice_in_dim(vectors, at, width, axis=1)
+        return jax.lax.dynamic_update_slice_in_dim(vectors, jnp.where(kept[:, None], part[order], 0), at, axis=1)
+
+    n = vectors.shape[1]
+    whole = n // _NODES
+    if whole:
+        vectors = jax.lax.fori_loop(0, whole, lambda number, x: some(number * _NODES, _NODES, x), vectors)
+    return some(whole * _NODES, n % _NODES, vectors) if n % _NODES else vectors

@@ -76,9 +76,9 @@ def regions(
     array = np.asarray(labels)
     if array.shape != inside.shape:
         raise ValueError(f"labels: got shape {array.shape}; expected the grid's shape {inside.shape}")
-    found = array[inside]
-    whole = np.rint(found).astype(np.int32)
-    if not np.array_equal(whole, found):
+    inner = array[inside]
+    whole = np.rint(inner).astype(np.int32)
+    if not np.array_equal(whole, inner):
         raise ValueError("labels: got numbers with a fraction inside the domain; expected whole numbers, 0 for none")
     present = [int(label) for label in np.unique(whole) if label != 0]
     if not present:

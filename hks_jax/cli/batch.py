@@ -1,0 +1,213 @@
+"""``hks-jax batch SUBJECTS.tsv -o DIR``: the signatures of many subjects, and the tables of their regions."""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hks_jax.cli.arguments import Times, parse_times
+from hks_jax.cli.hks import add_signature_arguments, settings_of
+from hks_jax.cli.inputs import (
+    add_eigenpair_arguments,
+    add_json_argument,
+    add_tensor_options,
+    read_volume,
+    require_metric,
+)
+from hks_jax.cli.stats import add_atlas_arguments
+from hks_jax.cli.study_progress import StudyProgress
+from hks_jax.cli.subjects import FILES, OPTIONS, Subject, read_subjects
+
+if TYPE_CHECKING:
+    from hks_jax.cli.study import Study
+
+DESCRIPTION = f"""\
+Compute the signatures of many subjects, at the same times for all, and tables of their regions. SUBJECTS is a table
+(.tsv, or .csv) with a row for each subject and the columns
+
+  participant_id   sub-01 or 01
+  session_id       ses-1 or 1, optional
+  file             tensors, or diffusion-weighted images; of six images of components, one
+  {", ".join(FILES)}
+                   more files of the subject, optional; paths begin where the table is
+  {", ".join(OPTIONS)}
+                   options that differ between subjects, optional
+
+and any others, such as age and group, which are kept in participants.tsv. What an option says holds for all subjects
+whose row does not say otherwise.
+
+DIR becomes a BIDS derivative: for each subject an image with its sidecar, an .npz for hks-jax explore, plot and stats,
+a picture, and with --atlas a table of regions; for all of them group_summary.tsv and group_regions.tsv.
+
+A subject that fails does not stop the others. The same command, given again, computes only what is not there yet, or
+was of other files.
+"""
+
+EPILOG = """\
+examples:
+  hks-jax batch subjects.tsv -o study --metric inverse --boundary mean --normalisation flat --atlas atlas.nii.gz
+  hks-jax batch subjects.tsv -o study --metric inverse --times 20 40 80 160 --only sub-07 sub-08
+"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the subcommand's parser."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "batch",
+        help="compute the signatures of many subjects, and tables of their regions",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("subjects", metavar="SUBJECTS", type=Path, help="the table of subjects")
+    add("-o", "--output", metavar="DIR", type=Path, required=True, help="the study's folder")
+    add_tensor_options(parser)
+    add_eigenpair_arguments(parser)
+    add_signature_arguments(parser)
+    add(
+        "--time-unit",
+        choices=("scanner", "lambda1"),
+        default="scanner",
+        help="of --times: scanner, the same t for all subjects, in seconds for D⁻¹ of mm²/s (default); or lambda1, the "
+        "same λ₁t, each subject's t being divided by its own first positive eigenvalue. Automatic times are log-spaced "
+        "over what suits all, and remain those of the study",
+    )
+    add_atlas_arguments(parser, required=False)
+    add(
+        "--save-pairs",
+        action="store_true",
+        help="keep each subject's eigenpairs: with other --times, --normalisation or --method nothing is solved again",
+    )
+    add("--replace", action="store_true", help="compute a study in DIR again that had other settings or times")
+    add("--only", nargs="+", metavar="SUBJECT", help="compute only these, such as sub-07 or sub-07_ses-2")
+    add_json_argument(parser)
+    return parser
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the subcommand.
+
+    Raises:
+        FileNotFoundError: no such table.
+        ValueError: a table or options that are wrong for all subjects.
+        ComputationError: some subjects failed; the others are done.
+    """
+    from hks_jax.cli.job import ComputationError
+    from hks_jax.cli.outputs import check_folder
+    from hks_jax.cli.study_tasks import run_all
+
+    times = parse_times(args.times)
+    subjects = read_subjects(args.subjects, args)
+    chosen = _only(subjects, args.only)
+    for subject in chosen:
+        if subject.arguments is not None:
+            require_metric(subject.arguments)
+    with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
+    if args.names is not None and not with_regions:
+        raise ValueError("--names: it names labels; pass --atlas too, or a column atlas in the table")
+    check_folder(args.output)
+    progress = StudyProgress(len(chosen), args.quiet)
+    with progress.catching_warnings():
+        study = _open(args, times, subjects, progress)
+        study.write_description(subjects, _text(times))
+        problems = {subject.name: "" for subject in subjects if subject not in chosen}
+        problems |= run_all(study, chosen, progress, args.debug)
+        if args.only:  # what others have done in the meantime
+            problems = {name: why for name, why in problems.items() if why or not _is_there(study, subjects, name)}
+        files = study.write_group(subjects, problems, with_regions)
+    failed = [subject.name for subject in chosen if problems.get(subject.name)]
+    if args.json:
+        print(json.dumps({"failed": failed, "files": [str(file) for file in files]}, ensure_ascii=False))
+    elif not args.quiet:
+        print("\n".join(str(file) for file in files if file.suffix == ".tsv"))
+    if failed:
+        raise ComputationError(
+            f"{len(failed)} of {len(chosen)} subjects failed ({', '.join(failed[:5])}{', …' * (len(failed) > 5)}); "
+            f"{args.output / 'group_summary.tsv'} says why. The others are done; the same command tries these again"
+        )
+
+
+def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> "Study":
+    """Return the study, its times settled: as given, or as it has them already, or as they suit all subjects.
+
+    Raises:
+        ValueError: the folder is a study of other settings, which is not to be replaced.
+    """
+    from hks_jax.cli.study import Study, reading_options
+    from hks_jax.io.tables import read_json
+
+    settings = settings_of(args, times, args.metric or "tensor")
+    study = Study(args.output, settings, args.time_unit, reading_options(args), args.save_pairs)
+    before = read_json(args.output / "study.json")
+    changed = _changes(before, study, _text(times))
+    if before and changed and not args.replace:
+        raise ValueError(
+            f"--output: {args.output} is a study that differs in {'; '.join(changed)}. Choose another folder, or pass "
+            "--replace to compute its subjects again"
+        )
+    if times.explicit:
+        return study
+    explicit = _suitable(args, times.automatic, subjects, progress) if changed else tuple(before["times"])
+    return replace(study, settings=replace(settings, times=Times(explicit, 0)))
+
+
+def _changes(before: dict[str, Any], study: "Study", chosen: str) -> list[str]:
+    """Say in which options a study differs from what it was; automatic times remain what they were."""
+    now, then = study.record, dict(before)
+    if chosen != "explicit":
+        now["times"], then["times"] = chosen, before.get("chosen")
+    for part in ("settings", "reading"):
+        now |= now.pop(part)
+        then |= then.pop(part, {})
+    differing = [(name, then.get(name), value) for name, value in now.items() if then.get(name) != value]
+    return [f"--{name}: {json.dumps(old)}, now {json.dumps(new)}" for name, old, new in differing]
+
+
+def _text(times: Times) -> str:
+    return "explicit" if times.explicit else f"auto:{times.automatic}"
+
+
+def _suitable(
+    args: argparse.Namespace, count: int, subjects: list[Subject], progress: StudyProgress
+) -> tuple[float, ...]:
+    """Read all subjects, and return times that suit them; those that cannot be read have no say."""
+    from hks_jax.cli.study_times import common_times, suitable_range
+
+    if args.metric == "adjugate":
+        raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
+    ranges = {}
+    for number, subject in enumerate(subjects, 1):
+        progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
+        try:
+            assert subject.arguments is not None, subject.problem
+            volume = read_volume(subject.arguments, StudyProgress(1, True))
+            ranges[subject.name] = suitable_range(volume, subject.arguments)
+        except Exception:  # said when its turn comes
+            continue
+    if not ranges:
+        raise ValueError("--times: none of the subjects can be read; pass --times to see why of each")
+    times = common_times(ranges, count, args.time_unit)
+    progress.end(f"times that suit all subjects ({len(ranges)}): {', '.join(f'{t:g}' for t in times)}")
+    return times
+
+
+def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
+    """Return the subjects that are to be computed."""
+    if names is None:
+        return subjects
+    wanted = {name if name.startswith("sub-") else f"sub-{name}" for name in names}
+    chosen = [subject for subject in subjects if {subject.name, subject.participant} & wanted]
+    missing = wanted - {name for subject in chosen for name in (subject.name, subject.participant)}
+    if missing:
+        raise ValueError(f"--only: got {', '.join(sorted(missing))}; expected subjects of the table")
+    return chosen
+
+
+def _is_there(study: "Study", subjects: list[Subject], name: str) -> bool:
+    subject = next(subject for subject in subjects if subject.name == name)
+    try:
+        return study.is_done(subject, study.fingerprint(subject))
+    except Exception:
+        return False

@@ -1,0 +1,129 @@
+"""``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``: eigenpairs kept with the field that they are of."""
+
+import argparse
+import json
+import zipfile
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hks_jax.cli.job import Settings, field_of
+from hks_jax.cli.outputs import plain
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import defaults
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.fem.assembly import assemble
+from hks_jax.io.pairs import pairs_of, save_pairs
+from hks_jax.io.volume import TensorVolume
+from hks_jax.npz import load_npz
+
+NAME = "pairs.npz"
+_RECORD = "field_record"
+_SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
+"""Settings that belong to the pairs."""
+_OPTIONS = {
+    **defaults(),
+    "metric": None,
+    "components": "raise",
+    "dtype": "float64",
+    "interpolation": "linear",
+    "boundary": "neumann",
+    "k": None,
+    "solver": "auto",
+    "save_pairs": False,
+}
+"""Options that were settled when the pairs were computed, and what they are unless given."""
+
+
+def is_saved_pairs(path: Path) -> bool:
+    """Tell whether a file holds eigenpairs with their field."""
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return f"{_RECORD}.npy" in archive.namelist()
+
+
+def check_options(args: argparse.Namespace) -> None:
+    """Raise ValueError for options that come too late."""
+    if args.others:
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one of eigenpairs")
+    for name, default in _OPTIONS.items():
+        if getattr(args, name) != default:
+            option = "-k" if name == "k" else f"--{name.replace('_', '-')}"
+            raise ValueError(
+                f"{option}: {args.file} holds eigenpairs, of which all but the signature is settled; leave it out"
+            )
+
+
+def write_pairs(
+    path: Path,
+    volume: TensorVolume,
+    pairs: Eigenpairs,
+    settings: Settings,
+    image: str,
+    warnings: list[str],
+    fingerprint: str = "",
+) -> None:
+    """Write eigenpairs with the volume, whose mask is the domain, and with what was settled in computing them.
+
+    Args:
+        path: the file.
+        volume: the tensors.
+        pairs: the eigenpairs.
+        settings: of the computation.
+        image: the suffix of images in the format of the tensors' file.
+        warnings: what was said of the tensors and of the pairs, to be said again.
+        fingerprint: of a study's subject, what the pairs were computed from.
+    """
+    about = ("order", "frame", "notes", "source", "digest", "slice_axis")
+    record = {name: getattr(volume, name) for name in about}
+    record |= {"repair": dict(volume.repair), "image": image, "warnings": warnings, "fingerprint": fingerprint}
+    record["settings"] = {name: value for name, value in asdict(settings).items() if name in _SETTLED}
+    place = {"tensors": volume.tensors, "spacing": volume.spacing, "origin": volume.origin}
+    place |= {name: value for name in ("mask", "affine") if (value := getattr(volume, name)) is not None}
+    save_pairs(path, pairs, {**place, _RECORD: json.dumps(plain(record))})
+
+
+def are_of(path: Path, fingerprint: str) -> bool:
+    """Tell whether a file holds the eigenpairs of a study's subject, computed from the same files and settings."""
+    if not is_saved_pairs(path):
+        return False
+    with np.load(path) as arrays:  # of which only the one is read
+        return bool(json.loads(str(arrays[_RECORD]))["fingerprint"] == fingerprint)
+
+
+def read_pairs(
+    path: Path, settings: Settings, progress: Progress
+) -> tuple[TensorVolume, TensorField, Eigenpairs, Settings, str]:
+    """Return the volume, its metric, the pairs, the settings with those that are settled, and the suffix of images.
+
+    Raises:
+        ValueError: a damaged file.
+    """
+    arrays = load_npz(path)
+    record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
+    volume = TensorVolume(
+        arrays["tensors"],
+        tuple(arrays["spacing"].tolist()),
+        tuple(arrays["origin"].tolist()),
+        arrays.get("mask"),
+        arrays.get("affine"),
+        **{name: record[name] for name in ("order", "frame", "source", "digest", "slice_axis", "repair")},
+        notes=tuple(record["notes"]),
+    )
+    settled = {**record["settings"], "boundary": _tuples(record["settings"]["boundary"])}
+    settings = replace(settings, **settled)
+    assert settings.metric is not None
+    for warning in record["warnings"]:
+        progress.warn(warning)
+    with progress.stage("assembly"):
+        field = field_of(volume, volume.grid("all"), settings.metric, settings.dtype, settings.interpolation)
+        pairs = pairs_of(str(path), arrays, assemble(field, settings.boundary))
+    return volume, field, pairs, settings, record["image"]
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

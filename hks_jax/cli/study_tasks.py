@@ -1,0 +1,144 @@
+"""The computations of a study: what is to be done of each subject, and doing it."""
+
+import sys
+import traceback
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from hks_jax.cli import INPUT_ERRORS
+from hks_jax.cli.arguments import Times
+from hks_jax.cli.bar import duration
+from hks_jax.cli.inputs import read_volume
+from hks_jax.cli.job import ComputationError, compute_pairs, signature_of
+from hks_jax.cli.picture import draw, draw_volume
+from hks_jax.cli.reading import image_suffix
+from hks_jax.cli.regions import region_table
+from hks_jax.cli.saved_pairs import are_of, read_pairs, write_pairs
+from hks_jax.cli.study import MAP, PAIRS, Study
+from hks_jax.cli.study_progress import StudyProgress
+from hks_jax.cli.subjects import Subject
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.io import TensorVolume
+from hks_jax.signatures.times import positive_range
+
+FORGETFUL = 8
+"""After so many subjects what was compiled is forgotten: domains differ, and each leaves 70 MiB that no other uses."""
+
+
+def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> dict[str, str]:
+    """Compute what is not there yet; return why some subjects failed, by their names."""
+    problems: dict[str, str] = {}
+    plan = []
+    for subject in subjects:
+        try:
+            task = _Task.of(study, subject)
+        except Exception as error:
+            problems[subject.name] = _said(error, debug)
+            progress.end(f"{subject.name} failed: {problems[subject.name]}")
+        else:
+            plan.append(task)
+    pending = [task for task in plan if task.signature or task.regions]
+    # What ended a process before, for want of memory perhaps, may do so again: the others come first.
+    pending.sort(key=lambda task: study.attempt(task.subject).exists())
+    if len(pending) < len(plan):
+        progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are done already")
+    progress.total = len(pending)
+    for number, task in enumerate(pending, 1):
+        name = task.subject.name
+        try:
+            with progress.subject(name):
+                task.run(study, progress)
+        except Exception as error:
+            problems[name] = _said(error, debug)
+            progress.end(f"{name} failed: {problems[name]}")
+        if number % FORGETFUL == 0:
+            jax.clear_caches()
+    done = len(subjects) - len(problems)
+    progress.end(f"{progress.line()}: {done} of {len(subjects)} subjects are done, in {duration(progress.elapsed)}")
+    return problems
+
+
+class _Task(NamedTuple):
+    """What is to be done of a subject."""
+
+    subject: Subject
+    fingerprint: str
+    signature: bool
+    regions: str
+    """The fingerprint of the table of regions, if it is to be written; else nothing."""
+
+    @classmethod
+    def of(cls, study: Study, subject: Subject) -> "_Task":
+        """Return what is to be done: what is not there, or was of other files or settings."""
+        fingerprint = study.fingerprint(subject)
+        assert subject.arguments is not None
+        missing, regions = not study.is_done(subject, fingerprint), ""
+        if subject.arguments.atlas is not None:
+            regions = study.regions_fingerprint(subject, fingerprint)
+            regions = "" if not missing and study.has_regions(subject, regions) else regions
+        return cls(subject, fingerprint, missing, regions)
+
+    def run(self, study: Study, progress: StudyProgress) -> None:
+        """Do it."""
+        args, attempt = self.subject.arguments, study.attempt(self.subject)
+        assert args is not None
+        if self.signature:
+            attempt.parent.mkdir(parents=True, exist_ok=True)
+            attempt.touch()
+            try:
+                _compute(study, self.subject, self.fingerprint, progress)
+            finally:
+                attempt.unlink()
+                with suppress(OSError):  # it has files
+                    attempt.parent.rmdir()
+        if self.regions:
+            study.forget_regions(self.subject)
+            with progress.stage("regions"):
+                table = region_table(study.path(self.subject, f"{MAP}.npz"), args.atlas, args.names, progress)
+            study.write_regions(self.subject, self.regions, *table)
+
+
+def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
+    """Compute and write the signature of a subject."""
+    study.forget(subject)
+    settings, scaled = study.settings, None
+    volume, field, pairs = _pairs(study, subject, progress)
+    if study.time_unit == "lambda1":
+        scaled = settings.times.explicit
+        own = np.array(scaled) / float(positive_range(pairs)[0])
+        settings = replace(settings, times=Times(tuple(own.tolist()), 0))
+    result = signature_of(volume, field, pairs, settings, progress)
+    drawn = partial(draw if volume.dimension == 2 else draw_volume, result)
+    with progress.stage("writing"):
+        study.write_signature(subject, fingerprint, result, progress.warnings, drawn, scaled)
+
+
+def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[TensorVolume, TensorField, Eigenpairs]:
+    """Return the volume, its metric and its eigenpairs: those that were kept, or computed, and kept if asked to."""
+    kept, fingerprint = study.path(subject, PAIRS), study.pairs_fingerprint(subject)
+    if are_of(kept, fingerprint):
+        return read_pairs(kept, study.settings, progress)[:3]
+    kept.unlink(missing_ok=True)
+    assert subject.arguments is not None
+    with progress.stage("reading"):
+        volume = read_volume(subject.arguments, progress)
+    field, pairs = compute_pairs(volume, study.settings, progress)
+    if study.save_pairs:
+        domain, image = volume.with_mask(field.grid.mask), image_suffix(subject.arguments.file)
+        with progress.stage("writing"):
+            write_pairs(kept, domain, pairs, study.settings, image, progress.warnings, fingerprint)
+    return volume, field, pairs
+
+
+def _said(error: Exception, debug: bool) -> str:
+    """Return an error as one line."""
+    if debug:
+        traceback.print_exception(error, file=sys.stderr)
+    plain = isinstance(error, (*INPUT_ERRORS, ComputationError, np.linalg.LinAlgError))
+    return " ".join((str(error) if plain else f"{type(error).__name__}: {error}").split())

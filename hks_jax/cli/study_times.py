@@ -1,0 +1,68 @@
+"""Times for all subjects of a study, where none are given."""
+
+import argparse
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hks_jax.cli.info import describe
+from hks_jax.fem.boundary import doubled_problems, normalise_boundary
+from hks_jax.io import TensorVolume
+
+SMALLEST_TIMES_FIRST_EIGENVALUE = 4 * math.log(10.0)
+"""λ₁t at which all but the constant has decayed by 1e-4: the end of the default times of Sun et al."""
+
+
+class Range(NamedTuple):
+    """The times that suit one subject: those that its voxels and its eigenpairs resolve, and its size ends."""
+
+    least: float
+    largest: float
+
+
+def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
+    """Return the range of times that suits a subject, from its metric and its size, before anything is computed.
+
+    Raises:
+        KeyError: the metric is the adjugate, or no tensor is valid.
+    """
+    inside = volume.inside
+    box = tuple(slice(int(i.min()), int(i.max()) + 1) for i in np.nonzero(inside))  # the domain's size, not the image's
+    domain = replace(volume, tensors=volume.tensors[box], mask=inside[box])
+    suits: dict[str, Any] = describe(args.file, domain)["suits"]
+    of = suits[args.metric or "tensor"]
+    d = volume.dimension
+    # Eigenpairs of several problems (under "mean" and "mirror") are so many fewer for each of them.
+    pairs = of["k"] if args.k is None else args.k
+    share = pairs / len(doubled_problems(normalise_boundary(args.boundary, d)))
+    by_pairs = of["least_time_of_k"] * (of["k"] / share) ** (2 / d)
+    return Range(max(of["least_time"], by_pairs), of["largest_time"])
+
+
+def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
+    """Return n times, log-spaced over what suits all subjects, rounded to three digits.
+
+    Args:
+        ranges: one for each subject, by name.
+        n: how many.
+        unit: ``"scanner"``: from the largest of the least times to the least of the largest; ``"lambda1"``: the same of
+            λ₁t, whose largest is 4 ln 10.
+
+    Raises:
+        ValueError: no time suits all.
+    """
+    if unit == "lambda1":
+        end = SMALLEST_TIMES_FIRST_EIGENVALUE
+        ranges = {name: Range(end * least / most, end) for name, (least, most) in ranges.items()}
+    late, flat = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
+    least, largest = ranges[late].least, ranges[flat].largest
+    if least >= largest:
+        raise ValueError(
+            f"--times: none suits all subjects: {late} resolves only t ≥ {least:.3g}, and {flat} is flat from "
+            f"t = {largest:.3g} on. Choose times, or more eigenpairs (-k); see what 'hks-jax info' says of {late}: "
+            "tensors with eigenvalues near zero take its pairs (--repair nearest:1e-4)"
+        )
+    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n)) if n > 1 else (float(f"{least:.3g}"),)

@@ -1,0 +1,120 @@
+"""The table of a study's subjects: one row each, with its files and what differs in reading them."""
+
+import argparse
+import copy
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn
+
+from hks_jax.cli.reading import add_file_argument, add_options, defaults
+from hks_jax.cli.stats import add_atlas_arguments
+from hks_jax.io.tables import read_table
+
+FILES = ("mask", "bval", "bvec", "atlas", "names")
+"""Columns that are paths, beside `file`; relative ones begin where the table is."""
+
+OPTIONS = tuple(name.replace("_", "-") for name in defaults() if name not in FILES)
+"""Columns that stand for the option of the same name: those of reading tensors."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A row of the table.
+
+    Attributes:
+        participant: ``sub-`` and a label.
+        session: ``ses-`` and a label, or nothing.
+        arguments: the command's arguments with those of the row; None where these are wrong.
+        problem: what is wrong with them.
+        covariates: the columns that are no arguments.
+    """
+
+    participant: str
+    session: str
+    arguments: argparse.Namespace | None
+    problem: str = ""
+    covariates: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The beginning of the names of its files: ``sub-01`` or ``sub-01_ses-2``."""
+        return "_".join(filter(None, (self.participant, self.session)))
+
+    @property
+    def folder(self) -> Path:
+        """Its folder within the study's."""
+        return Path(self.participant, self.session)
+
+
+class _RowParser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(message)
+
+
+def _row_parser() -> argparse.ArgumentParser:
+    parser = _RowParser(add_help=False)
+    add_file_argument(parser)
+    add_options(parser)
+    add_atlas_arguments(parser, required=False)
+    return parser
+
+
+def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
+    """Read the table, and join each row with the arguments that hold for all subjects.
+
+    A row with wrong options becomes a subject with a problem.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no table, no columns `participant_id` and `file`, labels that BIDS does not allow, or a subject
+            (and session) twice.
+    """
+    rows, parser = read_table(path), _row_parser()
+    subjects: dict[str, Subject] = {}
+    for number, row in enumerate(rows, 2):
+        if "participant_id" not in row:
+            raise ValueError(f"{path}: row {number} has no participant_id; expected one in every row")
+        participant = _label(path, "sub", row.pop("participant_id"))
+        session = _label(path, "ses", row.pop("session_id")) if "session_id" in row else ""
+        subject = _subject(parser, path.parent, participant, session, row, common)
+        if subject.name in subjects:
+            raise ValueError(f"{path}: {subject.name} is there twice; tell the rows apart by a column session_id")
+        subjects[subject.name] = subject
+    return list(subjects.values())
+
+
+def _label(path: Path, entity: str, text: str) -> str:
+    label = text.removeprefix(f"{entity}-")
+    if not re.fullmatch("[A-Za-z0-9]+", label):
+        raise ValueError(f"{path}: got {text!r}; expected {entity}-LABEL or LABEL of letters and digits alone (BIDS)")
+    return f"{entity}-{label}"
+
+
+def _subject(
+    parser: argparse.ArgumentParser,
+    folder: Path,
+    participant: str,
+    session: str,
+    row: dict[str, str],
+    common: argparse.Namespace,
+) -> Subject:
+    words, covariates = [], {}
+    if "file" in row:
+        words.append(str(folder / row.pop("file")))
+    for column, text in row.items():
+        option = column.lower().replace("_", "-")
+        if option in FILES:
+            words += [f"--{option}", str(folder / text)]
+        elif option in OPTIONS:
+            words += [f"--{option}", *(text.replace(",", " ").split() if option == "spacing" else [text])]
+        else:
+            covariates[column] = text
+    try:
+        if not words or words[0].startswith("--"):
+            raise ValueError("the row has no file")
+        arguments = parser.parse_args(words, copy.copy(common))
+    except ValueError as error:
+        return Subject(participant, session, None, str(error), covariates)
+    return Subject(participant, session, arguments, "", covariates)

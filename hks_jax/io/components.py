@@ -1,0 +1,112 @@
+"""Tensors in six images, one for each component: BIDS's ``param-txx`` … ``param-tzz``, DSI Studio's, ANTs'."""
+
+import json
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hks_jax.io import nifti
+from hks_jax.io.tensor_order import ORDERS
+from hks_jax.io.volume import TensorVolume
+from hks_jax.reading import reading
+
+NAMES = ORDERS["nifti"]
+_NAME = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
+_REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world"}
+"""The frame that BIDS names by the field Reference of OrientationEncoding."""
+
+
+def component_of(path: str | os.PathLike[str]) -> str | None:
+    """Tell by a file's name which component it holds: ``"xy"`` for ``sub-01_param-txy_dwimap.nii.gz``, ``dtxy.nii``."""
+    names = _NAME.findall(os.path.basename(path))
+    return names[-1].lower() if names else None
+
+
+def siblings(path: str | os.PathLike[str]) -> list[str]:
+    """Return the six files of which one is given: their names differ in the component alone.
+
+    Raises:
+        ValueError: the name has no component.
+        FileNotFoundError: some of them are missing.
+    """
+    folder, name = os.path.split(os.fspath(path))
+    matches = list(_NAME.finditer(name))
+    if not matches:
+        raise ValueError(f"{os.fspath(path)}: its name has no component, such as txx or Dxx; expected one of six")
+    start, end = matches[-1].span(1)
+    upper = name[start:end].isupper()
+    names = [os.path.join(folder, name[:start] + (c.upper() if upper else c) + name[end:]) for c in NAMES]
+    missing = [os.path.basename(each) for each in names if not os.path.isfile(each)]
+    if missing:
+        raise FileNotFoundError(
+            f"{os.fspath(path)}: by its name it holds the component {component_of(path)} of tensors, of which six are "
+            f"needed; not beside it: {', '.join(missing)}"
+        )
+    return names
+
+
+def is_one_of_six(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a NIfTI file holds one component alone: by its name, and as it has one value for each voxel."""
+    return component_of(path) is not None and math.prod(nifti.load(path).shape[3:]) == 1
+
+
+def read_tensors(
+    paths: Sequence[str | os.PathLike[str]], order: str | None = None, frame: str | None = None
+) -> TensorVolume:
+    """Read tensors from six NIfTI images, whose names say which component each has, in any sequence.
+
+    Args:
+        paths: the six files.
+        order: must be None; for the error.
+        frame: the axes of the components; None: what the BIDS sidecar beside an image says (``Reference`` of
+            ``OrientationEncoding``), or those of the voxels.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not six images, or names that do not say which; shapes or affines that differ.
+    """
+    if order is not None:
+        raise ValueError(f"order: got {order!r}; the names of six images say which component each has. Leave it out")
+    files = {component_of(path): os.fspath(path) for path in paths}
+    if len(paths) != 6 or set(files) != set(NAMES):
+        given = ", ".join(f"{os.path.basename(path)} ({component_of(path) or 'none'})" for path in paths)
+        raise ValueError(
+            f"files: got {given}; expected six NIfTI images, one for each component {' '.join(NAMES)}, which their "
+            "names tell, as in sub-01_param-txx_dwimap.nii.gz or dtxx.nii.gz"
+        )
+    images = [_image(files[name]) for name in NAMES]
+    first = images[0]
+    for name, image in zip(NAMES, images, strict=True):
+        if image.shape != first.shape:
+            raise ValueError(f"{files[name]}: got shape {image.shape}; expected that of {files['xx']}, {first.shape}")
+        if not np.allclose(image.affine, first.affine, rtol=1e-4, atol=1e-3):
+            raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected the same voxels")
+    values = np.stack([nifti.voxels(files[name], image) for name, image in zip(NAMES, images, strict=True)], axis=-1)
+    joined = nifti.nibabel().Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
+    joined.header.set_intent(nifti.SYMMETRIC_MATRIX, (3,))
+    return nifti.tensors_of(files["xx"], joined, None, frame or _declared_frame(files["xx"]))
+
+
+def _image(path: str) -> Any:
+    if not nifti.is_nifti(path):
+        raise ValueError(f"{path}: one of six images; expected NIfTI, .nii or .nii.gz")
+    image = nifti.load(path)
+    if len(image.shape) < 3 or math.prod(image.shape[3:]) != 1:
+        raise ValueError(f"{path}: got shape {image.shape}; expected (nx, ny, nz), one component")
+    return image
+
+
+def _declared_frame(path: str) -> str | None:
+    """Return the frame that the sidecar of an image names, if there is one."""
+    sidecar = Path(path.removesuffix(".gz").removesuffix(".nii") + ".json")
+    if not sidecar.is_file():
+        return None
+    with reading(sidecar, "a BIDS sidecar in JSON"):
+        encoding = json.loads(sidecar.read_text(encoding="utf-8")).get("OrientationEncoding") or {}
+        reference = encoding.get("Reference")
+    return _REFERENCES.get(reference) if isinstance(reference, str) else None

@@ -1,0 +1,125 @@
+"""MRtrix's image format, .mif and .mif.gz: tensors as dwi2tensor writes them, and masks.
+
+https://mrtrix.readthedocs.io/en/latest/getting_started/image_data.html describes it: a header of lines ``key: value``
+up to ``END``, and the voxels at the offset that ``file`` names, in the order that ``layout`` gives.
+"""
+
+import gzip
+import math
+import os
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hks_jax.io.order_check import invalid_by_order
+from hks_jax.io.tensor_order import FRAMES, to_voxel_axes, unpack
+from hks_jax.io.volume import TensorVolume
+from hks_jax.reading import existing, reading
+
+SUFFIXES = (".mif", ".mif.gz")
+_MAGIC = b"mrtrix image"
+_KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
+
+
+class Image(NamedTuple):
+    """The voxel values, in the header's order of axes, and the affine: voxel indices to scanner coordinates, in mm."""
+
+    values: np.ndarray
+    affine: Float[np.ndarray, "4 4"]
+
+
+def is_mrtrix(path: str | os.PathLike[str]) -> bool:
+    """Tell by the name whether a file is one of MRtrix's images."""
+    return os.fspath(path).lower().endswith(SUFFIXES)
+
+
+def load(path: str | os.PathLike[str]) -> Image:
+    """Read an image. A compressed one is read to its end, where its checksum is compared.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not MRtrix's format, or a damaged file; complex numbers.
+    """
+    file = existing(path)
+    with reading(file, "a readable image of MRtrix (.mif)"):
+        content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
+        header, offset = _header(content)
+        shape = tuple(int(n) for n in header["dim"][0].split(","))
+        if min(shape) < 1 or len(shape) < 3:
+            raise ValueError(f"dim is {header['dim'][0]}")
+        count, dtype = math.prod(shape), header["datatype"][0].strip()
+        length = -(-count // 8) if dtype == "Bit" else count * _dtype(dtype).itemsize
+        if len(content) != offset + length:
+            raise ValueError(f"{dtype} of shape {shape} end at byte {offset + length}, the file at {len(content)}")
+        raw = np.frombuffer(content, np.uint8 if dtype == "Bit" else _dtype(dtype), offset=offset)
+        flat = np.unpackbits(raw)[:count] if dtype == "Bit" else raw
+        values = _in_order(flat, shape, header["layout"][0])
+        if "scaling" in header:
+            shift, scale = (float(word) for word in header["scaling"][0].split(","))
+            values = values * scale + shift
+        affine = np.eye(4)
+        affine[:3] = [[float(word) for word in row.split(",")] for row in header["transform"]]
+        affine[:3, :3] *= [float(word) for word in header["vox"][0].split(",")[:3]]
+        if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
+            raise ValueError("transform and vox place the voxels nowhere")
+    return Image(values, affine)
+
+
+def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
+    """Read tensors; see `hks_jax.io.read_tensors`. Unless an order is given, it is that of all MRtrix's programs."""
+    values, affine = load(name)
+    if values.ndim != 4 or values.shape[-1] != 6:
+        raise ValueError(
+            f"{name}: got an image of shape {values.shape}; expected the six components of dwi2tensor, (nx, ny, nz, 6)"
+        )
+    order = order or "mrtrix"
+    frame = frame or FRAMES[order]
+    components = np.ascontiguousarray(values, np.float32 if values.dtype.itemsize <= 4 else np.float64)
+    return TensorVolume(
+        to_voxel_axes(unpack(components, order), frame, affine),
+        tuple(np.linalg.norm(affine[:3, :3], axis=0).tolist()),
+        (0.0, 0.0, 0.0),
+        affine=affine,
+        order=order,
+        frame=frame,
+        notes=(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes',),
+        source=name,
+        invalid_by_order=invalid_by_order(components, order),
+    )
+
+
+def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
+    """Return the values of each key, and where the voxels begin."""
+    end = content.find(b"\nEND\n")
+    if not content.startswith(_MAGIC) or end < 0:
+        raise ValueError(f"it does not begin with {_MAGIC.decode()!r} and a header up to END")
+    header: dict[str, list[str]] = {}
+    for line in content[:end].decode().splitlines()[1:]:
+        key, _, value = line.partition(":")
+        header.setdefault(key.strip(), []).append(value.strip())
+    where, offset = header["file"][0].split()
+    if where != "." or int(offset) < end:
+        raise ValueError(f"its voxels are not in it, but in {header['file'][0]!r}")
+    return header, int(offset)
+
+
+def _dtype(name: str) -> np.dtype:
+    """Return the dtype of Float32LE, Int16BE, UInt8 and so on."""
+    bare, order = (name[:-2], "<" if name.endswith("LE") else ">") if name[-2:] in ("LE", "BE") else (name, "=")
+    kind = bare.rstrip("0123456789")
+    if kind not in _KINDS:
+        raise ValueError(f"voxels are of type {name}; expected real numbers")
+    return np.dtype(f"{order}{_KINDS[kind]}{int(bare[len(kind) :]) // 8}")
+
+
+def _in_order(flat: np.ndarray, shape: tuple[int, ...], layout: str) -> np.ndarray:
+    """Return the values with the header's axes; a layout such as ``-0,+1,+2`` has each axis's rank and direction."""
+    words = [word.strip() for word in layout.split(",")]
+    ranks = [int(word.lstrip("+-")) for word in words]
+    if sorted(ranks) != list(range(len(shape))):
+        raise ValueError(f"layout is {layout}, of {len(shape)} axes")
+    slowest_first = sorted(range(len(shape)), key=lambda axis: -ranks[axis])
+    stored = flat.reshape([shape[axis] for axis in slowest_first])
+    values = stored.transpose(np.argsort(slowest_first))
+    return values[tuple(slice(None, None, -1 if word.startswith("-") else 1) for word in words)]

@@ -1,0 +1,83 @@
+"""Tables of tab-separated values as BIDS has them: a header, n/a for what is missing, JSON about the columns."""
+
+import csv
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hks_jax.atomic import atomic_path
+from hks_jax.reading import existing, reading
+
+MISSING = "n/a"
+
+
+def write_table(
+    path: str | os.PathLike[str],
+    columns: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    about: Mapping[str, Any] | None = None,
+) -> list[Path]:
+    """Write a table, and beside it, where there is something to say about it, a JSON file; return their paths.
+
+    Both appear whole or not at all, the JSON file last: where it is there, the table is.
+    """
+    written = [Path(path)]
+    with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as stream:
+        stream.write("\t".join(columns) + "\n")
+        stream.writelines("\t".join(map(cell, row)) + "\n" for row in rows)
+    if about is not None:
+        written.append(write_json(Path(path).with_suffix(".json"), about))
+    return written
+
+
+def cell(value: Any) -> str:
+    """Return a value as text without tabs or line ends: numbers to nine digits, ``n/a`` for None, NaN and nothing."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return MISSING
+    return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split()) or MISSING
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> Path:
+    """Write a JSON file, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return path
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return what is in a JSON file; nothing if there is no such file, or it is no object."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def read_table(path: str | os.PathLike[str]) -> list[dict[str, str]]:
+    """Read a table with a header: tab-separated, or separated by commas if its name ends in ``.csv``.
+
+    Returns:
+        One dictionary for each row that is not empty, without the cells that are empty or ``n/a``.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not a table in UTF-8, columns without a name or of the same name, or rows longer than the header.
+    """
+    file = existing(path)
+    separator = "," if file.name.lower().endswith(".csv") else "\t"
+    with reading(file, "a table in UTF-8"), open(file, encoding="utf-8-sig", newline="") as stream:
+        lines = [[word.strip() for word in line] for line in csv.reader(stream, delimiter=separator)]
+    lines = [line for line in lines if any(line)]
+    header, rows = (lines[0], lines[1:]) if lines else ([], [])
+    if not rows or not all(header) or len(set(header)) < len(header):
+        raise ValueError(
+            f"{file}: got the columns {', '.join(header) or 'none'} and {len(rows)} rows; expected a header of "
+            f"different names, separated by {'commas' if separator == ',' else 'tabs'}, and rows below it"
+        )
+    for number, row in enumerate(rows, 2):
+        if len(row) > len(header):
+            raise ValueError(f"{file}: row {number} has {len(row)} cells; expected {len(header)}, as the header")
+    return [{k: v for k, v in zip(header, row, strict=False) if v and v.lower() != MISSING} for row in rows]

@@ -1,0 +1,517 @@
+"""Studies: regions' statistics, six images of components, and many subjects that are computed, killed and resumed."""
+
+import argparse
+import csv
+import importlib.util
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+from annotations import unchecked
+
+import hks_jax as hj
+from hks_jax.cli import build_parser, main
+from hks_jax.cli.study import Study
+from hks_jax.cli.study_progress import StudyProgress
+from hks_jax.cli.study_times import Range, common_times, suitable_range
+from hks_jax.cli.subjects import read_subjects
+from hks_jax.io import TensorVolume, read_tensors, save_tensors
+from hks_jax.io.components import component_of
+from hks_jax.io.labels import names_beside, read_names
+from hks_jax.io.pairs import pairs_of
+from hks_jax.io.tables import read_table, write_table
+
+ROOT = Path(__file__).resolve().parents[1]
+BRAINS = ROOT.parent / "shared" / "data"
+SHAPE = (9, 8, 3)
+AFFINE = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
+
+
+def tensors(scale=1.0):
+    """Tensors in mm²/s that turn and stretch, multiplied by a number."""
+    x, y, z = (a / 5 for a in np.indices(SHAPE))
+    field = np.zeros((*SHAPE, 3, 3))
+    for a, values in enumerate((1.5 + 0.4 * np.cos(x), 1.0 + 0.3 * np.sin(y), 0.8 + 0.1 * z)):
+        field[..., a, a] = values
+    field[..., 0, 1] = field[..., 1, 0] = 0.2 * np.sin(x + y)
+    field[..., 1, 2] = field[..., 2, 1] = 0.1 * np.cos(z)
+    return 1e-3 * scale * field
+
+
+def volume(scale=1.0):
+    return TensorVolume(tensors(scale), (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE)
+
+
+def table(path):
+    with open(path, encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream, delimiter="\t"))
+
+
+# ---------------------------------------------------------------------------------------------------- regions
+
+
+def test_region_statistics_are_those_of_the_regions_alone(rng):
+    values, labels = rng.standard_normal((3, 6, 5)), rng.integers(0, 4, (6, 5)) * 10
+    values[:, labels == 30] = np.nan
+    values[:, 0, :] = np.nan
+    found = hj.region_statistics(values, labels, 2.5)
+    assert found.labels.tolist() == [10, 20, 30]
+    inside = np.isfinite(values[0])
+    for r, label in enumerate((10, 20)):
+        part = values[:, inside & (labels == label)]
+        assert (found.nodes[r], found.volume[r]) == (part.shape[1], 2.5 * part.shape[1])
+        np.testing.assert_allclose(found.coverage[r], part.shape[1] / (labels == label).sum())
+        np.testing.assert_allclose(found.mean[:, r], part.mean(axis=1))
+        np.testing.assert_allclose(found.deviation[:, r], np.sqrt(((part - part.mean(1, keepdims=True)) ** 2).mean(1)))
+        np.testing.assert_allclose(found.median[:, r], np.median(part, axis=1))
+    assert (found.nodes[2], found.coverage[2]) == (0, 0)
+    assert np.isnan(found.mean[:, 2]).all()
+
+
+@pytest.mark.parametrize(
+    ("labels", "words"),
+    [
+        (np.zeros((6, 5)), "0 everywhere"),
+        (np.full((6, 5), 0.5), "a fraction"),
+        (np.ones((5, 6)), r"got shape \(5, 6\)"),
+    ],
+)
+def test_labels_that_are_none_are_refused(labels, words):
+    with unchecked(), pytest.raises(ValueError, match=words):
+        hj.region_statistics(np.ones((2, 6, 5)), labels)
+
+
+def test_names_are_read_from_what_there_is(tmp_path):
+    def names(text):
+        (tmp_path / "n.tsv").write_text(text, encoding="utf-8")
+        return read_names(tmp_path / "n.tsv")
+
+    assert names("color\tname\tindex\n#ff\tleft thalamus\t10\n") == {10: "left thalamus"}
+    assert names("# No. Name: R G B A\n10  Left-Thalamus  0 118 14 0\n") == {10: "Left-Thalamus"}
+    assert names("10 left thalamus\n4\tbelow it\tB\n") == {10: "left thalamus", 4: "below it"}
+    with pytest.raises(ValueError, match="no line has a number and a name"):
+        names("index\tname\n")
+    assert names_beside(tmp_path / "n.nii.gz") == str(tmp_path / "n.tsv")
+    assert names_beside(tmp_path / "m.nii.gz") is None
+
+
+def test_tables_come_back_as_they_were_written(tmp_path):
+    rows = [("01", 1 / 3, None, "a\tb\nc"), ("02", float("nan"), 5, "")]
+    path, about = write_table(tmp_path / "t.tsv", ("id", "x", "n", "text"), rows, {"x": {"Units": "s"}})
+    assert path.read_text() == "id\tx\tn\ttext\n01\t0.333333333\tn/a\ta b c\n02\tn/a\t5\tn/a\n"
+    assert read_table(path) == [{"id": "01", "x": "0.333333333", "text": "a b c"}, {"id": "02", "n": "5"}]
+    assert json.loads(about.read_text()) == {"x": {"Units": "s"}}
+    for text, words in (("id\tid\n1\t2\n", "different names"), ("id\n1\t2\n", "row 2 has 2 cells"), ("id\n", "0 rows")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=words):
+            read_table(path)
+
+
+# ---------------------------------------------------------------------------------------------------- six images
+
+
+def write_six(folder, field, affine=AFFINE, name="sub-01_model-tensor_param-t{}_dwimap.nii.gz"):
+    paths = []
+    for a, b in ("xx", "xy", "xz", "yy", "yz", "zz"):
+        paths.append(folder / name.format(a + b))
+        nib.save(nib.Nifti1Image(field[..., "xyz".index(a), "xyz".index(b)], affine), paths[-1])
+    return paths
+
+
+def test_six_images_are_the_tensors_that_they_are_the_components_of(tmp_path):
+    paths = write_six(tmp_path, tensors())
+    for given in (paths, paths[::-1], paths[4]):
+        read = read_tensors(given)
+        np.testing.assert_array_equal(read.tensors, tensors())
+        np.testing.assert_allclose(read.affine, AFFINE)
+        assert (read.frame, read.spacing) == ("voxel", (2.0, 2.0, 3.0))
+    ants = write_six(tmp_path, tensors(), name="dt{}.nii")
+    np.testing.assert_array_equal(read_tensors(ants[0]).tensors, tensors())
+    assert [component_of(n) for n in ("a_Dxy.nii", "t_param-tzz_x.nii", "xxl.nii", "maxx.nii")] == [
+        "xy",
+        "zz",
+        None,
+        None,
+    ]
+
+
+def test_six_images_say_by_their_sidecar_along_which_axes_they_are(tmp_path):
+    paths = write_six(tmp_path, tensors())
+    sidecar = tmp_path / "sub-01_model-tensor_param-txx_dwimap.json"
+    for reference, frame in (("xyz", "world"), ("bvec", "fsl"), ("ijk", "voxel")):
+        sidecar.write_text(json.dumps({"OrientationEncoding": {"Reference": reference}}))
+        expected = read_tensors(paths, frame=frame)
+        assert read_tensors(paths).frame == frame
+        np.testing.assert_array_equal(read_tensors(paths).tensors, expected.tensors)
+    # World axes: x is −j, y is i, z is −k here.
+    axes = AFFINE[:3, :3] / [2, 2, 3]
+    np.testing.assert_allclose(read_tensors(paths, frame="world").tensors, axes.T @ tensors() @ axes, atol=1e-15)
+
+
+def test_what_are_not_six_images_is_refused(tmp_path):
+    paths = write_six(tmp_path, tensors())
+    with pytest.raises(ValueError, match="expected six NIfTI images"):
+        read_tensors(paths[:5])
+    with pytest.raises(ValueError, match="Leave it out"):
+        read_tensors(paths, "fsl")
+    nib.save(nib.Nifti1Image(tensors()[..., 0, 0], AFFINE + 0.5 * np.eye(4, k=3)), paths[5])
+    with pytest.raises(ValueError, match=r"tzz.*its affine differs"):
+        read_tensors(paths)
+    nib.save(nib.Nifti1Image(tensors()[:-1, ..., 0, 0], AFFINE), paths[5])
+    with pytest.raises(ValueError, match=r"tzz.*got shape"):
+        read_tensors(paths)
+    paths[5].unlink()
+    with pytest.raises(FileNotFoundError, match=r"not beside it: sub-01_model-tensor_param-tzz_dwimap.nii.gz"):
+        read_tensors(paths[0])
+
+
+def test_the_command_line_takes_six_files(tmp_path, capsys):
+    paths = [str(path) for path in write_six(tmp_path, tensors())]
+    assert main(["convert", *paths, str(tmp_path / "t.nii.gz"), "-q"]) == 0
+    np.testing.assert_allclose(read_tensors(tmp_path / "t.nii.gz").tensors, tensors(), rtol=1e-6)
+    assert main(["info", paths[2], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["shape"] == list(SHAPE)
+    assert main(["info", *paths[:2]]) == 2
+    assert "expected six NIfTI images" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------------------------------------- studies
+
+
+@pytest.fixture
+def study(tmp_path):
+    """Three subjects alike but for the size of their tensors, of which one is in six images; and their labels."""
+    rows = ["participant_id\tfile\tgroup"]
+    for i, scale in enumerate((1.0, 1.5, 0.7), 1):
+        if i == 2:
+            write_six(tmp_path, tensors(scale), name="sub-2_param-t{}.nii.gz")
+        else:
+            save_tensors(tmp_path / f"t{i}.nii.gz", volume(scale))
+        rows.append(f"0{i}\t{'sub-2_param-txx' if i == 2 else f't{i}'}.nii.gz\t{'patient' if i == 3 else 'control'}")
+    (tmp_path / "subjects.tsv").write_text("\n".join(rows) + "\n")
+    labels = np.where(np.indices(SHAPE)[0] < 4, 17, 4)
+    nib.save(nib.Nifti1Image(labels.astype(np.int16), AFFINE), tmp_path / "atlas_dseg.nii.gz")
+    (tmp_path / "atlas_dseg.tsv").write_text("index\tname\n17\tleft half\n4\tright half\n")
+    return tmp_path
+
+
+def command(study, out, *more):
+    given = ["batch", study / "subjects.tsv", "-o", study / out, "--atlas", study / "atlas_dseg.nii.gz", "-k", "8"]
+    return [*map(str, given), "--metric", "inverse", "--slice", "z=1", "--components", "largest", *more]
+
+
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+LAMBDA1 = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume")
+
+
+def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    assert main(command(study, "whole", *LAMBDA1, "-q")) == 0
+    write, count = Study.write_signature, []
+
+    def stop(self, subject, *rest):
+        count.append(subject.name)
+        if len(count) == 2:
+            (self.path(subject, "x").parent).mkdir(parents=True)
+            (self.path(subject, "x").parent / f".{'0' * 12}.left").write_text("half of it")
+            raise KeyboardInterrupt
+        write(self, subject, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Study, "write_signature", stop)
+        assert main(command(study, "stopped", *LAMBDA1, "-q")) == 130
+    assert not (study / "stopped" / "group_regions.tsv").exists()
+    (study / "stopped" / "sub-02" / ".attempt").touch()  # as it is after a crash: then it is the last
+    capsys.readouterr()
+    assert main(command(study, "stopped", *LAMBDA1)) == 0
+    printed = capsys.readouterr().err
+    assert "1 of 3 subjects are done already" in printed
+    assert printed.index("0 of 2: sub-03") < printed.index("1 of 2, ") < printed.index(": sub-02")
+    assert contents(study / "stopped") == contents(study / "whole")
+
+    # λ₁t and the domain's volume take the size of the metric out: the subjects are alike then.
+    rows = table(study / "whole" / "group_regions.tsv")
+    assert [row["participant_id"] for row in rows] == [f"sub-0{i}" for i in (1, 2, 3) for _ in range(4)]
+    assert {row["region"] for row in rows} == {"left half", "right half"}
+    for name in ("mean", "std", "median", "lambda1_t", "volume"):
+        numbers = np.array([float(row[name]) for row in rows]).reshape(3, -1)
+        np.testing.assert_allclose(numbers, np.broadcast_to(numbers[0], numbers.shape), rtol=1e-6)
+    times = np.array([float(row["t"]) for row in rows]).reshape(3, -1)
+    np.testing.assert_allclose(times[1:] / times[0], [[1 / 1.5] * 4, [1 / 0.7] * 4], rtol=1e-6)
+
+    # They are the library's numbers.
+    field = hj.TensorField.from_diffusion(volume().slice("z", 1).grid(), volume().slice("z", 1).tensors, "inverse")
+    values = hj.hks(hj.eigenpairs(field, 8), times[0][:2], "volume")
+    np.testing.assert_allclose([float(r["mean"]) for r in rows[2:4]], np.asarray(values)[:, :4].mean((1, 2)), rtol=1e-7)
+
+    # Again, nothing is computed; with other labels, only the tables.
+    monkeypatch.setattr("hks_jax.cli.study_tasks._compute", None)
+    assert main(command(study, "whole", *LAMBDA1)) == 0
+    assert "3 of 3 subjects are done already" in capsys.readouterr().err
+    nib.save(nib.Nifti1Image(np.full(SHAPE, 3, np.int16), AFFINE), study / "atlas_dseg.nii.gz")
+    assert main(command(study, "whole", *LAMBDA1)) == 0
+    assert {row["index"] for row in table(study / "whole" / "group_regions.tsv")} == {"3"}
+
+
+def test_a_study_is_a_bids_derivative(study, monkeypatch):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    assert main([*command(study, "out", "--times", "3e3", "--only", "sub-01"), "-q"]) == 0
+    out = study / "out"
+    about = json.loads((out / "dataset_description.json").read_text())
+    assert (about["DatasetType"], about["GeneratedBy"][0]["Name"]) == ("derivative", "hks-jax")
+    assert [row["group"] for row in table(out / "participants.tsv")] == ["control", "control", "patient"]
+    assert [row["status"] for row in table(out / "group_summary.tsv")] == ["done", "pending", "pending"]
+    stem = out / "sub-01" / "dwi" / "sub-01_model-tensor_param-hks_dwimap"
+    sidecar = json.loads(stem.with_suffix(".json").read_text())
+    assert (sidecar["Times"], sidecar["Sources"]) == ([3000.0], ["t1.nii.gz"])
+    image = nib.load(stem.with_suffix(".nii.gz"))
+    assert image.shape == (9, 8, 1, 1)
+    assert (out / "sub-01" / "figures" / f"{stem.name}.png").is_file()
+
+    # One result's table by itself is that of the study; on other voxels, labels are refused.
+    atlas = study / "atlas_dseg.nii.gz"
+    assert main(["stats", f"{stem}.npz", "--atlas", str(atlas), "-o", str(study / "r.tsv"), "-q"]) == 0
+    assert (study / "r.tsv").read_text() == stem.with_name("sub-01_model-tensor_param-hks_regions.tsv").read_text()
+    (row,) = (row for row in table(study / "r.tsv") if row["index"] == "17")
+    assert (row["region"], row["voxels"], row["coverage"]) == ("left half", "32", "1")
+    assert float(row["volume"]) == 32 * 12  # mm³
+
+
+def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    lines = (study / "subjects.tsv").read_text().splitlines()
+    bad = ["04\tabsent.nii.gz\tx", "05\tt1.nii.gz\tx\tz=99", "06\tt1.nii.gz\tx\tz=1\tmoved.nii.gz"]
+    (study / "subjects.tsv").write_text("\n".join([lines[0] + "\tslice\tatlas", *bad, lines[3]]) + "\n")
+    nib.save(nib.Nifti1Image(np.ones(SHAPE, np.int16), AFFINE + 0.9 * np.eye(4, k=3)), study / "moved.nii.gz")
+    assert main(command(study, "out", "--times", "3e3")) == 1
+    printed = capsys.readouterr().err
+    assert "3 of 4 subjects failed (sub-04, sub-05, sub-06)" in printed
+    rows = table(study / "out" / "group_summary.tsv")
+    assert [row["status"] for row in rows] == ["failed", "failed", "failed", "done"]
+    for row, words in zip(rows, ("no such file", "0 … 2", "other voxels than the image's"), strict=False):
+        assert words in row["problem"]
+    assert {row["participant_id"] for row in table(study / "out" / "group_regions.tsv")} == {"sub-03"}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("id\tfile\n1\tt.nii\n", "row 2 has no participant_id"),
+        ("participant_id\tfile\nsub-1\ta\n1\tb\n", "sub-1 is there twice"),
+        ("participant_id\tfile\nsub-a_b\ta\n", "letters and digits alone"),
+        ("participant_id,file\n", "separated by tabs"),
+    ],
+)
+def test_a_table_that_is_wrong_for_all_is_refused(tmp_path, capsys, text, words):
+    (tmp_path / "subjects.tsv").write_text(text)
+    assert main(["batch", str(tmp_path / "subjects.tsv"), "-o", str(tmp_path / "out"), "--metric", "inverse"]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_rows_join_the_options_of_the_command(tmp_path):
+    (tmp_path / "subjects.csv").write_text(
+        "participant_id,session_id,file,spacing,b_max,mask,age\n"
+        "01,pre,a.npz,1 2,900,,41\nsub-01,ses-post,/b.npz,,n/a,m.npy,42\n02,pre,c.npz,x,,,\n03,pre,,,,,\n"
+    )
+    words = ["batch", str(tmp_path / "subjects.csv"), "-o", "out", "--erode", "2", "--b-max", "1000"]
+    first, second, bad, empty = read_subjects(tmp_path / "subjects.csv", build_parser().parse_args(words))
+    assert (first.name, first.folder.as_posix(), first.covariates) == (
+        "sub-01_ses-pre",
+        "sub-01/ses-pre",
+        {"age": "41"},
+    )
+    assert (first.arguments.file, first.arguments.spacing) == (tmp_path / "a.npz", [1.0, 2.0])
+    assert (first.arguments.b_max, second.arguments.b_max, second.arguments.erode) == (900, 1000, 2)
+    assert (second.arguments.file, second.arguments.mask) == (Path("/b.npz"), tmp_path / "m.npy")
+    assert (first.arguments.mask, bad.arguments, empty.problem) == (None, None, "the row has no file")
+    assert "--spacing: invalid float value: 'x'" in bad.problem
+
+
+def test_common_times_suit_all_subjects():
+    ranges = {"sub-01": Range(2.0, 50.0), "sub-02": Range(3.0, 80.0)}
+    assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
+    scaled = common_times(ranges, 2, "lambda1")
+    np.testing.assert_allclose(scaled, 4 * np.log(10) * np.array([2 / 50, 1]), rtol=5e-3)
+    with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and sub-01 is flat from t = 3 on"):
+        common_times({"sub-01": Range(2.0, 3.0), "sub-02": Range(4.0, 9.0)}, 3, "scanner")
+
+
+def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, monkeypatch, capsys):
+    def suitable(scale, k, boundary):
+        args = argparse.Namespace(file=Path("t.nii"), metric="inverse", k=k, boundary=boundary)
+        # So many voxels that k, and not their size, limits t; in an image much larger.
+        many = np.zeros((60, 60, 20, 3, 3))
+        many[3:30, 4:28, 5:14] = np.tile(tensors(scale), (3, 3, 3, 1, 1))
+        return np.array(suitable_range(TensorVolume(many, (2.0, 2.0, 3.0), (0.0,) * 3, many[..., 0, 0] > 0), args))
+
+    np.testing.assert_allclose(suitable(2.0, 8, "neumann"), suitable(1.0, 8, "neumann") / 2, rtol=1e-12)
+    np.testing.assert_allclose(suitable(1.0, 8, "mean"), suitable(1.0, 4, "neumann"), rtol=1e-12)
+    side = 54.0  # mm, of the largest axis, along which D is about 1.5e-3 mm²/s
+    assert abs(suitable(1.0, 8, "neumann")[1] / (4 * np.log(10) * (side / np.pi) ** 2 / 1.5e-3) - 1) < 0.3
+    assert suitable(1.0, 1, "neumann")[0] > suitable(1.0, 8, "neumann")[0]
+
+    def times(*more):
+        assert main([*command(study, "out", "--times", "auto:2", *more), "-q"]) == 0
+        return json.loads((study / "out" / "study.json").read_text())["times"]
+
+    monkeypatch.setattr("hks_jax.cli.study_tasks.run_all", lambda *_: {})
+    monkeypatch.setattr(Study, "write_group", lambda *_: [])
+    first = times()
+    with open(study / "subjects.tsv", "a") as stream:
+        stream.write("04\tt1.nii.gz\tcontrol\n05\tt4.nii.gz\tcontrol\n")
+    save_tensors(study / "t4.nii.gz", volume(0.9 * 0.7))
+    assert times() == first
+    other = ("--interpolation", "log-euclidean")
+    assert main(command(study, "out", "--times", "auto:2", *other)) == 2
+    assert 'differs in --interpolation: "linear", now "log-euclidean". Choose' in capsys.readouterr().err
+    assert times("--replace", *other)[0] > first[0]  # chosen anew, of all subjects
+
+
+def test_progress_says_how_long_the_others_take(capsys, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    progress = StudyProgress(4)
+    for seconds in (60, 120):
+        with progress.subject("sub-01"):
+            clock[0] += seconds
+    assert progress.line() == "[##########..........] 2 of 4, about 3 min left"
+    assert "1 of 4, about 3 min left: sub-01" in capsys.readouterr().err
+
+
+def test_on_a_terminal_the_bar_stays_in_its_line():
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    progress = StudyProgress(2)
+    progress.stream = stream
+    with progress.subject("sub-01"), progress.stage("eigenpairs"):
+        progress.update("3 of 8 pairs")
+        progress.warn("it is too coarse")
+    progress.end("done")
+    text = stream.getvalue()
+    assert re.findall(r"\n", text) == ["\n"] * 2
+    assert "\r\x1b[Kwarning: sub-01: it is too coarse\n" in text
+    assert "\r[....................] 0 of 2: sub-01: eigenpairs, 3 of 8 pairs\x1b[K" in text
+
+
+@pytest.mark.slow
+def test_a_killed_study_is_resumed_with_the_same_result(study):
+    """Three volumes in processes of their own, killed once a subject is there; the times are automatic."""
+
+    def start(out):
+        arguments = [word for word in command(study, out, "--boundary", "mean") if word not in ("--slice", "z=1")]
+        return [sys.executable, "-m", "hks_jax", *arguments]
+
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    subprocess.run(start("whole"), check=True, env=environment, capture_output=True, timeout=600)
+    with subprocess.Popen(start("killed"), env=environment, stderr=subprocess.DEVNULL) as process:
+        first = study / "killed" / "sub-01" / "dwi" / "sub-01_model-tensor_param-hks_dwimap.json"
+        end = time.monotonic() + 300
+        while not first.exists() and process.poll() is None and time.monotonic() < end:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert not (study / "killed" / "group_regions.tsv").exists()
+    done = subprocess.run(start("killed"), env=environment, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    assert contents(study / "killed") == contents(study / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (BRAINS / "brain_tensor.nii.gz").exists(), reason=f"no brain data in {BRAINS}")
+def test_tissues_of_a_real_brain_differ_as_the_documentation_says(tmp_path):
+    spec = importlib.util.spec_from_file_location("brain_study", ROOT / "docs" / "brain_study.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    subjects, means = script.write_study(BRAINS, tmp_path), {}
+    for boundary, k in (("neumann", "100"), ("mean", "200")):
+        out = tmp_path / boundary
+        options = ["--metric", "inverse", "--components", "largest", "--normalisation", "flat", "--times", "1.2e5"]
+        given = ["batch", str(subjects), "-o", str(out), "--only", "01", "--boundary", boundary, "-k", k, *options]
+        assert main([*given, "--names", str(tmp_path / "names.tsv"), "-q"]) == 0
+        means[boundary] = {row["region"]: float(row["mean"]) for row in table(out / "group_regions.tsv")}
+    rim, deep, white, fluid = script.REGIONS.values()
+    assert means["neumann"][rim] > 1.9  # the rim doubles the signature
+    assert max(means["mean"][name] for name in (rim, deep, white)) < 1.1
+    assert means["mean"][fluid] < 0.9 < 1 < means["mean"][deep]
+
+
+# ---------------------------------------------------------------------------------------------------- saved pairs
+
+
+@pytest.mark.slow
+def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit(study, monkeypatch):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    other = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume", "--only", "02", "-q")
+    assert main(command(study, "kept", "--times", "3e3", "--only", "02", "--save-pairs", "-q")) == 0
+    assert main(command(study, "direct", *other)) == 0
+    monkeypatch.setattr("hks_jax.cli.study_tasks.compute_pairs", None)
+    assert main(command(study, "kept", "--replace", *other)) == 0
+    kept, direct = contents(study / "kept"), contents(study / "direct")
+    assert len(kept.pop("sub-02/dwi/sub-02_model-tensor_param-hks_pairs.npz")) > 8 * 8 * 72
+    assert kept == direct
+    # Pairs of other settings are none.
+    assert main(command(study, "kept", "--replace", "--interpolation", "log-euclidean", *other)) == 1
+
+
+@pytest.mark.parametrize("boundary", ["neumann", pytest.param("mean", marks=pytest.mark.slow)])
+def test_saved_pairs_give_the_signature_of_other_times_without_another_computation(
+    tmp_path, monkeypatch, capsys, boundary
+):
+    monkeypatch.setattr("hks_jax.cli.picture.draw", lambda result, path, **_: path.write_text("picture"))
+    save_tensors(tmp_path / "t.nii.gz", volume())
+    arguments = ["--metric", "inverse", "--slice", "z=1", "-k", "8", "--boundary", boundary, "-q"]
+
+    def run(source, out, times, *more):
+        return main(["hks", str(source), "-o", str(tmp_path / out), "--times", *times, *more])
+
+    assert run(tmp_path / "t.nii.gz", "first", ["1e4"], *arguments, "--save-pairs") == 0
+    assert run(tmp_path / "t.nii.gz", "other", ["2e4", "5e4"], *arguments, "--normalisation", "flat") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("hks_jax.cli.job.eigenpairs", None)
+        kept = tmp_path / "first" / "pairs.npz"
+        assert run(kept, "again", ["2e4", "5e4"], "--normalisation", "flat", "-q") == 0
+        other, again = (np.load(tmp_path / out / "hks.npz") for out in ("other", "again"))
+        np.testing.assert_allclose(again["hks"], other["hks"], rtol=1e-12)
+        np.testing.assert_array_equal(again["affine"], other["affine"])
+        assert nib.load(tmp_path / "again" / "hks.nii.gz").shape == (9, 8, 1, 2)
+        reports = [json.loads((tmp_path / out / "report.json").read_text()) for out in ("other", "again")]
+        assert reports[0]["input"] == reports[1]["input"]
+        assert reports[0]["settings"] == reports[1]["settings"]
+        assert reports[0]["times"] == reports[1]["times"]
+        capsys.readouterr()
+        assert run(kept, "again", ["2e4"], "-k", "5") == 2
+        assert "-k: " in capsys.readouterr().err
+
+
+def test_pairs_of_another_pencil_are_refused(tmp_path):
+    def pencil(field):
+        return hj.assemble(hj.TensorField(hj.Grid((7, 6)), field))
+
+    plane = 1e3 * tensors()[:7, :6, 0, :2, :2]
+    pairs = hj.eigenpairs(pencil(plane), 6)
+    path = hj.io.save_pairs(tmp_path / "p.npz", pairs)
+    read = hj.io.load_pairs(path, pencil(plane))
+    np.testing.assert_array_equal(hj.hks(read, [5.0, 9.0]), hj.hks(pairs, [5.0, 9.0]))
+    assert read.summary() == pairs.summary()
+    with pytest.raises(ValueError, match="do not solve"):
+        hj.io.load_pairs(path, pencil(1.1 * plane))
+    fewer = {**np.load(path), "vectors": np.ones((6, 41))}
+    with pytest.raises(ValueError, match=r"got .* \(6, 41\); expected \(6, 42\), those of this pencil"):
+        pairs_of("p.npz", fewer, pencil(plane))
+    with pytest.raises(ValueError, match="lacks part"):
+        pairs_of("p.npz", {name: a for name, a in fewer.items() if name != "part"}, pencil(plane))
+    with pytest.raises(ValueError, match=r"ends in \.npz"):
+        hj.io.save_pairs(tmp_path / "p.npy", pairs)
