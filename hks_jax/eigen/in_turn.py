@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from hks_jax.traced import is_traced
 
@@ -22,6 +23,9 @@ def in_turn(function: Callable[..., Any], settings: tuple[Hashable, ...], *args:
         settings: what is static.
         args: pytrees of arrays.
     """
+    if not is_traced((args, jnp.zeros(()))):
+        with jax.core.eval_context():
+            return function(*settings, *args)
     if not is_traced(args):
         return function(*settings, *args)
     # `custom_vmap` takes no static arguments, and so each call has a rule of its own; what it runs is compiled once.

@@ -60,9 +60,9 @@ def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, "
     return jnp.moveaxis(coefficients, 0, -1).reshape(-1)
 
 
-def with_rim(x: Float[Array, "*shape b"], periodic: tuple[bool, ...], first: int = 0) -> Float[Array, "*rimmed b"]:
-    """Return x with a node more at either end of each axis from the ``first`` on: the opposite one's, or zero."""
-    for axis, wraps in enumerate(periodic[first:], start=first):
+def with_rim(x: Float[Array, "*shape"], periodic: tuple[bool, ...], first: int = 0) -> Float[Array, "*rimmed"]:
+    """Return x with a node more at either end of some axes, from the ``first`` on: the opposite one's, or zero."""
+    for axis, wraps in enumerate(periodic, start=first):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
         x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
     return x

@@ -135,7 +135,7 @@ class Slabs:
         x = jnp.pad(x, [(1, 1)] + [(0, 0)] * (x.ndim - 1))
         x = jax.lax.dynamic_update_slice_in_dim(x, below, 0, axis=0)
         x = jax.lax.dynamic_update_slice_in_dim(x, above, place, axis=0)
-        return with_rim(x, self.periodic, first=1)
+        return with_rim(x, self.periodic[1:], first=1)
 
     def own(self, x: Array, axis: int = 0) -> Array:
         """Return this device's slab of an array that every device has whole."""

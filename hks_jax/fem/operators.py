@@ -1,6 +1,7 @@
 """Matrices on grids: stencils."""
 
 from itertools import product
+from operator import add
 
 import equinox as eqx
 import jax
@@ -8,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.fem.columns import stencil
+from hks_jax.fem.columns import stencil, with_rim
 from hks_jax.fem.grid_pattern import GridPattern
 from hks_jax.fem.space import GridSpace, taken
 from hks_jax.linear.operators import OfColumns, PatternedOperator, Places
 
-_ROWS, _LARGE = 8, 1 << 22
+_ROWS, _LARGE = 8, 1 << 18
 """Large arrays are multiplied in blocks of so many rows, written out one by one: the transpose, which sums over the
 rows, is then a fused sum and not a reduction, which XLA does many times slower on CPUs."""
 
@@ -46,9 +47,12 @@ class StencilOperator(PatternedOperator):
         # The shifted copies are made again in the transpose: kept, they would be 3^d arrays of the size of x.
         @jax.checkpoint
         def product_with(some: Float[Array, "*rows_and_shape"]) -> Float[Array, "*rows_and_shape"]:
-            y = jnp.zeros((), x.dtype)
-            for c, offset in zip(coefficients, product((-1, 0, 1), repeat=len(shape)), strict=True):
-                y = y + c * _neighbours(some, offset, self.space.periodic)
+            # Behind the barrier the neighbours are slices of an array, and not what decides of each node where it is.
+            leading, y = some.ndim - len(shape), jnp.zeros((), x.dtype)
+            rimmed, before = jax.lax.optimization_barrier(with_rim(some, self.space.periodic, leading)), (0,) * leading
+            for c, start in zip(coefficients, product((0, 1, 2), repeat=len(shape)), strict=True):
+                stop = tuple(map(add, (*before, *start), some.shape))
+                y = y + c * jax.lax.slice(rimmed, (*before, *start), stop)
             return y
 
         whole = rows.shape[0] - rows.shape[0] % _ROWS
@@ -84,25 +88,3 @@ class StencilOperator(PatternedOperator):
     def diagonal(self) -> Float[Array, " n_dof"]:
         """Return the main diagonal."""
         return self.space.restrict(self.coefficients[self.coefficients.shape[0] // 2])
-
-
-def _neighbours(x: Array, offset: tuple[int, ...], periodic: tuple[bool, ...]) -> Array:
-    """Return the neighbours' values, y[i] = x[i + offset], over the last axes; 0 beyond the grid's sides."""
-    first = x.ndim - len(offset)
-    for axis, (o, wraps) in enumerate(zip(offset, periodic, strict=True), start=first):
-        if o == 0:
-            continue
-        # Padding by −1 on one side and 1 on the other is a shift that XLA fuses with the product.
-        y = _placed(x, axis, -o, o)
-        if wraps:
-            n = x.shape[axis]
-            edge = jax.lax.slice_in_dim(x, 0, 1, axis=axis) if o > 0 else jax.lax.slice_in_dim(x, n - 1, n, axis=axis)
-            y = y + (_placed(edge, axis, n - 1, 0) if o > 0 else _placed(edge, axis, 0, n - 1))
-        x = y
-    return x
-
-
-def _placed(x: Array, axis: int, before: int, after: int) -> Array:
-    return jax.lax.pad(
-        x, jnp.zeros((), x.dtype), [(before, after, 0) if a == axis else (0, 0, 0) for a in range(x.ndim)]
-    )

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients, a block of rows at once, each with a matrix of its own."""
+"""Preconditioned conjugate gradients, a block of columns at once, each with a matrix of its own."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,11 +11,12 @@ MAX_ITERATIONS = 200
 
 
 class _Iteration(NamedTuple):
-    """The state of conjugate gradients for one block of rows."""
+    """The state of conjugate gradients for one block of columns."""
 
-    x: Float[Array, "b n_dof"]
-    r: Float[Array, "b n_dof"]
-    p: Float[Array, "b n_dof"]
+    x: Float[Array, "n_dof b"]
+    r: Float[Array, "n_dof b"]
+    p: Float[Array, "n_dof b"]
+    first: Float[Array, " b"]
     energy: Float[Array, " b"]
     errors: Float[Array, " b"]
     going: Bool[Array, " b"]
@@ -25,38 +26,42 @@ class _Iteration(NamedTuple):
 def conjugate_gradients(
     product: Callable[[Array], tuple[Array, Array]],
     precondition: Callable[[Array], Array],
-    rhs: Float[Array, "b n_dof"],
+    rhs: Float[Array, "n_dof b"],
     wanted: Float[Array, " b"],
-) -> Float[Array, "b n_dof"]:
-    """Solve Aᵢxᵢ = rhsᵢ for a block of rows; NaN where the error asked for is not reached.
+) -> Float[Array, "n_dof b"]:
+    """Solve Aᵢxᵢ = rhsᵢ for a block of columns; NaN where the error asked for is not reached.
 
     Args:
-        product: x ↦ Aᵢxᵢ, and for each row the energy xᵢᵀAᵢxᵢ below which Aᵢ counts as singular.
+        product: x ↦ Aᵢxᵢ, and for each column the energy xᵢᵀAᵢxᵢ below which Aᵢ counts as singular.
         precondition: r ↦ an approximation of Aᵢ⁻¹rᵢ, symmetric and positive definite.
         rhs: the right-hand sides.
-        wanted: the error in the energy norm, relative; rows of which it is infinite stay zero.
+        wanted: the error in the energy norm, relative; columns of which it is infinite stay zero.
     """
 
     def going_on(state: _Iteration) -> Bool[Array, ""]:
         return jnp.any(state.going) & (state.steps < MAX_ITERATIONS)
 
+    # The residual, preconditioned, tells the error before a step. That the step reduces it as the one before did saves
+    # the preconditioner, which costs the most, once more than it takes steps.
     def step(state: _Iteration) -> _Iteration:
-        x, r, p, energy, errors, going, steps = state
-        image, least = product(p)
-        curvature = jnp.sum(p * image, axis=1)
-        regular = curvature > least
-        length = jnp.where(going & regular, energy / jnp.where(regular, curvature, 1), 0)[:, None]
-        x, r = x + length * p, r - length * image
+        x, r, p, first, before, errors, going, steps = state
         z = precondition(r)
-        following = jnp.sum(r * z, axis=1)
-        error = jnp.where(regular, jnp.sqrt(jnp.abs(following) / first) / wanted, jnp.inf)
+        energy = jnp.sum(r * z, axis=0)
+        first = jnp.where(steps == 0, energy, first)
+        change = jnp.where(going & (steps > 0), energy / before, 0)
+        p = jnp.where(going, z + change * p, p)
+        image, least = product(p)
+        curvature = jnp.sum(p * image, axis=0)
+        regular = curvature > least
+        length = jnp.where(going & regular, energy / jnp.where(regular, curvature, 1), 0)
+        reduction = jnp.where(steps > 0, jnp.sqrt(jnp.minimum(jnp.abs(change), 1)), 1)
+        error = jnp.where(regular, jnp.sqrt(jnp.abs(energy) / first) * reduction / wanted, jnp.inf)
         errors = jnp.where(going, error, errors)
-        p = z + jnp.where(going, following / jnp.where(going, energy, 1), 0)[:, None] * p
-        return _Iteration(x, r, p, following, errors, going & regular & (error > 1), steps + 1)
+        going = going & regular & (error > 1)
+        return _Iteration(x + length * p, r - length * image, p, first, energy, errors, going, steps + 1)
 
-    z = precondition(rhs)
-    first = jnp.sum(rhs * z, axis=1)
-    asked = jnp.isfinite(wanted)
-    start = _Iteration(jnp.zeros_like(rhs), rhs, z, first, jnp.where(asked, jnp.inf, 0), asked, jnp.zeros((), int))
+    asked, none = jnp.isfinite(wanted), jnp.ones_like(wanted)
+    errors = jnp.where(asked, jnp.inf, 0)
+    start = _Iteration(jnp.zeros_like(rhs), rhs, rhs, none, none, errors, asked, jnp.zeros((), int))
     end = jax.lax.while_loop(going_on, step, start)
-    return jnp.where((end.errors <= 1)[:, None], end.x, jnp.nan)
+    return jnp.where(end.errors <= 1, end.x, jnp.nan)

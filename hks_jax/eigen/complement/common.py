@@ -36,13 +36,14 @@ def attainable(tolerance: float, dtype: Any) -> float:
 
 def definite_product(
     pencil: SymmetricPencil, shifts: Float[Array, " b"], beyond: Float[Array, ""]
-) -> Callable[[Float[Array, "b n"]], tuple[Float[Array, "b n"], Float[Array, " b"]]]:
+) -> Callable[[Float[Array, "n b"]], tuple[Float[Array, "n b"], Float[Array, " b"]]]:
     """Return x ↦ (K − λᵢM) xᵢ, with the energy below which an eigenvalue equal to λᵢ is left on the complement."""
+    stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
 
-    def product(x: Float[Array, "b n"]) -> tuple[Float[Array, "b n"], Float[Array, " b"]]:
-        image = pencil.mass.apply(x)
-        energy = (x * image).sum(axis=1)
-        return pencil.stiffness.apply(x) - shifts[:, None] * image, SINGULAR * beyond * energy
+    def product(x: Float[Array, "n b"]) -> tuple[Float[Array, "n b"], Float[Array, " b"]]:
+        image = mass(x)
+        energy = (x * image).sum(axis=0)
+        return stiffness(x) - shifts * image, SINGULAR * beyond * energy
 
     return product
 

@@ -28,11 +28,11 @@ from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, inner_products
+from hks_jax.linear.products import combine, inner_products, products_with_columns
 
 _BLOCK = 16
 """Rows solved at once."""
-_WINDOW = 64
+_WINDOW = 32
 """Eigenvectors next to a shift that every step takes out."""
 _MEMORY = 5e8
 """Bytes that factorisations may take together."""
@@ -117,16 +117,17 @@ def _solve(
         factor = Factorisation(factors.dissection, *matrices)
 
         nearest = jnp.clip(factor.negative - window // 2, 0, values.size - window)
-        near, near_images = (jax.lax.dynamic_slice_in_dim(x, nearest, window) for x in (vectors, images))
+        near, near_images = (
+            jax.lax.dynamic_slice_in_dim(x, nearest, window) for x in (vectors, images)
+        )
 
         # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
         # next to σ alone, which is why no others are taken out before the end.
         def precondition(r: Array) -> Array:
-            z = factor.solve(r)
-            return z - combine(inner_products(near_images, z), near)
+            z = factor.solve_columns(r)
+            return (z - combine(products_with_columns(near_images, z).T, near).T)
 
-        x = conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
-        return x - combine(inner_products(images, x), vectors)
+        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
     parts = (
         jnp.asarray(of_block),
@@ -134,7 +135,8 @@ def _solve(
         jnp.pad(left, ((0, spare), (0, 0))).reshape(blocks, _BLOCK, -1),
         jnp.pad(wanted, (0, spare), constant_values=jnp.inf).reshape(blocks, _BLOCK),
     )
-    return jax.lax.map(solve_block, parts).reshape(blocks * _BLOCK, -1)[:k]
+    x = jax.lax.map(solve_block, parts).reshape(blocks * _BLOCK, -1)[:k]
+    return x - combine(inner_products(images, x), vectors)
 
 
 def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> _Groups:
