@@ -24,8 +24,8 @@ SINGULAR = 1e-8
 
 _LEAST = 100
 """What rounding leaves of a row that should vanish, in units of ε of what the row was; and the finest tolerance."""
-_FACTORISATION = 100
-"""What one factorisation costs, in solves of one row."""
+_FACTORISATION = 200
+"""What one factorisation costs, in solves of one row: about 100, doubled as small rows take few steps."""
 _MOST_GROUPS = 16
 
 

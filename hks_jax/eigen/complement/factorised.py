@@ -61,7 +61,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
     """
 
-    tolerance: float = eqx.field(default=1e-9, static=True)
+    tolerance: float = eqx.field(default=1e-8, static=True)
 
     def prepare(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Factorisation:
         """Factorise K − σM for each group of the first k of p eigenvalues; the results are stacked."""
@@ -117,15 +117,13 @@ def _solve(
         factor = Factorisation(factors.dissection, *matrices)
 
         nearest = jnp.clip(factor.negative - window // 2, 0, values.size - window)
-        near, near_images = (
-            jax.lax.dynamic_slice_in_dim(x, nearest, window) for x in (vectors, images)
-        )
+        near, near_images = (jax.lax.dynamic_slice_in_dim(x, nearest, window) for x in (vectors, images))
 
         # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
         # next to σ alone, which is why no others are taken out before the end.
         def precondition(r: Array) -> Array:
             z = factor.solve_columns(r)
-            return (z - combine(products_with_columns(near_images, z).T, near).T)
+            return z - combine(products_with_columns(near_images, z).T, near).T
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 

@@ -94,12 +94,12 @@ def _solve(
         shifts, references, b, wanted = args
         degree = jnp.ceil(jnp.clip(degree_for(band, jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
-        def precondition(r: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
-            columns = to_columns(space.extend(r, outside=0.0).reshape(r.shape[0], -1), level.shape)
+        def precondition(r: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+            columns = to_columns(space.extend(r.T, outside=0.0).reshape(r.shape[1], -1), level.shape)
             z = correction(level, periodic, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
-            return without_known(-space.restrict(to_rows(z).reshape(-1, *level.shape)))
+            return without_known(-space.restrict(to_rows(z).reshape(-1, *level.shape))).T
 
-        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
+        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
     left = rhs - combine(inner_products(vectors, rhs), images)
     wanted = wanted_errors(rhs, left, pencil.mass.diagonal(), values, tolerance, rhs.dtype)
