@@ -104,3 +104,14 @@ def test_tolerances_of_fits_compile_nothing_anew(optimiser):
         fine = fit(1e-5)
     assert not seen
     assert len(fine.history) > len(rough.history)
+
+
+@pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")  # of so few pairs
+def test_plain_derivatives_use_the_solver_as_it_was_compiled(rng):
+    grid, solver = hj.Grid((9, 11)), hj.BlockLanczos(block=2)
+    tensors = jnp.asarray(random_spd(rng, grid.shape))
+    solver.lowest(hj.assemble(hj.TensorField(grid, tensors)), 4 + solver.guards(4, 99))
+    with compilations() as seen:
+        jax.grad(lambda x: hj.hks(hj.eigenpairs(hj.TensorField(grid, x), 4, solver=solver), [0.5]).sum())(tensors)
+    assert seen
+    assert not any("_eliminate" in name or "_advance" in name for name in seen), seen

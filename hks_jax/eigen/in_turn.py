@@ -1,5 +1,6 @@
 """Batches of eigenproblems: one after another where a device gains nothing from taking them together."""
 
+import contextlib
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import Any
@@ -23,11 +24,11 @@ def in_turn(function: Callable[..., Any], settings: tuple[Hashable, ...], *args:
         settings: what is static.
         args: pytrees of arrays.
     """
-    if not is_traced((args, jnp.zeros(()))):
-        with jax.core.eval_context():
-            return function(*settings, *args)
     if not is_traced(args):
-        return function(*settings, *args)
+        # Of a derivative taken plainly, JAX would compile the known part anew. Where an operation on constants gives a
+        # tracer, all of it belongs to a computation to come.
+        with contextlib.nullcontext() if is_traced(jnp.zeros(())) else jax.core.eval_context():
+            return function(*settings, *args)
     # `custom_vmap` takes no static arguments, and so each call has a rule of its own; what it runs is compiled once.
     problem = jax.custom_batching.custom_vmap(partial(function, *settings))
 

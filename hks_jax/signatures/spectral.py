@@ -112,7 +112,9 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return value, reduce(operator.add, terms) if terms else jnp.zeros_like(value)
 
 
+# The transpose computes again what it needs: kept, that would be two copies of the eigenvectors.
 @jax.jit
+@jax.checkpoint
 def _tangent(
     contraction: Contraction,
     filters: Filter,
