@@ -112,7 +112,7 @@ assert after < before / 2
 # %%
 predicted = signature(network(unseen[0]))
 figure = hj.plot.new_figure(9.5, 5.2)
-for row, panels in zip(figure.subplots(2, 3), (unseen[0], predicted), strict=True):
+for row, name, panels in zip(figure.subplots(2, 3), ("given", "from the network"), (unseen[0], predicted), strict=True):
     for ax, t, panel in zip(row, times, panels, strict=True):
-        hj.plot.scalar_image(ax, grid, jnp.exp(panel), centre=1)
-        ax.set_title(f"{'given' if panels is unseen[0] else 'from the network'}, t = {t:g}")
+        hj.plot.scalar_image(ax, jnp.exp(panel), grid, centre=1)
+        ax.set_title(f"{name}, t = {t:g}")
