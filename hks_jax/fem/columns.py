@@ -72,8 +72,8 @@ def product_with_rim(together: Float[Array, " entries"], x: Float[Array, "*rimme
     """Return the product with columns whose neighbours beyond all sides are there; coefficients `side_by_side`."""
     coefficients = together.reshape(*(n - 2 for n in x.shape[:-1]), -1)
     y = jnp.zeros((), x.dtype)
-    for o, neighbours in enumerate(_neighbours(x)):
-        y = y + coefficients[..., o, None] * neighbours
+    for o, shifted in enumerate(neighbours(x, 0, x.ndim - 1)):
+        y = y + coefficients[..., o, None] * shifted
     return y
 
 
@@ -81,14 +81,17 @@ def stencil_outer(
     p: Float[Array, "*shape b"], x: Float[Array, "*shape b"], periodic: tuple[bool, ...]
 ) -> Float[Array, "offsets *shape"]:
     """Return Σ_b p[i, b] x[i + o, b] for every offset: the derivative of Σ_b pᵀCx by the coefficients of C."""
-    return jnp.stack([jnp.sum(p * neighbours, axis=-1) for neighbours in _neighbours(with_rim(x, periodic))])
+    rimmed = with_rim(x, periodic)
+    return jnp.stack([jnp.sum(p * shifted, axis=-1) for shifted in neighbours(rimmed, 0, len(periodic))])
 
 
-def _neighbours(x: Float[Array, "*rimmed b"]) -> Iterator[Float[Array, "*shape b"]]:
-    """Go through the columns shifted by each offset, given with their rim."""
-    for start in product((0, 1, 2), repeat=x.ndim - 1):
-        stop = [s + n - 2 for s, n in zip(start, x.shape[:-1], strict=True)]
-        yield jax.lax.slice(x, (*start, 0), (*stop, x.shape[-1]))
+def neighbours(x: Float[Array, "*rimmed"], first: int, dimension: int) -> Iterator[Float[Array, "*shape"]]:
+    """Go through x shifted by each offset along so many axes from the ``first`` on, which are given with their rim."""
+    before, after = (0,) * first, (0,) * (x.ndim - first - dimension)
+    shape = [n - 2 if first <= axis < first + dimension else n for axis, n in enumerate(x.shape)]
+    for start in product((0, 1, 2), repeat=dimension):
+        start = (*before, *start, *after)
+        yield jax.lax.slice(x, start, [s + n for s, n in zip(start, shape, strict=True)])
 
 
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:

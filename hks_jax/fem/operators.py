@@ -1,15 +1,12 @@
 """Matrices on grids: stencils."""
 
-from itertools import product
-from operator import add
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.fem.columns import stencil, with_rim
+from hks_jax.fem.columns import neighbours, stencil, with_rim
 from hks_jax.fem.grid_pattern import GridPattern
 from hks_jax.fem.space import GridSpace, taken
 from hks_jax.linear.operators import OfColumns, PatternedOperator, Places
@@ -48,11 +45,10 @@ class StencilOperator(PatternedOperator):
         @jax.checkpoint
         def product_with(some: Float[Array, "*rows_and_shape"]) -> Float[Array, "*rows_and_shape"]:
             # Behind the barrier the neighbours are slices of an array, and not what decides of each node where it is.
-            leading, y = some.ndim - len(shape), jnp.zeros((), x.dtype)
-            rimmed, before = jax.lax.optimization_barrier(with_rim(some, self.space.periodic, leading)), (0,) * leading
-            for c, start in zip(coefficients, product((0, 1, 2), repeat=len(shape)), strict=True):
-                stop = tuple(map(add, (*before, *start), some.shape))
-                y = y + c * jax.lax.slice(rimmed, (*before, *start), stop)
+            first, y = some.ndim - len(shape), jnp.zeros((), x.dtype)
+            rimmed = jax.lax.optimization_barrier(with_rim(some, self.space.periodic, first))
+            for c, shifted in zip(coefficients, neighbours(rimmed, first, len(shape)), strict=True):
+                y = y + c * shifted
             return y
 
         whole = rows.shape[0] - rows.shape[0] % _ROWS

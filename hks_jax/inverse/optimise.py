@@ -49,22 +49,19 @@ def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
     return everything, _Told(values, misfit + jnp.sum(penalties**2) / 2, misfit, unknown)
 
 
-@eqx.filter_custom_jvp
-def _objective(values: Values, problem: Problem) -> tuple[Float[Array, ""], _Told]:
+def _half_squares(values: Values, problem: Problem) -> tuple[Float[Array, ""], _Told]:
     residuals, told = _residuals(values, problem)
     return jnp.sum(residuals**2) / 2, told
+
+
+_objective = eqx.filter_custom_jvp(_half_squares)
 
 
 @_objective.def_jvp
 def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
     """Compute the gradient with the value, so that it can be told: whoever differentiates needs it anyway."""
     (values, problem), (direction, _) = primals, tangents
-
-    def objective(values: Values) -> tuple[Float[Array, ""], _Told]:
-        residuals, told = _residuals(values, problem)
-        return jnp.sum(residuals**2) / 2, told
-
-    (value, told), gradient = jax.value_and_grad(objective, has_aux=True)(values)
+    (value, told), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
     told = _Told(told.values, told.loss, told.misfit, jnp.linalg.norm(jnp.ravel(gradient)))
     return (value, told), (jnp.sum(gradient * direction), jax.tree.map(jnp.zeros_like, told))
 
