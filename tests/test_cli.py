@@ -22,6 +22,7 @@ from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.arguments import Times, parse_boundary, parse_times
 from hks_jax.cli.bar import bar, duration
+from hks_jax.cli.boundary import default_boundary
 from hks_jax.cli.cache import cache_folder
 from hks_jax.cli.picture import away_from_rim, bounding_box
 from hks_jax.cli.progress import Progress
@@ -86,18 +87,25 @@ def one_error(capsys, code, *words):
 
 def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
     out = tmp_path / "deep" / "out"
-    assert main(["hks", str(npz), "-o", str(out), "-k", "25", "--times", "0.5,2", "8"]) == 0
+    assert main(["hks", str(npz), "-o", str(out), "-k", "25", "--times", "0.7,2", "8"]) == 0
     assert sorted(file.name for file in out.iterdir()) == QUIET_FILES
     captured = capsys.readouterr()
     assert captured.out.split() == [str(out / name) for name in QUIET_FILES]
-    for stage in ("reading", "assembly", "eigenpairs: 25 of", "signature", "writing"):
+    for stage in (
+        "reading",
+        "boundary mean (the domain has a mask",
+        "assembly",
+        "eigenpairs: 25 of",
+        "signature",
+        "writing",
+    ):
         assert stage in captured.err
 
     grid = hj.Grid(SHAPE, (0.5, 0.25), (1.0, 2.0), disc())
-    expected = hj.hks(hj.eigenpairs(hj.TensorField(grid, metric()), 25), [0.5, 2.0, 8.0])
+    expected = hj.hks(hj.eigenpairs(hj.TensorField(grid, metric()), 25, "mean"), [0.7, 2.0, 8.0])
     with np.load(out / "hks.npz") as read:
         np.testing.assert_allclose(read["hks"], expected, rtol=1e-9)
-        np.testing.assert_array_equal(read["times"], [0.5, 2, 8])
+        np.testing.assert_array_equal(read["times"], [0.7, 2, 8])
         np.testing.assert_array_equal(read["mask"], disc())
         np.testing.assert_array_equal(read["input_tensors"], metric().astype(np.float32))
         assert read["eigenvalues"].shape == (25,)
@@ -116,7 +124,7 @@ def test_report_says_what_was_done(npz, tmp_path, capsys):
         "metric": "tensor",
         "interpolation": "linear",
         "k": 25,
-        "boundary": "neumann",
+        "boundary": "mean",
         "times": "explicit",
         "components": "raise",
         "solver": "auto",
@@ -143,6 +151,23 @@ def test_report_says_what_was_done(npz, tmp_path, capsys):
     assert {"reading", "assembly", "eigenpairs", "signature"} <= set(report["seconds"])
 
 
+def test_a_masked_domain_has_the_mean_where_there_is_one():
+    whole, corner, strip = np.ones((5, 6), bool), np.ones((5, 6), bool), np.zeros((5, 6), bool)
+    corner[0, 0] = False
+    strip[2:4] = True
+    for inside, boundary, why in (
+        (whole, "neumann", "no mask"),
+        (corner, "mean", "a mask"),
+        (strip, "neumann", "thin"),
+    ):
+        found, said = default_boundary(inside)
+        assert (found, why in said) == (boundary, True)
+        field = hj.TensorField(hj.Grid((5, 6), mask=inside), metric((5, 6)))
+        assert hj.assemble(field, found).space.n_dof == inside.sum()
+    with pytest.raises(ValueError, match="every node of the domain is on a Dirichlet side or rim"):
+        hj.assemble(field, "mean")
+
+
 @pytest.mark.slow
 def test_method_auto_reports_which_times_came_from_where(npz, tmp_path):
     out = tmp_path / "out"
@@ -155,7 +180,7 @@ def test_method_auto_reports_which_times_came_from_where(npz, tmp_path):
     assert method["agreement"]["difference"] < 1e-4
     field = hj.TensorField(hj.Grid(SHAPE, (0.5, 0.25), (1.0, 2.0), disc()), metric())
     with np.load(out / "hks.npz") as read:
-        np.testing.assert_allclose(read["hks"][:1], hj.hks_spectrum_free(field, [0.1]), rtol=1e-3)
+        np.testing.assert_allclose(read["hks"][:1], hj.hks_spectrum_free(field, [0.1], boundary="mean"), rtol=1e-3)
 
 
 def test_nifti_slice_end_to_end_keeps_the_affine(nifti, tmp_path):
@@ -189,7 +214,8 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
 
     tensors = read_tensors(nifti).tensors.astype(float)
     grid = hj.Grid((*SHAPE, 5), (2.0, 2.0, 3.0), mask=mask)
-    expected = hj.hks(hj.eigenpairs(hj.TensorField.from_diffusion(grid, tensors, "inverse"), 12), [20000.0, 50000.0])
+    field = hj.TensorField.from_diffusion(grid, tensors, "inverse")
+    expected = hj.hks(hj.eigenpairs(field, 12, "mean"), [20000.0, 50000.0])
     with np.load(out / "hks.npz") as read:
         np.testing.assert_allclose(read["hks"], expected, rtol=1e-5)  # the file's tensors are float32
         np.testing.assert_array_equal(read["mask"], mask)
@@ -270,7 +296,7 @@ def test_options_reach_the_computation(npz, tmp_path, extra):
             with np.load(npz) as read:
                 grid = hj.Grid(SHAPE, read["spacing"].tolist(), mask=hj.io.erode(read["mask"], 1))
                 field = hj.TensorField.from_diffusion(grid, read["tensors"], "adjugate", interpolation=value)
-            assert pairs["last"] == pytest.approx(float(hj.eigenpairs(field, 10).eigenvalues[-1]), rel=1e-9)
+            assert pairs["last"] == pytest.approx(float(hj.eigenpairs(field, 10, "mean").eigenvalues[-1]), rel=1e-9)
         if option == "--dtype":
             assert dtype == np.float32
 
@@ -647,6 +673,14 @@ def write_target(path, values, **changes):
     arrays = {"hks": values, "times": FIT_TIMES, "spacing": FIT_GRID.spacing, "origin": FIT_GRID.origin, **changes}
     np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
     return path
+
+
+def test_a_fit_has_the_boundary_that_its_target_says(conformal, tmp_path):
+    _, values = conformal
+    record = json.dumps({"settings": {"boundary": [["dirichlet", "mean"], "neumann"]}})
+    said = fit.read_target(write_target(tmp_path / "said.npz", values, provenance=record))
+    assert said.boundary == (("dirichlet", "mean"), "neumann")
+    assert fit.read_target(write_target(tmp_path / "unsaid.npz", values)).boundary is None
 
 
 @pytest.mark.slow

@@ -146,6 +146,24 @@ def test_the_times_that_info_names_are_those_of_the_spectrum(tmp_path, capsys):
     assert suits["k_for_least_time"] == pytest.approx(needed, rel=0.2)
 
 
+def test_what_info_names_of_a_masked_domain_is_of_its_pieces_and_of_the_mean(tmp_path, capsys):
+    def suits(shape, corner):
+        mask = np.zeros(shape, bool)
+        mask[corner : corner + 30, corner : corner + 24] = mask[-4:, -4:] = True
+        np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (*shape, 2, 2)), mask=mask)
+        assert main(["info", str(tmp_path / "t.npz"), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["boundary"] == "mean"
+        return found["suits"]["tensor"]
+
+    assert suits((90, 80), 3) == (small := suits((45, 40), 1))
+    assert small["largest_time"] == pytest.approx(4 * np.log(10) * (29 / np.pi) ** 2)
+    grid = hj.Grid((30, 24))
+    values = hj.eigenpairs(hj.TensorField(grid, np.broadcast_to(np.eye(2), (30, 24, 2, 2))), 200, "mean").eigenvalues
+    assert small["largest_time"] == pytest.approx(4 * np.log(10) / float(values[1]), rel=0.01)
+    assert small["least_time_of_k"] == pytest.approx(4.6 / float(values[-1]), rel=0.25)
+
+
 def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
     field = np.broadcast_to(np.eye(2), (6, 6, 2, 2)).copy()
     field[2, 2] *= -1

@@ -253,7 +253,7 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
 
     # They are the library's numbers.
     field = hj.TensorField.from_diffusion(volume().slice("z", 1).grid(), volume().slice("z", 1).tensors, "inverse")
-    values = hj.hks(hj.eigenpairs(field, 8), times[0][:2], "volume")
+    values = hj.hks(hj.eigenpairs(field, 8, "mean"), times[0][:2], "volume")
     np.testing.assert_allclose([float(r["mean"]) for r in rows[2:4]], np.asarray(values)[:, :4].mean((1, 2)), rtol=1e-7)
 
     # Again, nothing is computed; with other labels, only the tables.
@@ -452,6 +452,22 @@ def test_tissues_of_a_real_brain_differ_as_the_documentation_says(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsys):
+    def boundary(out, *more):
+        assert main(command(study, out, "--times", "3e3", *more)) == 0
+        return json.loads((study / out / "study.json").read_text())["settings"]["boundary"]
+
+    monkeypatch.setattr("hks_jax.cli.study_tasks.run_all", lambda *_: {})
+    monkeypatch.setattr(Study, "write_group", lambda *_: [])
+    assert boundary("new") == "mean"
+    assert "boundary mean (of all subjects alike" in capsys.readouterr().err
+    assert boundary("old", "--boundary", "neumann:dirichlet,neumann") == [["neumann", "dirichlet"], "neumann"]
+    assert boundary("old") == [["neumann", "dirichlet"], "neumann"]
+    assert main(command(study, "old", "--times", "3e3", "--boundary", "mean")) == 2
+    assert "differs in --boundary" in capsys.readouterr().err
+    assert boundary("old", "--replace") == "mean"
+
+
 def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit(study, monkeypatch):
     monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
     other = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume", "--only", "02", "-q")

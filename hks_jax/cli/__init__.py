@@ -20,7 +20,7 @@ examples:
   hks-jax demo
   hks-jax info tensor.nii.gz
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
-  hks-jax batch subjects.tsv -o study --metric inverse --boundary mean --atlas atlas.nii.gz
+  hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
   hks-jax hks --help
 """
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hks_jax.cli.arguments import Times, parse_times
+from hks_jax.cli.boundary import MEAN, recorded_boundary
 from hks_jax.cli.hks import add_signature_arguments, settings_of
 from hks_jax.cli.inputs import (
     add_eigenpair_arguments,
@@ -18,6 +19,8 @@ from hks_jax.cli.inputs import (
 from hks_jax.cli.stats import add_atlas_arguments
 from hks_jax.cli.study_progress import StudyProgress
 from hks_jax.cli.subjects import FILES, OPTIONS, Subject, read_subjects
+from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.io.tables import read_json
 
 if TYPE_CHECKING:
     from hks_jax.cli.study import Study
@@ -46,7 +49,7 @@ was of other files.
 
 EPILOG = """\
 examples:
-  hks-jax batch subjects.tsv -o study --metric inverse --boundary mean --normalisation flat --atlas atlas.nii.gz
+  hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --times 20 40 80 160 --only sub-07 sub-08
 """
 
@@ -64,7 +67,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("subjects", metavar="SUBJECTS", type=Path, help="the table of subjects")
     add("-o", "--output", metavar="DIR", type=Path, required=True, help="the study's folder")
     add_tensor_options(parser)
-    add_eigenpair_arguments(parser)
+    add_eigenpair_arguments(parser, "that of the study in DIR, else mean, for all subjects alike")
     add_signature_arguments(parser)
     add(
         "--time-unit",
@@ -98,7 +101,9 @@ def run(args: argparse.Namespace) -> None:
     from hks_jax.cli.outputs import check_folder
     from hks_jax.cli.study_tasks import run_all
 
-    times = parse_times(args.times)
+    times, chosen_here = parse_times(args.times), args.boundary is not None
+    if not chosen_here:
+        args.boundary = _settled_boundary(args)
     subjects = read_subjects(args.subjects, args)
     chosen = _only(subjects, args.only)
     for subject in chosen:
@@ -109,6 +114,8 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--names: it names labels; pass --atlas too, or a column atlas in the table")
     check_folder(args.output)
     progress = StudyProgress(len(chosen), args.quiet)
+    if not chosen_here:
+        progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
     with progress.catching_warnings():
         study = _open(args, times, subjects, progress)
         study.write_description(subjects, _text(times))
@@ -129,6 +136,15 @@ def run(args: argparse.Namespace) -> None:
         )
 
 
+def _settled_boundary(args: argparse.Namespace) -> BoundarySpec:
+    """Return the boundary of a study that is given none: its own if it is there already, else the mean.
+
+    Subjects are compared, and so have the same boundary, with or without a mask.
+    """
+    before = {} if args.replace else read_json(args.output / "study.json")
+    return recorded_boundary(before.get("settings", {})) or MEAN
+
+
 def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> "Study":
     """Return the study, its times settled: as given, or as it has them already, or as they suit all subjects.
 
@@ -136,7 +152,6 @@ def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progr
         ValueError: the folder is a study of other settings, which is not to be replaced.
     """
     from hks_jax.cli.study import Study, reading_options
-    from hks_jax.io.tables import read_json
 
     settings = settings_of(args, times, args.metric or "tensor")
     study = Study(args.output, settings, args.time_unit, reading_options(args), args.save_pairs)

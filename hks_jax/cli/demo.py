@@ -31,7 +31,7 @@ RIM = 2
 SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
 """How far the heat has spread, √(Dt), at the times drawn: in voxels, from what they resolve to the brain's size."""
 N_PAIRS = 600
-"""Of the two problems under "mean": enough for the first of these times."""
+"""Of the two problems whose mean it is: enough for the first of these times."""
 PHANTOM_SHAPE = (72, 80)
 
 
@@ -71,7 +71,6 @@ def run(args: argparse.Namespace) -> None:
             metric="inverse",
             components="largest",
             k=N_PAIRS,
-            boundary="mean",  # else the rim's glow covers all at large times
             times=Times(tuple(times.tolist()), 0),
             normalisation="flat",
         )

@@ -1,6 +1,7 @@
 """``hks-jax fit TARGET -o OUT``: the metric that has a given heat kernel signature."""
 
 import argparse
+import json
 import math
 import sys
 from dataclasses import replace
@@ -11,9 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.arguments import parse_boundary
+from hks_jax.cli.boundary import NATURAL, recorded_boundary, unreached_sides
+from hks_jax.cli.explore import About
 from hks_jax.cli.inputs import add_interpolation_argument, add_json_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
+from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, read_tensors, save, save_tensors
 from hks_jax.io.masks import as_mask
 from hks_jax.io.provenance import digest
@@ -50,11 +54,13 @@ class Target(NamedTuple):
         values: (n_times, *shape).
         times: (n_times,).
         volume: the identity on the grid of the values: the flat metric, and where it lies in space.
+        boundary: what the signature was computed with, where the file says it.
     """
 
     values: Float[np.ndarray, "n_times *shape"]
     times: Float[np.ndarray, " n_times"]
     volume: TensorVolume
+    boundary: BoundarySpec | None
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -88,9 +94,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add(
         "--boundary",
         type=parse_boundary,
-        default="neumann",
         metavar="B",
-        help="the target's, written as for 'hks-jax hks' (default neumann)",
+        help="the target's, written as for 'hks-jax hks' (default what TARGET says of itself, else neumann)",
     )
     add(
         "-k",
@@ -137,7 +142,7 @@ def run(args: argparse.Namespace) -> None:
             "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors D, which are no metric"
         )
 
-    from hks_jax.cli.job import ComputationError, unreached_sides, use_dtype
+    from hks_jax.cli.job import ComputationError, use_dtype
     from hks_jax.cli.outputs import check_folder, show_files
     from hks_jax.inverse.fit import fit_metric
     from hks_jax.inverse.metric_fit import RESULTS
@@ -152,6 +157,10 @@ def run(args: argparse.Namespace) -> None:
             # The mask is the domain of a signature that was computed: its pieces were wanted.
             grid = target.volume.grid(components="all")
             init = _initial(args, target, grid, progress)
+            if args.boundary is None:
+                args.boundary = NATURAL if target.boundary is None else target.boundary
+                origin = "the target says none" if target.boundary is None else "the target's"
+                progress.note(f"boundary {json.dumps(args.boundary)} ({origin})")
         for message in unreached_sides(grid.inside, args.boundary):
             progress.warn(message)
         regularisers: list[Regulariser] = []
@@ -220,7 +229,7 @@ def read_target(path: Path) -> Target:
         source=str(path),
         digest=digest(path),
     )
-    return Target(values, times, volume)
+    return Target(values, times, volume, recorded_boundary(About.of(arrays).settings))
 
 
 def _weight(text: str) -> float:

@@ -63,7 +63,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add_tensor_arguments(parser)
-    add_eigenpair_arguments(parser)
+    add_eigenpair_arguments(parser, "mean where the domain has a mask, else neumann; of a mesh neumann")
     add(
         "--through",
         type=parse_voxel,
@@ -159,7 +159,7 @@ def run(args: argparse.Namespace) -> None:
             if args.through is not None:
                 _check_voxel(args.through, volume)
             if not saved:
-                field, pairs = compute_pairs(volume, settings, progress)
+                field, pairs, settings = compute_pairs(volume, settings, progress)
             if args.save_pairs:  # at once: what comes after may fail, or be interrupted
                 with progress.stage("writing", str(args.output / saved_pairs.NAME)):
                     domain = volume.with_mask(field.grid.mask)

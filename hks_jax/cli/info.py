@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from hks_jax.cli.arguments import DEFAULT_K, RESOLVED
+from hks_jax.cli.boundary import MEAN, default_boundary, n_problems
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.cli.spelling import READING, as_options
@@ -18,6 +20,7 @@ from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.tensor_checks import MANY
 from hks_jax.eigen.weyl import weyl, weyl_number
+from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.mesh import is_mesh
@@ -65,9 +68,10 @@ def run(args: argparse.Namespace) -> None:
         print("\n".join(_lines(description)))
 
 
-def describe(path: Path, volume: TensorVolume) -> dict[str, Any]:
-    """Return what there is to say of a volume, in plain numbers."""
+def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
+    """Return what there is to say of a volume, in plain numbers; without a boundary for that which suits it."""
     inside, bad = volume.inside, find_invalid(volume)
+    boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad
     labels, count = label_nodes(inside, (False,) * volume.dimension)
     description: dict[str, Any] = {
@@ -85,6 +89,7 @@ def describe(path: Path, volume: TensorVolume) -> dict[str, Any]:
         "masked": volume.mask is not None,
         "components": count,
         "without_element": int((inside & (labels == 0)).sum()),
+        "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
         "not_positive_definite": int(bad.sum()),
         "not_symmetric": int(find_unsymmetric(volume).sum()),
@@ -102,9 +107,10 @@ def describe(path: Path, volume: TensorVolume) -> dict[str, Any]:
     # Of a few valid ones among indefinite tensors nothing can be told that suits.
     if good.any() and bad.sum() <= MANY * inside.sum():
         metrics = {"inverse": np.linalg.inv(tensors), "tensor": tensors}
+        problems, share = n_problems(boundary, volume.dimension), inside.sum() / good.sum()
+        steps = _steps(labels if count else inside)
         description["suits"] = {
-            name: _suits(g, np.array(volume.spacing), volume.shape, inside.sum() / good.sum())
-            for name, g in metrics.items()
+            name: _suits(g, np.array(volume.spacing), steps, share, problems) for name, g in metrics.items()
         }
     return description
 
@@ -132,27 +138,45 @@ def describe_mesh(path: Path) -> dict[str, Any]:
     }
 
 
+def _steps(labels: Int[np.ndarray, "*shape"] | Bool[np.ndarray, "*shape"]) -> Int[np.ndarray, "components d"]:
+    """Return how many steps from voxel to voxel each component is long, per axis."""
+    boxes = ndimage.find_objects(labels.astype(int))
+    return np.array([[part.stop - part.start - 1 for part in box] for box in boxes])
+
+
 def _suits(
-    metric: Float[np.ndarray, "n d d"], spacing: Float[np.ndarray, " d"], shape: tuple[int, ...], share: float
+    metric: Float[np.ndarray, "n d d"],
+    spacing: Float[np.ndarray, " d"],
+    steps: Int[np.ndarray, "components d"],
+    share: float,
+    problems: int,
 ) -> dict[str, float]:
-    """Return the times and k for the metric at the valid voxels, which are one part in `share` of the domain."""
+    """Return the times and k for the metric at the valid voxels.
+
+    Args:
+        metric: at the valid voxels.
+        spacing: of the voxels.
+        steps: how long each component is.
+        share: how many times as large as the valid voxels the domain is.
+        problems: how many eigenproblems share the eigenpairs.
+    """
     d = len(spacing)
     along = np.einsum("naa->na", metric) * spacing**2  # squared distances of neighbours, per axis
     volume = float(np.sqrt(np.linalg.det(metric)).sum() * np.prod(spacing) * share)
-    size = float(np.sqrt((np.median(along, axis=0) * np.array(shape) ** 2).max()))
-    return _times(d, volume, float(np.median(along.max(axis=1))), size, round(len(metric) * share))
+    size = float(np.sqrt((np.median(along, axis=0) * steps**2).max()))
+    return _times(d, volume, float(np.median(along.max(axis=1))), size, round(len(metric) * share), problems)
 
 
-def _times(d: int, volume: float, width2: float, size: float, nodes: int) -> dict[str, float]:
+def _times(d: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1) -> dict[str, float]:
     """Return the least time that the spacing allows, what k it takes, what the default k allows, and the largest."""
-    least = COARSE * width2
-    k = max(1, min(DEFAULT_K[d], nodes // 4))
+    least, unknowns = COARSE * width2, problems * nodes
+    k = max(1, min(DEFAULT_K[d], unknowns // 4))
     return {
         "least_time": least,
-        "k_for_least_time": math.ceil(weyl_number(RESOLVED[d] / least, volume, d)),
+        "k_for_least_time": math.ceil(weyl_number(RESOLVED[d] / least, problems * volume, d)),
         "k": k,
-        "nodes": nodes,
-        "least_time_of_k": RESOLVED[d] / weyl(k, volume, d),
+        "unknowns": unknowns,
+        "least_time_of_k": RESOLVED[d] / weyl(k, problems * volume, d),
         "largest_time": 4 * np.log(10) * (size / np.pi) ** 2,  # 4 ln 10 / λ₁ of an interval of this length
     }
 
@@ -183,6 +207,8 @@ def _lines(description: dict[str, Any]) -> list[str]:
             *(f"                {as_options(note, READING)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",
             f"components      {description['components']} ({sizes} nodes)",
+            f"boundary        {description['boundary']} unless chosen"
+            f"{', whose two problems share the k pairs' * (description['boundary'] == MEAN)}",
         ]
         if description["without_element"]:
             lines.append(
@@ -207,7 +233,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
         ]
     for name, s in description.get("suits", {}).items():
         takes = f"takes k ≈ {s['k_for_least_time']}"
-        if s["k_for_least_time"] > s["nodes"] / 4:
+        if s["k_for_least_time"] > s["unknowns"] / 4:
             takes = "takes more pairs than are worth computing: see --method auto"
         lines += [
             f"metric {name:<8} t ≥ {s['least_time']:.3g} by the spacing (to 1 %; {takes}); "

@@ -48,24 +48,31 @@ def add_interpolation_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_eigenpair_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that say which eigenpairs are computed."""
+def add_eigenpair_arguments(parser: argparse.ArgumentParser, unless_given: str, boundary: str | None = None) -> None:
+    """Add the arguments that say which eigenpairs are computed.
+
+    Args:
+        parser: what they are added to.
+        unless_given: which boundary there is without ``--boundary``, and why, for the help.
+        boundary: the same, where it is known before the domain is.
+    """
     add_interpolation_argument(parser)
     add = parser.add_argument
     add(
         "--boundary",
         type=parse_boundary,
-        default="neumann",
+        default=boundary,
         metavar="B",
-        help="neumann (default); mean, of Neumann and Dirichlet, under which the rim of a mask hardly shows; "
-        "dirichlet, dirichlet-rim (the rim of a mask, too), periodic or mirror; one for all axes, or one per axis as "
-        "in neumann,periodic, and then one for the rim of a mask; low:high for the two sides, as in "
-        "neumann:dirichlet,neumann",
+        help="neumann; mean, of Neumann and Dirichlet, under which the rim of a mask hardly shows; dirichlet, "
+        "dirichlet-rim (the rim of a mask, too), periodic or mirror; one for all axes, or one per axis as in "
+        "neumann,periodic, and then one for the rim of a mask; low:high for the two sides, as in "
+        f"neumann:dirichlet,neumann (default {unless_given})",
     )
     add(
         "-k",
         type=int,
-        help="number of eigenpairs (default 200, for a volume 100, or a quarter of the unknowns if that is less)",
+        help="number of eigenpairs, under the mean of both problems together (default 200, for a volume 100, or a "
+        "quarter of the unknowns if that is less)",
     )
     add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
 

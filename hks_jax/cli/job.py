@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, Times
+from hks_jax.cli.boundary import NATURAL, default_boundary, unreached_sides
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -17,7 +18,7 @@ from hks_jax.eigen.choice import choose_solver
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.fem.assembly import assemble
-from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
+from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.heat import Normalisation
@@ -33,12 +34,16 @@ class ComputationError(RuntimeError):
 
 @dataclass(frozen=True)
 class Settings:
-    """What to compute; see ``hks-jax hks --help``. Only on meshes, which have one of their own, is there no metric."""
+    """What to compute; see ``hks-jax hks --help``.
+
+    Only on meshes, which have one of their own, is there no metric. Without a boundary the domain has the one that
+    suits it (`hks_jax.cli.boundary.default_boundary`), and a mesh the natural one.
+    """
 
     metric: MetricChoice | None
     interpolation: Interpolation = "linear"
     k: int | None = None
-    boundary: BoundarySpec = "neumann"
+    boundary: BoundarySpec | None = None
     times: Times = DEFAULT_TIMES
     components: Literal["raise", "largest", "all"] = "raise"
     solver: str = "auto"
@@ -73,7 +78,7 @@ def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Res
         ValueError: tensors, mask or settings that cannot be computed with.
         ComputationError: eigenpairs that did not converge.
     """
-    return signature_of(volume, *compute_pairs(volume, settings, progress), settings, progress)
+    return signature_of(volume, *compute_pairs(volume, settings, progress), progress)
 
 
 def signature_of(
@@ -95,8 +100,10 @@ def compute_on_mesh(mesh: SimplicialMesh, described: dict[str, Any], settings: S
         ValueError: settings that cannot be computed with.
         ComputationError: eigenpairs that did not converge.
     """
+    boundary = NATURAL if settings.boundary is None else settings.boundary
+    settings = replace(settings, boundary=boundary)
     with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
-        pencil = assemble(mesh, settings.boundary)
+        pencil = assemble(mesh, boundary)
     pairs = _solve(pencil, settings, progress)
     return _result(mesh, described, pairs, settings, progress)
 
@@ -129,21 +136,26 @@ def field_of(
     return TensorField.from_diffusion(grid, tensors, metric, interpolation=interpolation, name="tensors")
 
 
-def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) -> tuple[TensorField, Eigenpairs]:
-    """Compute the eigenpairs of a volume or slice, and return them with its metric.
+def compute_pairs(
+    volume: TensorVolume, settings: Settings, progress: Progress
+) -> tuple[TensorField, Eigenpairs, Settings]:
+    """Compute the eigenpairs of a volume or slice; return its metric, them, and the settings with their boundary.
 
     Raises:
         ValueError: tensors, mask or settings that cannot be computed with.
         ComputationError: eigenpairs that did not converge.
     """
-    grid = volume.grid(settings.components)
+    grid, boundary = volume.grid(settings.components), settings.boundary
     assert settings.metric is not None
+    if boundary is None:
+        boundary, why = default_boundary(grid.inside)
+        progress.note(f"boundary {boundary} ({why})")
     with progress.stage("assembly", f"{int(grid.inside.sum())} of {grid.size} nodes"):
-        for message in unreached_sides(grid.inside, settings.boundary):
+        for message in unreached_sides(grid.inside, boundary):
             progress.warn(message)
         field = field_of(volume, grid, settings.metric, settings.dtype, settings.interpolation)
-        pencil = assemble(field, settings.boundary)
-    return field, _solve(pencil, settings, progress)
+        pencil = assemble(field, boundary)
+    return field, _solve(pencil, settings, progress), replace(settings, boundary=boundary)
 
 
 def _solve(pencil: Pencil | MirrorPencil, settings: Settings, progress: Progress) -> Eigenpairs:
@@ -174,25 +186,6 @@ def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) 
         "agreement": agreement,
     }
     return np.asarray(result.values), {"method": {name: value for name, value in origin.items() if name != "none"}}
-
-
-def unreached_sides(inside: np.ndarray, boundary: BoundarySpec) -> list[str]:
-    """Say which conditions have no effect, because the mask does not reach the side of the grid that they are for."""
-    warned = []
-    *axes, rim = normalise_boundary(boundary, inside.ndim)
-    on_rim = {
-        "neumann": 'the mask\'s own rim is natural (Neumann); "dirichlet-rim" and "mean" take it in',
-        "dirichlet": 'the mask\'s own rim has "dirichlet"',
-        "mean": 'the mask\'s own rim has "mean"',
-    }[rim[0]]
-    for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False)):
-        for index, condition in zip((0, -1), conditions, strict=True):
-            if condition not in ("neumann", rim[0]) and not np.take(inside, index, axis).any():
-                warned.append(
-                    f'boundary: "{condition}" has no effect at the {"low" if index == 0 else "high"} side of {name}, '
-                    f"which the mask does not reach; {on_rim}"
-                )
-    return warned
 
 
 def _report(settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]) -> dict[str, Any]:

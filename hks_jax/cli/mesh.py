@@ -45,7 +45,7 @@ def check_options(args: argparse.Namespace) -> None:
     for name, default in _OF_GRIDS.items():
         if getattr(args, name) != default:
             raise ValueError(f"--{name.replace('_', '-')}: it is for tensors on a grid; leave it out for a mesh")
-    if args.boundary not in MESH_BOUNDARIES:
+    if args.boundary not in (None, *MESH_BOUNDARIES):
         raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes one of {', '.join(MESH_BOUNDARIES)}")
     if args.array is None:
         for name, default in _OF_TENSORS.items():

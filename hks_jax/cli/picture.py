@@ -123,8 +123,10 @@ def _coloured(
 ) -> tuple[Bool[np.ndarray, "*shape"], tuple[float, float]]:
     """Return which nodes' values the colours span, and from which quantile to which."""
     rim = normalise_boundary(result.report["settings"]["boundary"], inside.ndim)[-1]
-    # Under "mean" the rim is like all else, but for its corners.
-    return (inside, (0.01, 0.99)) if "mean" in rim else (away_from_rim(inside), SPAN)
+    if "mean" not in rim:
+        return away_from_rim(inside), SPAN
+    # The rim is like all else, but for its corners; and in a volume but for the mask's thin parts, which are many.
+    return inside if inside.ndim == 2 else away_from_rim(inside), (0.01, 0.99)
 
 
 def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) -> tuple[int, ...]:

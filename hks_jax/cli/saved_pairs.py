@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.cli.boundary import recorded_boundary
 from hks_jax.cli.job import Settings, field_of
 from hks_jax.cli.outputs import plain
 from hks_jax.cli.progress import Progress
@@ -30,7 +31,7 @@ _OPTIONS = {
     "components": "raise",
     "dtype": "float64",
     "interpolation": "linear",
-    "boundary": "neumann",
+    "boundary": None,
     "k": None,
     "solver": "auto",
     "save_pairs": False,
@@ -114,16 +115,13 @@ def read_pairs(
         **{name: record[name] for name in ("order", "frame", "source", "digest", "slice_axis", "repair")},
         notes=tuple(record["notes"]),
     )
-    settled = {**record["settings"], "boundary": _tuples(record["settings"]["boundary"])}
-    settings = replace(settings, **settled)
+    boundary = recorded_boundary(record["settings"])
+    settings = replace(settings, **{**record["settings"], "boundary": boundary})
     assert settings.metric is not None
+    assert boundary is not None
     for warning in record["warnings"]:
         progress.warn(warning)
     with progress.stage("assembly"):
         field = field_of(volume, volume.grid("all"), settings.metric, settings.dtype, settings.interpolation)
-        pairs = pairs_of(str(path), arrays, assemble(field, settings.boundary))
+        pairs = pairs_of(str(path), arrays, assemble(field, boundary))
     return volume, field, pairs, settings, record["image"]
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value

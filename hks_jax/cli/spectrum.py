@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hks_jax.cli.boundary import NATURAL
 from hks_jax.cli.inputs import (
     add_eigenpair_arguments,
     add_json_argument,
@@ -48,7 +49,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_tensor_arguments(parser)
-    add_eigenpair_arguments(parser)
+    add_eigenpair_arguments(parser, "neumann, also of a mask: mean would join the eigenvalues of two problems", NATURAL)
     add_json_argument(parser)
     return parser
 
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
             solver=args.solver,
             dtype=args.dtype,
         )
-        field, pairs = compute_pairs(volume, settings, progress)
+        field, pairs, settings = compute_pairs(volume, settings, progress)
         columns = {
             "eigenvalue": np.asarray(pairs.eigenvalues),
             "residual": np.asarray(pairs.residuals),

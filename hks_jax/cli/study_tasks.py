@@ -128,7 +128,7 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[Ten
     assert subject.arguments is not None
     with progress.stage("reading"):
         volume = read_volume(subject.arguments, progress)
-    field, pairs = compute_pairs(volume, study.settings, progress)
+    field, pairs, _ = compute_pairs(volume, study.settings, progress)
     if study.save_pairs:
         domain, image = volume.with_mask(field.grid.mask), image_suffix(subject.arguments.file)
         with progress.stage("writing"):

@@ -3,13 +3,11 @@
 import argparse
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hks_jax.cli.info import describe
-from hks_jax.fem.boundary import doubled_problems, normalise_boundary
 from hks_jax.io import TensorVolume
 
 SMALLEST_TIMES_FIRST_EIGENVALUE = 4 * math.log(10.0)
@@ -29,16 +27,9 @@ def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
     Raises:
         KeyError: the metric is the adjugate, or no tensor is valid.
     """
-    inside = volume.inside
-    box = tuple(slice(int(i.min()), int(i.max()) + 1) for i in np.nonzero(inside))  # the domain's size, not the image's
-    domain = replace(volume, tensors=volume.tensors[box], mask=inside[box])
-    suits: dict[str, Any] = describe(args.file, domain)["suits"]
+    suits: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"]
     of = suits[args.metric or "tensor"]
-    d = volume.dimension
-    # Eigenpairs of several problems (under "mean" and "mirror") are so many fewer for each of them.
-    pairs = of["k"] if args.k is None else args.k
-    share = pairs / len(doubled_problems(normalise_boundary(args.boundary, d)))
-    by_pairs = of["least_time_of_k"] * (of["k"] / share) ** (2 / d)
+    by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
     return Range(max(of["least_time"], by_pairs), of["largest_time"])
 
 
