@@ -218,7 +218,10 @@ def test_progress_is_reported(rng):
     field = hj.TensorField(hj.Grid((20, 20)), random_spd(rng, (20, 20)))
     hj.eigenpairs(field, 40, solver="shift-invert", progress=told.append)
     assert told[0] == "factorising"
-    assert "50 solves" in told
+    counts = [[int(word) for word in text.split() if word.isdecimal()] for text in told if "solves" in text]
+    assert [solves for solves, _ in counts] == [25 * (i + 1) for i in range(len(counts))]
+    assert all(solves <= expected < 2 * (counts[-1][0] + 25) for solves, expected in counts)
+    assert all(text.seconds_left > 0 for text in told if "solves" in text)
 
 
 def test_auto_chooses_by_size_and_says_so(rng):
