@@ -56,7 +56,9 @@ def finest_level(pencil: Pencil) -> GridLevel:
     else:
         assert isinstance(mass, StencilOperator)
         coefficients = mass.coefficients
-    return _level(stiffness.coefficients, coefficients, jnp.asarray(space.free), jnp.asarray(space.domain))
+    # Under `jit` they are constants, and without the barrier the compiler would compute with them, node by node.
+    free, domain = jax.lax.optimization_barrier((jnp.asarray(space.free), jnp.asarray(space.domain)))
+    return _level(stiffness.coefficients, coefficients, free, domain)
 
 
 def coarsen(level: GridLevel, periodic: tuple[bool, ...]) -> GridLevel:
@@ -68,6 +70,7 @@ def coarsen(level: GridLevel, periodic: tuple[bool, ...]) -> GridLevel:
     count = int(colours.max()) + 1
     padded = -(-count // _COLUMNS) * _COLUMNS
     indicators = (colours.ravel() == np.arange(padded)[:, None]).reshape(-1, _COLUMNS, colours.size)
+    indicators, of_neighbour = jax.lax.optimization_barrier((jnp.asarray(indicators), jnp.asarray(of_neighbour)))
 
     def galerkin(coefficients: Array) -> Array:
         def images(rows: Bool[Array, "b coarse"]) -> Float[Array, "b coarse"]:
@@ -75,14 +78,10 @@ def coarsen(level: GridLevel, periodic: tuple[bool, ...]) -> GridLevel:
             y = stencil_product(coefficients, x, periodic)
             return to_rows(_restrict(y, level, shape, periodic))
 
-        products = jax.lax.map(images, jnp.asarray(indicators)).reshape(padded, *shape)
+        products = jax.lax.map(images, indicators).reshape(padded, *shape)
         # A node's image under the sum of a colour's basis functions is its coupling to the one of them near by.
-        return jnp.stack(
-            [
-                jnp.where(neighbour >= 0, jnp.take_along_axis(products, np.maximum(neighbour, 0)[None], axis=0)[0], 0)
-                for neighbour in of_neighbour
-            ]
-        )
+        coupled = jnp.take_along_axis(products, jnp.maximum(of_neighbour, 0), axis=0)
+        return jnp.where(of_neighbour >= 0, coupled, 0)
 
     return _level(galerkin(level.stiffness), galerkin(level.mass), free, domain)
 
@@ -124,7 +123,7 @@ def _level(stiffness: Array, mass: Array, free: Array, domain: Array) -> GridLev
 
 def _colouring(
     shape: tuple[int, ...], periodic: tuple[bool, ...]
-) -> tuple[Int[np.ndarray, "*shape"], list[Int[np.ndarray, "*shape"]]]:
+) -> tuple[Int[np.ndarray, "*shape"], Int[np.ndarray, "offsets *shape"]]:
     """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none."""
     axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, periodic, strict=True)]
     number = np.zeros(shape, int)
@@ -138,4 +137,4 @@ def _colouring(
         padded[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))]
         for start in product((0, 1, 2), repeat=len(shape))
     ]
-    return number, neighbours
+    return number, np.stack(neighbours)
