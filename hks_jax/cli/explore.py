@@ -61,11 +61,11 @@ def run(args: argparse.Namespace) -> None:
         FileNotFoundError: no such result, labels or names.
         ValueError: a result that cannot be shown, or labels that do not fit it.
     """
-    from hks_jax.cli.outputs import check_folder
+    from hks_jax.cli.outputs import check_folder, signature_file
     from hks_jax.io.labels import read_labels, read_names
     from hks_jax.plot import explore
 
-    source = args.result / "hks.npz" if args.result.is_dir() else args.result
+    source = signature_file(args.result)
     page = source.with_name("explore.html") if args.output is None else args.output
     if page.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"--output: got {page}; expected a name that ends in .html")

@@ -17,6 +17,9 @@ from hks_jax.cli.progress import Progress
 from hks_jax.io.save import save
 from hks_jax.io.volume import TensorVolume
 
+SIGNATURE = "hks"
+"""How the names of a signature's files begin."""
+
 
 def check_folder(path: Path) -> None:
     """Raise before a long computation if its results could not be written.
@@ -32,14 +35,19 @@ def check_folder(path: Path) -> None:
         raise PermissionError(f"--output: {nearest} may not be written; choose another folder")
 
 
+def signature_file(result: Path) -> Path:
+    """Return the file of the signature in a folder that `write_outputs` has written; a file is its own."""
+    return result / f"{SIGNATURE}.npz" if result.is_dir() else result
+
+
 def write_outputs(
     folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], image: str, command: list[str]
 ) -> list[Path]:
     """Write hks.npz, hks.png (by `draw`), report.json and, unless its suffix is empty, an image; return their paths."""
     with progress.stage("writing", str(folder)), atomic_folder(folder) as temporary:
         origin = {"command": command, "settings": plain(result.report["settings"]), "times": result.times}
-        save_result(temporary / "hks", result, image, origin)
-        draw(temporary / "hks.png")
+        save_result(temporary / SIGNATURE, result, image, origin)
+        draw(temporary / f"{SIGNATURE}.png")
         write_report(temporary / "report.json", result.report, progress, command)
         names = sorted(file.name for file in temporary.iterdir())
     return [folder / name for name in names]

@@ -67,11 +67,11 @@ def run(args: argparse.Namespace) -> None:
         FileNotFoundError: no such result, labels or names.
         ValueError: a result that has no regions, or labels that do not fit it.
     """
-    from hks_jax.cli.outputs import check_folder
+    from hks_jax.cli.outputs import check_folder, signature_file
     from hks_jax.cli.regions import region_table
     from hks_jax.io.tables import write_table
 
-    source = args.result / "hks.npz" if args.result.is_dir() else args.result
+    source = signature_file(args.result)
     table = source.with_name("regions.tsv") if args.output is None else args.output
     if table.suffix.lower() != ".tsv":
         raise ValueError(f"--output: got {table}; expected a name that ends in .tsv")
