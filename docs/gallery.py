@@ -172,6 +172,29 @@ def around_one() -> Figure:
     return figure
 
 
+def ball() -> Figure:
+    """(4πt)^(3/2)·HKS of a ball with a hill and a basin: a natural rim covers them, the mean leaves its curvature."""
+    n = 24
+    grid = hj.Grid((n, n, n), 2 / (n - 1), -1.0)
+    x, y, z = np.moveaxis(grid.nodes, -1, 0)
+    grid = hj.Grid(grid.shape, grid.spacing, -1.0, mask=x**2 + y**2 + z**2 < 0.95)
+    hill, basin = (np.exp(-((x - a) ** 2 + y**2 + z**2) / 0.06) for a in (-0.35, 0.35))
+    field = hj.TensorField(grid, (1 + 1.5 * hill - 0.5 * basin)[..., None, None] * np.eye(3))
+    times = np.array([0.05, 0.12])
+    pairs = hj.eigenpairs(field, 300, "mean", multiplet="drop")
+    mean = hj.hks(pairs, times, "flat")
+    natural = mean * (1 + hj.boundary_influence(pairs, times))
+    return plot.volume_panels(
+        np.concatenate([natural, mean]),
+        np.tile(times, 2),
+        grid,
+        node=(n // 2,) * 3,
+        titles=[f"{name}, t = {t:g}" for name in ("neumann", "mean") for t in times],
+        limits=[(0.4, 1.6)] * 4,
+        cmap="RdBu_r",
+    )
+
+
 def rim_errors() -> Figure:
     """The error at the rim of flat domains: of natural and Dirichlet conditions, and of their mean."""
     n = 41
@@ -305,6 +328,7 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
     "Spectra and Weyl's law": weyl,
     "The boundary's influence": influence,
     "Around 1, without the rim": around_one,
+    "Around 1, in a volume": ball,
     "What is left at a rim": rim_errors,
     "Beside Gaussian smoothing and heat flow": rows,
     "Volumes": volume,
