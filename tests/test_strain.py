@@ -204,7 +204,7 @@ def test_stress_on_the_command_line(tmp_path):
     arguments = ["hks", str(file), "-o", str(out), "-q", "-k", "5", "--times", "1", "--positive", "shift:1.5"]
     assert main(arguments) == 0
     grid = hj.Grid(GRID.shape, GRID.spacing, GRID.origin, MASK)
-    pairs = hj.eigenpairs(hj.TensorField.from_indefinite(grid, STRESS, "shift", 1.5), 5)
+    pairs = hj.eigenpairs(hj.TensorField.from_indefinite(grid, STRESS, "shift", 1.5), 5, "mean")
     with np.load(out / "hks.npz") as read:
         np.testing.assert_allclose(read["hks"], hj.hks(pairs, [1.0]), rtol=1e-9)
 
