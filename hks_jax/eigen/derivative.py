@@ -76,7 +76,10 @@ def _lowest_jvp(
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
     quiet = is_traced(primals) or solver.adjoint.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
-    tangents = *_tangents(solver, k, extra, telling, pencil, change, values, vectors), jnp.zeros_like(complete_below)
+    # Apart from the tangents, so that many products with one Jacobian share it.
+    prepared = in_turn(_prepare, (solver.adjoint, k), pencil, values) if _beyond(pencil, k, total) else None
+    tangents = _tangents(solver, k, extra, telling, prepared, pencil, change, values, vectors)
+    tangents = *tangents, jnp.zeros_like(complete_below)
     values, vectors = _leading(values, vectors, k + extra)
     return (values, vectors, vectors, complete_below), tangents
 
@@ -93,12 +96,20 @@ def _leading(
     return values[:size], vectors[:size]
 
 
+def _beyond(pencil: SymmetricPencil, k: int, p: int) -> bool:
+    """Return whether derivatives of the first k of p computed pairs have parts in other eigenvectors."""
+    return p < pencil.size and pencil.n_null < k
+
+
+# What is kept for the transpose would be several copies of the eigenvectors.
 @partial(jax.jit, static_argnames=("solver", "k", "extra", "telling"))
+@partial(jax.checkpoint, static_argnums=(0, 1, 2, 3))
 def _tangents(
     solver: Eigensolver,
     k: int,
     extra: int,
     telling: Telling,
+    prepared: Any,
     pencil: SymmetricPencil,
     change: SymmetricPencil,
     values: Float[Array, " p"],
@@ -116,7 +127,8 @@ def _tangents(
     gauge = -jnp.matmul(moved, functions.T, precision="highest") / 2
     within = jnp.where(apart[:, :k], rotation[:, :k], gauge)
     frame = jnp.matmul(rotation[:, k:], vectors[k:], precision="highest")
-    frame = frame + _outside(solver, telling, pencil, values, vectors, -force)
+    if _beyond(pencil, k, len(values)):
+        frame = frame + _outside(solver, telling, prepared, pencil, values, vectors, -force)
     d_vectors = jnp.matmul(within, functions, precision="highest") + frame
     d_vectors, frame = (jnp.pad(d, ((0, extra), (0, 0))) for d in (d_vectors, frame))
     return jnp.pad(jnp.diagonal(into), (0, extra)), d_vectors, frame
@@ -125,22 +137,17 @@ def _tangents(
 def _outside(
     solver: Eigensolver,
     telling: Telling,
+    prepared: Any,
     pencil: SymmetricPencil,
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
     rhs: Float[Array, "k n_dof"],
 ) -> Float[Array, "k n_dof"]:
     """Solve (K − λᵢM) xᵢ = Q rhsᵢ on the complement of the p computed eigenvectors."""
-    k, n_null = rhs.shape[0], min(pencil.n_null, rhs.shape[0])
-    if values.size == pencil.size or n_null == k:
-        return jnp.zeros_like(rhs)
-    shifts = values[:k, None]
+    shifts, n_null = values[: len(rhs), None], pencil.n_null
 
     def matvec(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
-
-    # Outside the linear solve, so that many products with one Jacobian share it.
-    prepared = in_turn(_prepare, (solver.adjoint, k), pencil, values)
 
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return _told(telling, in_turn(_solve, (solver.adjoint,), prepared, pencil, values, vectors, b))

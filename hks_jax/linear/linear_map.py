@@ -29,16 +29,29 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
     """
 
     x = jax.tree.map(jnp.asarray, x)  # tangents of users may be numbers
+    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), x)
+    forward = partial(_forward, function, derivative, at, constants)
+    return with_transpose(forward, partial(_backward, function, derivative, at, constants, like), x, at)
 
-    def swap(y: Any, x: Any) -> tuple[Any, Any]:
-        forward = _forward(function, derivative, at, constants, x)
-        return forward, _backward(function, derivative, at, constants, x, y)
+
+def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any], x: Any, at: Any = ()) -> Any:
+    """Return ``forward(x)``, linear in x, whose transpose is ``backward``; JAX itself transposes neither.
+
+    Args:
+        forward: maps x to y, pytrees of floating point arrays.
+        backward: maps y to x.
+        x: to what it is applied.
+        at: what else the two depend on and are to be differentiated by, in rules of their own.
+    """
 
     # JAX transposes a solve all of whose right-hand side depends on what is linearised: x, or `at`.
     def zeros(like: Any, tree: Any) -> Any:
         empty = [jnp.ravel(leaf)[:0].astype(float) for leaf in jax.tree.leaves(tree)]
-        nothing = jnp.sum(jnp.concatenate(empty))
+        nothing = jnp.sum(jnp.concatenate([jnp.zeros(0), *empty]))
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, nothing, leaf.dtype), like)
+
+    def swap(y: Any, x: Any) -> tuple[Any, Any]:
+        return forward(x), backward(y)
 
     def system(unknowns: tuple[Any, Any]) -> tuple[Any, Any]:
         u, v = unknowns
@@ -48,7 +61,7 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
         b, c = right
         return jax.tree.map(jnp.add, c, swap(*b)), b
 
-    y = zeros(jax.eval_shape(function, at, constants, x), x)
+    y = zeros(jax.eval_shape(forward, x), x)
     right = (y, jax.tree.map(jnp.add, x, zeros(x, x))), (y, zeros(x, x))
     (result, _), _ = jax.lax.custom_linear_solve(system, right, solve, symmetric=True)
     return result

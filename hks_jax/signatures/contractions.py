@@ -6,10 +6,16 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.linear.linear_map import with_transpose
+from hks_jax.linear.products import products_with_columns
 from hks_jax.static_array import StaticArray
+
+_ROWS = 64
+"""Functions whose products with all others are computed together, or left out."""
 
 
 class Contraction(eqx.Module):
@@ -20,8 +26,10 @@ class Contraction(eqx.Module):
         """Return the reading for each diagonal C = diag(weights)."""
 
     @abstractmethod
-    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "*s n"]:
-        """Return the reading for one symmetric C."""
+    def mixed(
+        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
+    ) -> Float[Array, "*s n"]:
+        """Return the reading for one symmetric C, zero between functions that do not matter."""
 
 
 class Diagonal(Contraction):
@@ -31,9 +39,36 @@ class Diagonal(Contraction):
         """Return Σᵢ cᵢ φᵢ(x)²."""
         return _matmul(weights, jnp.square(vectors))
 
-    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, " n"]:
+    # At large times only the first few functions matter. Of C the rows up to the last of them are enough, with twice
+    # the entries in columns that do not matter. The transpose has its large factor on the left, where XLA is fastest.
+    def mixed(
+        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
+    ) -> Float[Array, " n"]:
         """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x)."""
-        return jnp.sum(vectors * _matmul(matrix, vectors), axis=0)
+        (k, n), size = vectors.shape, min(_ROWS, len(vectors))
+        starts = np.minimum(np.arange(0, k, size), k - size)  # the last block may overlap the one before
+        rows = starts[:, None] + np.arange(size)
+        used = matters[rows] & (rows >= np.arange(0, k, size)[:, None])
+        blocks = jnp.where(used[..., None], jnp.where(matters, matrix, 2 * matrix)[rows], 0)
+        count = jnp.max(jnp.where(jnp.any(used, axis=1), np.arange(1, len(starts) + 1), 0))
+
+        def own(number: Array) -> Float[Array, "size n"]:
+            return jax.lax.dynamic_slice_in_dim(vectors, jnp.asarray(starts)[number], size)
+
+        def forward(blocks: Float[Array, "blocks size k"]) -> Float[Array, " n"]:
+            def add(number: Array, total: Array) -> Array:
+                return total + jnp.sum(own(number) * _matmul(blocks[number], vectors), axis=0)
+
+            return jax.lax.fori_loop(0, count, add, jnp.zeros(n, vectors.dtype))
+
+        def backward(weights: Float[Array, " n"]) -> Float[Array, "blocks size k"]:
+            def put(number: Array, blocks: Array) -> Array:
+                columns = jax.lax.optimization_barrier((own(number) * weights).T)
+                return blocks.at[number].set(products_with_columns(vectors, columns).T)
+
+            return jax.lax.fori_loop(0, count, put, jnp.zeros((*rows.shape, k), vectors.dtype))
+
+        return with_transpose(forward, backward, blocks)
 
 
 class _FromSources(Contraction):
@@ -53,7 +88,9 @@ class Columns(_FromSources):
         """Return Σᵢ cᵢ φᵢ(x_s) φᵢ(x)."""
         return _matmul(weights[:, None, :] * self.at_sources(vectors).T, vectors)
 
-    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "s n"]:
+    def mixed(
+        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
+    ) -> Float[Array, "s n"]:
         """Return Σᵢⱼ Cᵢⱼ φᵢ(x_s) φⱼ(x)."""
         return _matmul(_matmul(self.at_sources(vectors).T, matrix), vectors)
 
@@ -68,7 +105,9 @@ class SquaredDistances(_FromSources):
         """Return Σᵢ cᵢ (φᵢ(x) − φᵢ(x_s))²."""
         return jnp.moveaxis(self._map(vectors, lambda apart: _matmul(weights, jnp.square(apart))), 0, 1)
 
-    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "s nodes"]:
+    def mixed(
+        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
+    ) -> Float[Array, "s nodes"]:
         """Return Σᵢⱼ Cᵢⱼ (φᵢ(x) − φᵢ(x_s)) (φⱼ(x) − φⱼ(x_s))."""
         return self._map(vectors, lambda apart: jnp.sum(apart * _matmul(matrix, apart), axis=0))
 
@@ -92,7 +131,9 @@ class Applied(Contraction):
         """Return Σᵢ cᵢ (φᵢ·w) φᵢ(x)."""
         return _matmul(weights[:, None, :] * self._coefficients(vectors), vectors)
 
-    def mixed(self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"]) -> Float[Array, "s n"]:
+    def mixed(
+        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
+    ) -> Float[Array, "s n"]:
         """Return Σᵢⱼ Cᵢⱼ (φᵢ·w) φⱼ(x)."""
         return _matmul(_matmul(self._coefficients(vectors), matrix), vectors)
 

@@ -27,6 +27,27 @@ class Filter(eqx.Module):
         return divided_difference(self, low, high)
 
 
+@jax.custom_jvp
+def _mean_decay(y: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Return the mean of exp(−sy) over 0 ≤ s ≤ 1, y ≥ 0."""
+    return jnp.where(y > 0, -jnp.expm1(-y) / jnp.where(y > 0, y, 1), 1)
+
+
+@_mean_decay.defjvp
+def _mean_decay_jvp(
+    primals: tuple[Float[Array, "*n"]], tangents: tuple[Float[Array, "*n"]]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    def free_of_cancellation(y: Array) -> Array:
+        """Return the same; where y is small, its derivatives by quadrature."""
+        small = y < 1
+        nodes, weights = gauss(8)
+        near = sum(w * jnp.exp(-s * jnp.where(small, y, 0)) for s, w in zip(nodes, weights, strict=True))
+        far = jnp.where(small, 1, y)
+        return jnp.where(small, near, -jnp.expm1(-far) / far)
+
+    return _mean_decay(*primals), jax.jvp(free_of_cancellation, primals, tangents)[1]
+
+
 class Heat(Filter):
     """exp(−λt), of heat diffusing for the time t."""
 
@@ -39,13 +60,7 @@ class Heat(Filter):
 
     def divided_difference(self, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return −t exp(−t·low) (1 − e^(−y))/y, y = t (high − low)."""
-        y = self.time * (high - low)
-        # For small y the mean of exp(−sy) over 0 ≤ s ≤ 1, whose derivatives by t have no cancellation either.
-        small = y < 1
-        nodes, weights = gauss(8)
-        near = sum(w * jnp.exp(-s * jnp.where(small, y, 0)) for s, w in zip(nodes, weights, strict=True))
-        far = jnp.where(small, 1, y)
-        return -self.time * jnp.exp(-self.time * low) * jnp.where(small, near, -jnp.expm1(-far) / far)
+        return -self.time * jnp.exp(-self.time * low) * _mean_decay(self.time * (high - low))
 
 
 class Wave(Filter):

@@ -134,7 +134,8 @@ def _tangent(
 
     def inner(one: Filter) -> Array:
         of_f, of_lambda_f = _divided_differences(one, values, kept)
-        return contraction.mixed(of_f * stiffness - of_lambda_f * mass, vectors)
+        matters = _matters(_weights(one, values, kept), jnp.diagonal(of_f), values)
+        return contraction.mixed(of_f * stiffness - of_lambda_f * mass, vectors, matters)
 
     return outer + jax.lax.map(inner, filters)
 
@@ -173,6 +174,14 @@ def _divided_differences(
     of_f = jnp.where(high == 0, 0, of_f)
     # f at the larger eigenvalue, where it is small, and not the other way round: no cancellation.
     return of_f, jnp.where(gap >= 0, f[:, None], f) + low * of_f
+
+
+def _matters(f: Float[Array, " k"], slope: Float[Array, " k"], values: Float[Array, " k"]) -> Bool[Array, " k"]:
+    """Return where f or λf' is not negligible beside what they are elsewhere, the constants apart."""
+    size = jnp.maximum(jnp.abs(f), jnp.abs(values * slope))
+    largest = jnp.max(jnp.where(values > 0, size, 0))
+    # Between two that are not, [f] is a quotient by their gap: relative to λ it may be as small as √ε.
+    return ~(size <= jnp.finfo(f.dtype).eps ** 1.5 * largest)  # NaN matters
 
 
 def _is_zero(leaf: Any) -> bool:

@@ -62,31 +62,34 @@ def first_beyond(values: Float[Array, " p"]) -> Float[Array, ""]:
 # Small rows need fewer digits, or none: their share in what is summed over all rows is small. Where the operator
 # amplifies more, because λᵢ is near Λ, they count for more.
 def wanted_errors(
-    whole: Float[Array, "k n"],
-    left: Float[Array, "k n"],
-    lumped: Float[Array, " n"],
-    values: Float[Array, " p"],
+    before: Float[Array, " b"],
+    after: Float[Array, " b"],
+    largest: Float[Array, ""],
+    amplification: Float[Array, " b"],
     tolerance: float,
     dtype: Any,
-) -> Float[Array, " k"]:
-    """Return the errors to reduce the rows to, in the energy norm, relative to each row's own; infinite for zero.
+) -> Float[Array, " b"]:
+    """Return the errors to reduce rows to, in the energy norm, relative to each row's own; infinite for zero.
 
     Args:
-        whole: the right-hand sides bᵢ.
-        left: what the projection leaves of them, Qbᵢ.
-        lumped: the diagonal of M, for the norm.
-        values: the known eigenvalues; row i belongs to the i-th.
+        before: the norms of the right-hand sides bᵢ, by `norms`.
+        after: the norms of what the projection leaves of them, Qbᵢ.
+        largest: the largest norm of all right-hand sides, those of other blocks included.
+        amplification: Λ/(Λ − λᵢ).
         tolerance: the accuracy of the largest row.
         dtype: what the eigenvectors and the rows were rounded to.
     """
-    xp = values.__array_namespace__()
-    before, after = (xp.sqrt(xp.sum(rows * rows / lumped, axis=1)) for rows in (whole, left))
-    beyond = first_beyond(values)
+    xp = before.__array_namespace__()
     # Where all rows are zero, none is asked for.
-    largest = xp.where(xp.any(before > 0), xp.max(before), 1)
-    share = after / largest * (beyond / (beyond - values[: len(whole)]))
+    share = after / xp.where(largest > 0, largest, 1) * amplification
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
+
+
+def norms(rows: Float[Array, "b n"], lumped: Float[Array, " n"]) -> Float[Array, " b"]:
+    """Return ‖rᵢ‖ in the norm of M⁻¹, M replaced by its diagonal."""
+    xp = rows.__array_namespace__()
+    return xp.sqrt(xp.sum(rows * rows / lumped, axis=1))
 
 
 def group_numbers(

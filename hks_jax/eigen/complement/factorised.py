@@ -21,6 +21,7 @@ from hks_jax.eigen.complement.common import (
     definite_product,
     first_beyond,
     group_numbers,
+    norms,
     shifts_between,
     wanted_errors,
 )
@@ -32,6 +33,8 @@ from hks_jax.linear.products import combine, inner_products, products_with_colum
 
 _BLOCK = 16
 """Rows solved at once."""
+_CHUNK = 128
+"""Rows that the known eigenvectors are taken out of at once."""
 _WINDOW = 32
 """Eigenvectors next to a shift that every step takes out."""
 _MEMORY = 5e8
@@ -102,14 +105,15 @@ def _solve(
     tolerance: float,
 ) -> Float[Array, "k n_dof"]:
     k, beyond, window = rhs.shape[0], first_beyond(values), min(_WINDOW, values.size)
-    tolerance = attainable(tolerance, rhs.dtype)
-    images = jax.lax.map(pencil.mass.apply, vectors, batch_size=_BLOCK)
-    left = rhs - combine(inner_products(vectors, rhs), images)
-    wanted = wanted_errors(rhs, left, pencil.mass.diagonal(), values, tolerance, rhs.dtype)
-
+    tolerance, lumped = attainable(tolerance, rhs.dtype), pencil.mass.diagonal()
     of_block = _group(factors.dissection, values, k, tolerance).of_block
-    blocks = of_block.size
-    spare = blocks * _BLOCK - k  # rows that fill the last block up, with nothing to solve
+    chunks = -(-k // _CHUNK)
+    blocks = -(-of_block.size // chunks)
+    before = jax.lax.map(lambda b: norms(b[None], lumped)[0], rhs)
+    largest = jnp.max(before)
+
+    def taken_out(b: Float[Array, "rows n_dof"]) -> Float[Array, "rows n_dof"]:
+        return b - pencil.mass.apply(combine(inner_products(vectors, b), vectors))
 
     def solve_block(block: tuple[Array, Array, Array, Array]) -> Array:
         g, shifts, b, wanted = block
@@ -117,7 +121,8 @@ def _solve(
         factor = Factorisation(factors.dissection, *matrices)
 
         nearest = jnp.clip(factor.negative - window // 2, 0, values.size - window)
-        near, near_images = (jax.lax.dynamic_slice_in_dim(x, nearest, window) for x in (vectors, images))
+        near = jax.lax.dynamic_slice_in_dim(vectors, nearest, window)
+        near_images = pencil.mass.apply(near)
 
         # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
         # next to σ alone, which is why no others are taken out before the end.
@@ -127,14 +132,24 @@ def _solve(
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
-    parts = (
-        jnp.asarray(of_block),
-        jnp.pad(values[:k], (0, spare)).reshape(blocks, _BLOCK),
-        jnp.pad(left, ((0, spare), (0, 0))).reshape(blocks, _BLOCK, -1),
-        jnp.pad(wanted, (0, spare), constant_values=jnp.inf).reshape(blocks, _BLOCK),
-    )
-    x = jax.lax.map(solve_block, parts).reshape(blocks * _BLOCK, -1)[:k]
-    return x - combine(inner_products(images, x), vectors)
+    # Known eigenvectors are taken out of many rows at once, and no array but the solution is as large as they are.
+    def solve_chunk(chunk: tuple[Array, Array, Array, Array]) -> Array:
+        g, at, shifts, before = chunk
+        b = rhs.at[at].get(mode="clip")
+        left = taken_out(b)
+        amplification = beyond / (beyond - shifts)
+        wanted = wanted_errors(before, norms(left, lumped), largest, amplification, tolerance, rhs.dtype)
+        wanted = jnp.where(at < k, wanted, jnp.inf)
+        parts = g, *(x.reshape(blocks, _BLOCK, *x.shape[1:]) for x in (shifts, left, wanted))
+        x = jax.lax.map(solve_block, parts).reshape(b.shape)
+        return x - combine(inner_products(vectors, pencil.mass.apply(x)), vectors)
+
+    # The last chunk is filled up with rows in which there is nothing to solve.
+    at = np.arange(chunks * blocks * _BLOCK).reshape(chunks, -1)
+    number = np.pad(of_block, (0, chunks * blocks - of_block.size), mode="edge").reshape(chunks, -1)
+    shifts, before = (x[np.minimum(at, k - 1)] for x in (values, before))
+    x = jax.lax.map(solve_chunk, (jnp.asarray(number), jnp.asarray(at), shifts, before))
+    return x.reshape(at.size, -1)[:k]
 
 
 def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> _Groups:

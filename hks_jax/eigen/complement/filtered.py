@@ -14,7 +14,13 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import attainable, definite_product, first_beyond, wanted_errors
+from hks_jax.eigen.complement.common import (
+    attainable,
+    definite_product,
+    first_beyond,
+    norms,
+    wanted_errors,
+)
 from hks_jax.eigen.filter.coarsening import finest_level
 from hks_jax.eigen.filter.damping import Band, correction, degree_for, upper_end
 from hks_jax.fem.columns import to_columns, to_rows
@@ -102,7 +108,8 @@ def _solve(
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
     left = rhs - combine(inner_products(vectors, rhs), images)
-    wanted = wanted_errors(rhs, left, pencil.mass.diagonal(), values, tolerance, rhs.dtype)
+    before, after = (norms(rows, pencil.mass.diagonal()) for rows in (rhs, left))
+    wanted = wanted_errors(before, after, jnp.max(before), beyond / (beyond - values[:k]), tolerance, rhs.dtype)
     count = -(-k // block)
     spare = count * block - k  # rows that fill the last block up, with nothing to solve
     parts = (

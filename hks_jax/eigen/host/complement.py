@@ -25,6 +25,7 @@ from hks_jax.eigen.complement.common import (
     attainable,
     first_beyond,
     group_numbers,
+    norms,
     shifts_between,
     wanted_errors,
 )
@@ -112,8 +113,11 @@ def _solve(
     m_phi = M @ phi
     x, errors = np.zeros_like(rhs), np.zeros(len(rhs))
     left = rhs - (rhs @ phi) @ m_phi.T
-    wanted = wanted_errors(rhs, left, M.diagonal(), values, tolerance, dtype)
-    rhs, beyond = left, float(first_beyond(values))
+    before, after = (norms(rows, M.diagonal()) for rows in (rhs, left))
+    beyond = float(first_beyond(values))
+    amplification = beyond / (beyond - values[: len(rhs)])
+    wanted = wanted_errors(before, after, before.max(), amplification, tolerance, dtype)
+    rhs = left
     active = np.flatnonzero(np.isfinite(wanted))
 
     def solve(block: np.ndarray, factor: SuperLU) -> None:
