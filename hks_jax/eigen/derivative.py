@@ -76,7 +76,7 @@ def _lowest_jvp(
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
     quiet = is_traced(primals) or solver.adjoint.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
-    tangents = *_tangents(solver, k, extra, telling, pencil, change, values, vectors), jnp.zeros_like(complete_below)
+    tangents = *tangents_of(solver, k, extra, telling, pencil, change, values, vectors), jnp.zeros_like(complete_below)
     values, vectors = _leading(values, vectors, k + extra)
     return (values, vectors, vectors, complete_below), tangents
 
@@ -94,7 +94,7 @@ def _leading(
 
 
 @partial(jax.jit, static_argnames=("solver", "k", "extra", "telling"))
-def _tangents(
+def tangents_of(
     solver: Eigensolver,
     k: int,
     extra: int,
@@ -104,7 +104,10 @@ def _tangents(
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
 ) -> Lowest:
-    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs, and zeros for ``extra``."""
+    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs, and zeros for ``extra``.
+
+    The pairs come in the order that the solver's adjoint expects.
+    """
     eigenvalues, functions = values[:k], vectors[:k]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved

@@ -11,6 +11,8 @@ instead.
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -53,6 +55,12 @@ def first_beyond(values: Float[Array, " p"]) -> Float[Array, ""]:
     return values[-1] * (1 + 1 / values.size)
 
 
+def amplification(values: Float[Array, " p"], k: int) -> Float[Array, " k"]:
+    """Return the norms Λ/(Λ − λᵢ), relative to that for λ = 0, of the inverses on the complement."""
+    beyond = first_beyond(values)
+    return beyond / (beyond - values[:k])
+
+
 # The accuracy asked for is relative to the right-hand sides bᵢ as they were given, before Q = I − MΦΦᵀ took the known
 # eigenvectors out of them. What is left may be rounding alone: along T itself dK and dM are multiples of K and M, so
 # that bᵢ is one of Mφᵢ and Qbᵢ = 0. Relative to itself that noise has no solution, since most of it lies in the span of
@@ -65,7 +73,7 @@ def wanted_errors(
     whole: Float[Array, "k n"],
     left: Float[Array, "k n"],
     lumped: Float[Array, " n"],
-    values: Float[Array, " p"],
+    amplified: Float[Array, " k"],
     tolerance: float,
     dtype: Any,
 ) -> Float[Array, " k"]:
@@ -75,18 +83,37 @@ def wanted_errors(
         whole: the right-hand sides bᵢ.
         left: what the projection leaves of them, Qbᵢ.
         lumped: the diagonal of M, for the norm.
-        values: the known eigenvalues; row i belongs to the i-th.
+        amplified: how much larger the solution of a row becomes than that of another as large.
         tolerance: the accuracy of the largest row.
         dtype: what the eigenvectors and the rows were rounded to.
     """
-    xp = values.__array_namespace__()
+    xp = amplified.__array_namespace__()
     before, after = (xp.sqrt(xp.sum(rows * rows / lumped, axis=1)) for rows in (whole, left))
-    beyond = first_beyond(values)
     # Where all rows are zero, none is asked for.
     largest = xp.where(xp.any(before > 0), xp.max(before), 1)
-    share = after / largest * (beyond / (beyond - values[: len(whole)]))
+    share = after / largest * amplified
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
+
+
+def in_blocks(
+    solve: Callable[..., Float[Array, "b n"]],
+    size: int,
+    rhs: Float[Array, "k n"],
+    wanted: Float[Array, " k"],
+    *of_rows: Float[Array, " k"],
+) -> Float[Array, "k n"]:
+    """Return what solve(number, rhs, wanted, *of_rows) makes of blocks of so many rows, one after another; in JAX."""
+    k = len(rhs)
+    count = -(-k // size)
+
+    def blocks(rows: Float[Array, "k ..."], fill: float = 0) -> Float[Array, "count b ..."]:
+        filled = jnp.pad(rows, ((0, count * size - k), *((0, 0),) * (rows.ndim - 1)), constant_values=fill)
+        return filled.reshape(count, size, *rows.shape[1:])
+
+    # Rows that fill the last block up have nothing to solve.
+    parts = jnp.arange(count), blocks(rhs), blocks(wanted, np.inf), *map(blocks, of_rows)
+    return jax.lax.map(lambda part: solve(*part), parts).reshape(count * size, -1)[:k]
 
 
 def group_numbers(
@@ -112,16 +139,25 @@ def shifts_between(
 ) -> Float[Array, " g"]:
     """Return a shift for each group of rows whose distances from Λ lie between the given ones.
 
-    The geometric mean of the two leaves the least condition, √ of their ratio. The shift is the middle of the gap in
-    the spectrum that is nearest to it, so that it is no eigenvalue.
+    The geometric mean of the two leaves the least condition, √ of their ratio.
     """
     xp = values.__array_namespace__()
-    targets = first_beyond(values) - xp.sqrt(nearest * farthest)
-    below = -0.1 * values[-1]
+    targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
         return xp.broadcast_to(below, targets.shape)
+    return middles_of_gaps(values, targets, below)
+
+
+def middles_of_gaps(
+    values: Float[Array, " p"], targets: Float[Array, " g"], otherwise: Float[Array, ""]
+) -> Float[Array, " g"]:
+    """Return the middle of the gap between two known eigenvalues that is nearest to each target: it is no eigenvalue.
+
+    Where all p ≥ 2 are equal it is ``otherwise``.
+    """
+    xp = values.__array_namespace__()
     gaps = xp.diff(values)
     typical = (values[-1] - values[0]) / (values.size - 1)
     distance = xp.abs(values[:-1] + gaps / 2 - targets[:, None])
     chosen = xp.argmin(xp.where(gaps >= 0.1 * typical, distance, xp.inf), axis=1)
-    return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, below)
+    return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, otherwise)

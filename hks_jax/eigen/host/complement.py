@@ -22,6 +22,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import (
     SINGULAR,
+    amplification,
     attainable,
     first_beyond,
     group_numbers,
@@ -112,7 +113,7 @@ def _solve(
     m_phi = M @ phi
     x, errors = np.zeros_like(rhs), np.zeros(len(rhs))
     left = rhs - (rhs @ phi) @ m_phi.T
-    wanted = wanted_errors(rhs, left, M.diagonal(), values, tolerance, dtype)
+    wanted = wanted_errors(rhs, left, M.diagonal(), amplification(values, len(rhs)), tolerance, dtype)
     rhs, beyond = left, float(first_beyond(values))
     active = np.flatnonzero(np.isfinite(wanted))
 

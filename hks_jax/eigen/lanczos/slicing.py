@@ -45,7 +45,7 @@ def _consider(
     known, below = jnp.sum(state.values < state.shift), negative - problem.negative
     missing = below - known
     complete = trial.sound & (missing == 0)
-    finished = complete & (known >= plan.wanted)
+    finished = complete & ((known >= plan.wanted) | (negative == problem.pencil.size))  # all, or there are no more
     too_many = trial.sound & (missing > plan.slice_size)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, tolerance, lowest))
