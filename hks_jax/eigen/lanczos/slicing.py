@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
 from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, steps_for
-from hks_jax.eigen.quality import indistinct, values_and_defects
+from hks_jax.eigen.quality import allowed_defects, indistinct, values_and_defects
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
 
@@ -126,8 +126,8 @@ def _accept(
     # Where nothing converged, as on a domain much longer than wide, it is rounding that is worse than usual: the
     # residuals say so.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
-    rounding = jnp.minimum(excuse * indistinct(problem.pencil, dtype) / scale, 0.01)
-    converged = (residuals <= jnp.maximum(tolerance, rounding) * scale) & (theta != 0)
+    allowed = allowed_defects(scale, excuse * indistinct(problem.pencil, dtype), tolerance)
+    converged = (residuals <= allowed) & (theta != 0)
     # Above the first that did not converge, or farther away than those looked at, some are missing.
     above = near > shift
     limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
