@@ -18,6 +18,7 @@ from hks_jax.eigen.eigenpairs import RESULTS, result_of
 from hks_jax.eigen.interval import in_interval
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos
 from hks_jax.eigen.located import locate, translated
+from hks_jax.eigen.messages import messages
 from hks_jax.eigen.quality import quality
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
@@ -262,23 +263,8 @@ def _report(pairs: MatrixEigenpairs, following: Float[Array, ""]) -> None:
     """Warn of what limits the pairs, where values are concrete."""
     if is_traced(pairs.eigenvalues) or not pairs.k:
         return
-    values, bad = np.asarray(pairs.eigenvalues), ~np.asarray(pairs.converged)
-    if bad.any():
-        worst = np.nanmax(np.asarray(pairs.residuals)[bad], initial=0.0)
-        warn_of_accuracy(
-            f"{int(bad.sum())} of {pairs.k} eigenpairs did not converge ({int(np.isnan(values).sum())} of them not "
-            f"found, worst relative residual of the others {worst:.1e}). Use float64 or fewer pairs"
-        )
-    if bool(pairs.unconfirmed):
-        warn_of_accuracy(
-            f"no proof that no eigenvalue was missed between {float(pairs.complete_below):.6g} and {values[-1]:.6g}. "
-            "Use a slightly different k"
-        )
+    values = np.asarray(pairs.eigenvalues)
     gap = _CUT * max(values[-1] - values[0], abs(values[-1]) * float(np.finfo(values.dtype).eps))
-    if float(following) - values[-1] <= gap:
-        cut = int(np.sum(values >= values[-1] - gap))
-        remedy = f"Take k = {pairs.k - cut} or a larger one" if cut < pairs.k else "Take a larger k"
-        warn_of_accuracy(
-            f"k = {pairs.k} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = {values[-1]:.6g}, have equals "
-            f"beyond k, and which of them are among the k is arbitrary. {remedy}"
-        )
+    cut = int(np.sum(values >= values[-1] - gap)) if float(following) - values[-1] <= gap else 0
+    for message in messages(pairs, pairs.k, cut, "a solver with other settings"):
+        warn_of_accuracy(message)
