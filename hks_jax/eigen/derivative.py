@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
+from hks_jax.eigen.complement.common import unsolved
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.in_turn import in_turn
 from hks_jax.eigen.quality import indistinct
@@ -171,24 +172,16 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
     """Return x; where rows of it are NaN, warn or raise."""
     failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
     if telling == "error":
-        return eqx.error_if(x, failed > 0, _message("some", len(x)))
+        return eqx.error_if(x, failed > 0, unsolved("some", len(x)))
     if telling == "warning":
 
         def warn(failed: Array | np.ndarray) -> np.ndarray:
             if failed:
-                warn_of_accuracy(_message(str(int(failed)), len(x)))
+                warn_of_accuracy(unsolved(int(failed), len(x)))
             return np.zeros((), x.dtype)
 
         return x + jax.pure_callback(warn, jax.ShapeDtypeStruct((), x.dtype), failed, vmap_method="sequential")
     return x
-
-
-def _message(failed: str, total: int) -> str:
-    return (
-        f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, and their part is NaN. k "
-        "may cut a cluster of eigenvalues, or the eigenpairs themselves did not converge: take another k or solver, or "
-        "set multiplet='drop' in `eigenpairs`"
-    )
 
 
 @jax.jit

@@ -161,3 +161,12 @@ def middles_of_gaps(
     distance = xp.abs(values[:-1] + gaps / 2 - targets[:, None])
     chosen = xp.argmin(xp.where(gaps >= 0.1 * typical, distance, xp.inf), axis=1)
     return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, otherwise)
+
+
+def unsolved(failed: int | str, total: int) -> str:
+    """Say that solves for so many of all rows did not converge."""
+    return (
+        f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, and their part is NaN. k, "
+        "or an end of the interval, may cut a cluster of eigenvalues, or the eigenpairs themselves did not converge: "
+        "take another k, interval or solver, or set multiplet='drop' in `eigenpairs`"
+    )

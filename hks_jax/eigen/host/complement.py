@@ -27,6 +27,7 @@ from hks_jax.eigen.complement.common import (
     first_beyond,
     group_numbers,
     shifts_between,
+    unsolved,
     wanted_errors,
 )
 from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices
@@ -73,11 +74,7 @@ class HostAdjoint(Adjoint[Pencil]):
             x, errors = _solve(K, M, values, vectors, b, tolerance, rhs.dtype)
             failed = ~(errors <= 1)
             if failed.any():
-                warn_of_accuracy(
-                    f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
-                    f"converge, and their part is NaN. k may cut a cluster of eigenvalues: take another k, or set "
-                    "multiplet='drop' in `eigenpairs`",
-                )
+                warn_of_accuracy(unsolved(int(failed.sum()), failed.size))
                 x[failed] = np.nan
             return x.astype(rhs.dtype)
 
