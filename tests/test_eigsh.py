@@ -8,6 +8,7 @@ import pytest
 import scipy.linalg
 import scipy.sparse as sp
 from jax.experimental.sparse import BCOO, BCSR
+from pencils import directions, graph_laplacian, indefinite, lattice
 from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
 from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
@@ -17,36 +18,12 @@ import hks_jax as hj
 SOLVER = hj.BlockLanczos(block=4)
 
 
-def graph_laplacian(components: int, n: int) -> sp.csr_matrix:
-    """The Laplacian of random graphs, n vertices each, and a star of which the hub has n − 1 neighbours."""
-    blocks = []
-    for seed in range(components):
-        hits = sp.random(n, n, 5 / n, random_state=seed) + sp.eye(n, k=1)
-        graph = ((hits + hits.T) > 0).astype(float)
-        graph.setdiag(0)
-        blocks.append(sp.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph)
-    star = sp.lil_matrix((n, n))
-    star[0, 1:] = star[1:, 0] = -1
-    star.setdiag([n - 1] + [1] * (n - 1))
-    return sp.block_diag([*blocks, star]).tocsr()
-
-
 def elastic_body() -> tuple[sp.csr_matrix, sp.csr_matrix]:
     """Stiffness and mass of a free elastic box: six rigid modes."""
     mesh = MeshTet.init_tensor(*(np.linspace(0, length, m) for length, m in ((2.0, 7), (1.0, 4), (1.1, 5))))
     basis = Basis(mesh, ElementVector(ElementTetP1()))
     mass = BilinearForm(lambda u, v, _: dot(u, v)).assemble(basis)
     return linear_elasticity(*lame_parameters(1.0, 0.3)).assemble(basis).tocsr(), mass.tocsr()
-
-
-def indefinite(n: int) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-    """A random indefinite K, and a positive definite M with another pattern."""
-    rng = np.random.default_rng(7)
-    K = sp.random(n, n, 2.5 / n, random_state=0)
-    L = sp.random(n, n, 1 / n, random_state=1)
-    return ((K + K.T) / 2 + sp.diags(rng.standard_normal(n))).tocsr(), (
-        L @ L.T + sp.diags(rng.uniform(1, 2, n))
-    ).tocsr()
 
 
 CASES = {
@@ -134,24 +111,6 @@ def loss(pencil, k, weights, solver=SOLVER):
     return jnp.sum(pairs.eigenvalues) + jnp.sum(jnp.sum(pairs.vectors**2, axis=0) * weights)
 
 
-def directions(pencil, rng):
-    """Symmetric changes of the entries of K and M."""
-    n, pattern = pencil.size, pencil.pattern
-    at = sp.coo_matrix((rng.standard_normal(pattern.rows.size), (pattern.rows, pattern.cols)), shape=(n, n)).tocsr()
-    change = np.asarray(((at + at.T) / 2)[pattern.rows, pattern.cols]).ravel()
-    for name in ("stiffness", "mass"):
-        yield eqx.tree_at(
-            lambda p, name=name: getattr(p, name).entries, jax.tree.map(jnp.zeros_like, pencil), jnp.asarray(change)
-        )
-
-
-def lattice(n: int) -> sp.csr_matrix:
-    """The Laplacian of a torus of n × n vertices, whose eigenvalues come in groups of four."""
-    ring = sp.lil_matrix(2 * sp.eye(n) - sp.eye(n, k=1) - sp.eye(n, k=-1))
-    ring[0, -1] = ring[-1, 0] = -1
-    return (sp.kron(ring, sp.eye(n)) + sp.kron(sp.eye(n), ring)).tocsr()
-
-
 SIMPLE = pytest.param(lambda: indefinite(300), 12, marks=pytest.mark.slow)
 MULTIPLE = (lambda: (lattice(18), sp.eye(324)), 9)
 
@@ -184,12 +143,6 @@ def test_forward_mode_traced_and_batched(rng):
     batch = jax.vmap(lambda entries: run(eqx.tree_at(lambda p: p.stiffness.entries, pencil, entries)))(several)
     np.testing.assert_allclose(batch[0], value, rtol=1e-10)
     np.testing.assert_allclose(batch[1], run(eqx.tree_at(lambda p: p.stiffness.entries, pencil, several[1])), rtol=1e-8)
-
-
-def test_an_interval_has_no_derivative():
-    pencil = hj.sparse_pencil(sp.diags(np.arange(1.0, 9)).tocsr())
-    with pytest.raises(NotImplementedError, match="interval"):
-        jax.grad(lambda p: jnp.sum(hj.eigsh(p, interval=(2.5, 4.5), k=2).eigenvalues), allow_int=True)(pencil)
 
 
 def test_what_is_refused():

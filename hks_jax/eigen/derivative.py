@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
+from hks_jax.eigen.complement.common import unsolved
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.in_turn import in_turn
 from hks_jax.eigen.quality import indistinct
@@ -76,9 +77,8 @@ def _lowest_jvp(
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
     quiet = is_traced(primals) or solver.adjoint.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
-    # Apart from the tangents, so that many products with one Jacobian share it.
-    prepared = in_turn(_prepare, (solver.adjoint, k), pencil, values) if _beyond(pencil, k, total) else None
-    tangents = _tangents(solver, k, extra, telling, prepared, pencil, change, values, vectors)
+    prepared = prepare(solver.adjoint, k, pencil, values)
+    tangents = tangents_of(solver.adjoint, k, extra, telling, prepared, pencil, change, values, vectors)
     tangents = *tangents, jnp.zeros_like(complete_below)
     values, vectors = _leading(values, vectors, k + extra)
     return (values, vectors, vectors, complete_below), tangents
@@ -96,16 +96,22 @@ def _leading(
     return values[:size], vectors[:size]
 
 
-def _beyond(pencil: SymmetricPencil, k: int, p: int) -> bool:
+# Apart from the tangents, so that many products with one Jacobian share it.
+def prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Array, " p"]) -> Any:
+    """Return what the adjoint needs for the first k of p computed pairs; None where it has nothing to solve."""
+    return in_turn(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
+
+
+def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     """Return whether derivatives of the first k of p computed pairs have parts in other eigenvectors."""
     return p < pencil.size and pencil.n_null < k
 
 
-# What is kept for the transpose would be several copies of the eigenvectors.
-@partial(jax.jit, static_argnames=("solver", "k", "extra", "telling"))
+# What else were kept for the transpose would be copies of the eigenvectors.
+@partial(jax.jit, static_argnames=("adjoint", "k", "extra", "telling"))
 @partial(jax.checkpoint, static_argnums=(0, 1, 2, 3))
-def _tangents(
-    solver: Eigensolver,
+def tangents_of(
+    adjoint: Adjoint,
     k: int,
     extra: int,
     telling: Telling,
@@ -115,7 +121,10 @@ def _tangents(
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
 ) -> Lowest:
-    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs, and zeros for ``extra``."""
+    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs, and zeros for ``extra``.
+
+    The pairs come in the order that the adjoint expects, for which it is prepared.
+    """
     eigenvalues, functions = values[:k], vectors[:k]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
@@ -127,15 +136,15 @@ def _tangents(
     gauge = -jnp.matmul(moved, functions.T, precision="highest") / 2
     within = jnp.where(apart[:, :k], rotation[:, :k], gauge)
     frame = jnp.matmul(rotation[:, k:], vectors[k:], precision="highest")
-    if _beyond(pencil, k, len(values)):
-        frame = frame + _outside(solver, telling, prepared, pencil, values, vectors, -force)
+    if _solves(pencil, k, len(values)):
+        frame = frame + _outside(adjoint, telling, prepared, pencil, values, vectors, -force)
     d_vectors = jnp.matmul(within, functions, precision="highest") + frame
     d_vectors, frame = (jnp.pad(d, ((0, extra), (0, 0))) for d in (d_vectors, frame))
     return jnp.pad(jnp.diagonal(into), (0, extra)), d_vectors, frame
 
 
 def _outside(
-    solver: Eigensolver,
+    adjoint: Adjoint,
     telling: Telling,
     prepared: Any,
     pencil: SymmetricPencil,
@@ -150,7 +159,7 @@ def _outside(
         return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
 
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return _told(telling, in_turn(_solve, (solver.adjoint,), prepared, pencil, values, vectors, b))
+        return _told(telling, in_turn(_solve, (adjoint,), prepared, pencil, values, vectors, b))
 
     # No force acts on the constants: they stay in the kernel of the stiffness. In reverse mode, where their rows are
     # cotangents, it is their solutions that do not count.
@@ -175,24 +184,16 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
     """Return x; where rows of it are NaN, warn or raise."""
     failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
     if telling == "error":
-        return eqx.error_if(x, failed > 0, _message("some", len(x)))
+        return eqx.error_if(x, failed > 0, unsolved("some", len(x)))
     if telling == "warning":
 
         def warn(failed: Array | np.ndarray) -> np.ndarray:
             if failed:
-                warn_of_accuracy(_message(str(int(failed)), len(x)))
+                warn_of_accuracy(unsolved(int(failed), len(x)))
             return np.zeros((), x.dtype)
 
         return x + jax.pure_callback(warn, jax.ShapeDtypeStruct((), x.dtype), failed, vmap_method="sequential")
     return x
-
-
-def _message(failed: str, total: int) -> str:
-    return (
-        f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, and their part is NaN. k "
-        "may cut a cluster of eigenvalues, or the eigenpairs themselves did not converge: take another k or solver, or "
-        "set multiplet='drop' in `eigenpairs`"
-    )
 
 
 @jax.jit

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.describe import describe_array
+from hks_jax.eigen.messages import messages
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.pencil import SymmetricPencil
@@ -130,32 +131,8 @@ class Eigenpairs(eqx.Module):
 
     def messages(self) -> list[str]:
         """Say in sentences what limits these pairs; empty if nothing does. Needs concrete values."""
-        sentences = []
-        bad = ~np.asarray(self.converged)
-        if bad.any():
-            missing = int(np.isnan(np.asarray(self.eigenvalues)).sum())
-            worst = np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
-            remedy = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
-            sentences.append(
-                f"{int(bad.sum())} of {self.k} eigenpairs did not converge ({missing} of them not sentences, worst "
-                f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
-                f"Use float64, fewer pairs, or {remedy}"
-            )
-        bound, last = float(self.complete_below), float(self.last_eigenvalue)
-        if bool(self.unconfirmed):
-            sentences.append(
-                f"the {self.solver_name} solver could not confirm that it missed no eigenvalue between {bound:.6g} and "
-                f"{last:.6g}. Use another solver, or a slightly different k"
-            )
-        cut, kept = int(self.cut_multiplet), int(self.kept.sum())
-        if cut:
-            remedy = f"Take k = {kept - cut} or a larger one" if cut < kept else "Take a larger k"
-            sentences.append(
-                f"k = {kept} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = "
-                f"{float(self.last_eigenvalue):.6g}, have equals beyond k, and which of them are among the k is "
-                f"arbitrary. {remedy}"
-            )
-        return sentences
+        other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
+        return messages(self, int(self.kept.sum()), int(self.cut_multiplet), other)
 
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Needs concrete values."""

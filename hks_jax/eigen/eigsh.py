@@ -15,11 +15,12 @@ from hks_jax.eigen.count import certain_count, count_eigenvalues
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import lowest
 from hks_jax.eigen.eigenpairs import RESULTS, result_of
+from hks_jax.eigen.interval import in_interval
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos
 from hks_jax.eigen.located import locate, translated
+from hks_jax.eigen.messages import messages
 from hks_jax.eigen.quality import quality
 from hks_jax.eigen.solver import Eigensolver, Report, silent
-from hks_jax.linear.not_differentiable import not_differentiable
 from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.sparse_input import sparse_pencil
@@ -29,10 +30,6 @@ _DENSE = 1000
 """Rows up to which all eigenpairs at once are faster."""
 _CUT = 1e-6
 """The gap, relative to the whole spread, below which two eigenvalues count as one."""
-_NO_DERIVATIVE = (
-    "eigsh: eigenpairs in an interval have no derivatives; compute the k lowest instead, k = the number of eigenvalues "
-    "below the interval's upper end (`count_eigenvalues`)"
-)
 
 
 class MatrixEigenpairs(eqx.Module):
@@ -97,7 +94,8 @@ def eigsh(
 
     Differentiable with respect to the entries of K and M, forward and reverse, once: exactly at any multiplicity, for
     what does not depend on the basis within a multiple eigenvalue. Works under `jit` and, with one pattern, `vmap` over
-    the entries (make the pencil with `sparse_pencil` and map over it). Pairs in an interval have no derivatives.
+    the entries (make the pencil with `sparse_pencil` and map over it). Pairs in an interval are differentiated with the
+    interval's ends fixed.
 
     Args:
         K: symmetric (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of this
@@ -107,6 +105,7 @@ def eigsh(
             of eigenvalues in the interval (`count_eigenvalues`).
         interval: (a, b): all a ≤ λ < b.
         solver: `BlockLanczos` with other settings; None takes its defaults, and for small matrices all pairs at once.
+            Of its ``adjoint``, derivatives in an interval take the tolerance alone.
         throw: whether a failure is an error, also under `jit`; else the pairs carry a code, ``.result``, and it is
             warned of where values are concrete.
         progress: called with short texts after each slice, where values are concrete; ``print`` will do.
@@ -126,7 +125,8 @@ def eigsh(
     if not is_traced(jax.lax.stop_gradient(pencil)):
         _check_mass(pencil)
     if interval is not None:
-        pairs = _in_interval(pencil, *_checked_interval(pencil, interval, k), solver, progress or silent)
+        held = _checked_interval(jax.lax.stop_gradient(pencil), interval, k)
+        pairs = _in_interval(pencil, *held, solver, throw, progress or silent)
         following = jnp.asarray(jnp.inf, pairs.eigenvalues.dtype)
     elif k is None:
         raise ValueError("k: not given; expected the number of eigenpairs, or an interval")
@@ -168,20 +168,17 @@ def _in_interval(
     below: Int[Array, ""],
     k: int,
     solver: BlockLanczos | None,
+    throw: bool,
     report: Report,
 ) -> MatrixEigenpairs:
     """Return the k pairs between two numbers, below the first of which lie so many eigenvalues."""
-    pencil, method = not_differentiable(_NO_DERIVATIVE, pencil), _method(solver, k, pencil.size)
+    method = _method(solver, k, pencil.size)
     moved = translated(pencil, low, below, (high - low) / (2 * max(k / SLICE, 1)), (high - low) / max(k, 1))
     if k == 0:
         values, vectors, bound = jnp.zeros(0, low.dtype), jnp.zeros((0, pencil.size), low.dtype), high - low
-    elif isinstance(method, Dense):
-        values, vectors, _ = method.lowest(moved, pencil.size)
-        values, vectors = (jax.lax.dynamic_slice_in_dim(x, below, k) for x in (values, vectors))
-        bound = high - low
-    else:
-        values, vectors, bound = method.lowest(moved, k, report)
-    return _pairs(pencil, moved, low, values, vectors, vectors, bound, method)
+        return _pairs(pencil, moved, low, values, vectors, vectors, bound, method)
+    values, vectors, frame, bound = in_interval(method, moved, k, throw, report)
+    return _pairs(pencil, moved, low, values, vectors, frame, jnp.minimum(bound, high - low), method)
 
 
 def _pairs(
@@ -266,23 +263,8 @@ def _report(pairs: MatrixEigenpairs, following: Float[Array, ""]) -> None:
     """Warn of what limits the pairs, where values are concrete."""
     if is_traced(pairs.eigenvalues) or not pairs.k:
         return
-    values, bad = np.asarray(pairs.eigenvalues), ~np.asarray(pairs.converged)
-    if bad.any():
-        worst = np.nanmax(np.asarray(pairs.residuals)[bad], initial=0.0)
-        warn_of_accuracy(
-            f"{int(bad.sum())} of {pairs.k} eigenpairs did not converge ({int(np.isnan(values).sum())} of them not "
-            f"found, worst relative residual of the others {worst:.1e}). Use float64 or fewer pairs"
-        )
-    if bool(pairs.unconfirmed):
-        warn_of_accuracy(
-            f"no proof that no eigenvalue was missed between {float(pairs.complete_below):.6g} and {values[-1]:.6g}. "
-            "Use a slightly different k"
-        )
+    values = np.asarray(pairs.eigenvalues)
     gap = _CUT * max(values[-1] - values[0], abs(values[-1]) * float(np.finfo(values.dtype).eps))
-    if float(following) - values[-1] <= gap:
-        cut = int(np.sum(values >= values[-1] - gap))
-        remedy = f"Take k = {pairs.k - cut} or a larger one" if cut < pairs.k else "Take a larger k"
-        warn_of_accuracy(
-            f"k = {pairs.k} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = {values[-1]:.6g}, have equals "
-            f"beyond k, and which of them are among the k is arbitrary. {remedy}"
-        )
+    cut = int(np.sum(values >= values[-1] - gap)) if float(following) - values[-1] <= gap else 0
+    for message in messages(pairs, pairs.k, cut, "a solver with other settings"):
+        warn_of_accuracy(message)

@@ -1,4 +1,4 @@
-"""Where the spectrum of any pencil begins, and how dense it is there: by counting eigenvalues below a few shifts."""
+"""Where the spectrum of any pencil begins, and how dense it is at some place: by counting below a few shifts."""
 
 from functools import partial
 from typing import NamedTuple
@@ -18,6 +18,8 @@ _TRIES = 60
 """Factorisations before giving up."""
 _JUST_BELOW = 0.625
 """The distance from zero at which the count of a singular matrix is still accurate, as a power of ε."""
+_ALIKE = 1e-3
+"""The relative difference of two distances below which the eigenvalues between them count as one multiple one."""
 _NARROW = 8
 """How many times that distance a bracket is not divided any more."""
 
@@ -50,6 +52,61 @@ def translated(
     assert isinstance(stiffness, SparseOperator)
     moved = SparseOperator(pencil.shifted(jax.lax.stop_gradient(origin)), stiffness.pattern)
     return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)))
+
+
+class _Descent(NamedTuple):
+    """What is known of the eigenvalues next below an origin.
+
+    Attributes:
+        near: the largest distance tried within which there are few enough; 0 at first.
+        number: how many those are.
+        far: the least distance tried within which there are too many; ∞ before there is one.
+        far_number: how many those are.
+        next: what to try next.
+        tries: counts so far.
+    """
+
+    near: Float[Array, ""]
+    number: Int[Array, ""]
+    far: Float[Array, ""]
+    far_number: Int[Array, ""]
+    next: Float[Array, ""]
+    tries: Int[Array, ""]
+
+
+@jit_quickly(static_argnames=("most", "probes"))
+def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Return how far to lower an origin, and how many eigenvalues it passes: at most so many, and half of them or more.
+
+    Fewer only where there are no more, or where the next is a multiple one that would be too many. Each factorisation
+    is tried out on so many random right-hand sides.
+    """
+    dissection, dtype = dissect(pencil.pattern), pencil.stiffness.dtype
+    tried = jax.random.normal(jax.random.key(0), (pencil.size, probes), dtype)
+
+    def unfinished(state: _Descent) -> Bool[Array, ""]:
+        few = (2 * state.number < most) & (state.number < pencil.negative)
+        narrow = state.far - state.near <= _ALIKE * jnp.maximum(state.near, pencil.spacing)
+        return few & ~narrow & (state.tries < _TRIES)
+
+    def step(state: _Descent) -> _Descent:
+        count, sound = count_once(pencil, dissection, -state.next, tried)
+        passed = pencil.negative - count
+        nearer, farther = sound & (passed <= most), sound & (passed > most)
+        near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
+        far, far_number = jnp.where(farther, state.next, state.far), jnp.where(farther, passed, state.far_number)
+        share = (3 * most // 4 - number) / jnp.maximum(far_number - number, 1)
+        between = near + jnp.clip(share.astype(dtype), 1 / 8, 7 / 8) * (far - near)
+        following = jnp.where(jnp.isfinite(far), between, 4 * near)
+        # Where the count is not to be trusted, try beside.
+        following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
+        return _Descent(near, number, far, far_number, following, state.tries + 1)
+
+    nothing = jnp.zeros((), dtype)
+    first = 3 / 4 * most * pencil.spacing
+    none = jnp.zeros((), int)
+    state = jax.lax.while_loop(unfinished, step, _Descent(nothing, none, nothing + jnp.inf, none, first, none))
+    return state.near, state.number
 
 
 class _Search(NamedTuple):

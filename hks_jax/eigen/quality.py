@@ -7,6 +7,8 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.linear.pencil import SymmetricPencil
 
+_EXCUSED = 0.01
+"""The relative residual that rounding excuses at most."""
 _ROWS = 8
 """How many vectors to look at together: what is computed from them stays in the cache."""
 
@@ -45,12 +47,22 @@ def quality(
 
     Eigenvalues smaller than ``unit`` are measured by it.
     """
-    _, defect = values_and_defects(pencil, vectors, values)
+    _, defects = values_and_defects(pencil, vectors, values)
     scale = jnp.maximum(jnp.abs(values), jnp.abs(unit))
-    scale = jnp.where(scale > 0, scale, 1)
-    residuals, rounding = defect / scale, indistinct(pencil, values.dtype) / scale
-    # Rounding excuses a residual of a per cent at most: beyond that, the pair is not known, whatever the reason.
-    return residuals, residuals <= jnp.maximum(tolerance, jnp.minimum(rounding, 0.01)), rounding
+    scale, rounding = jnp.where(scale > 0, scale, 1), indistinct(pencil, values.dtype)
+    return defects / scale, defects <= allowed_defects(scale, rounding, tolerance), rounding / scale
+
+
+def allowed_defects(scale: Float[Array, " m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, " m"]:
+    """Return the defects ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
+
+    Args:
+        scale: what their residuals are relative to: the size of λ, or of a typical eigenvalue if that is larger.
+        rounding: the defects that rounding alone may make; it excuses a relative residual of a per cent at most, beyond
+            which the pair is not known, whatever the reason.
+        tolerance: the relative residual asked for.
+    """
+    return jnp.maximum(tolerance * scale, jnp.minimum(rounding, _EXCUSED * scale))
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:

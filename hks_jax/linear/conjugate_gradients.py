@@ -23,19 +23,26 @@ class _Iteration(NamedTuple):
     steps: Int[Array, ""]
 
 
+def _dot(x: Float[Array, "n_dof b"], y: Float[Array, "n_dof b"]) -> Float[Array, " b"]:
+    return jnp.sum(x * y, axis=0)
+
+
 def conjugate_gradients(
     product: Callable[[Array], tuple[Array, Array]],
     precondition: Callable[[Array], Array],
     rhs: Float[Array, "n_dof b"],
     wanted: Float[Array, " b"],
+    inner: Callable[[Array, Array], Array] = _dot,
 ) -> Float[Array, "n_dof b"]:
     """Solve Aᵢxᵢ = rhsᵢ for a block of columns; NaN where the error asked for is not reached.
 
     Args:
         product: x ↦ Aᵢxᵢ, and for each column the energy xᵢᵀAᵢxᵢ below which Aᵢ counts as singular.
-        precondition: r ↦ an approximation of Aᵢ⁻¹rᵢ, symmetric and positive definite.
+        precondition: r ↦ an approximation of Aᵢ⁻¹rᵢ.
         rhs: the right-hand sides.
         wanted: the error in the energy norm, relative; columns of which it is infinite stay zero.
+        inner: the inner products (b,) of two blocks of columns, with respect to which all Aᵢ and the preconditioner are
+            symmetric and positive definite; energies are measured with it.
     """
 
     def going_on(state: _Iteration) -> Bool[Array, ""]:
@@ -46,12 +53,12 @@ def conjugate_gradients(
     def step(state: _Iteration) -> _Iteration:
         x, r, p, first, before, errors, going, steps = state
         z = precondition(r)
-        energy = jnp.sum(r * z, axis=0)
+        energy = inner(r, z)
         first = jnp.where(steps == 0, energy, first)
         change = jnp.where(going & (steps > 0), energy / before, 0)
         p = jnp.where(going, z + change * p, p)
         image, least = product(p)
-        curvature = jnp.sum(p * image, axis=0)
+        curvature = inner(p, image)
         regular = curvature > least
         length = jnp.where(going & regular, energy / jnp.where(regular, curvature, 1), 0)
         reduction = jnp.where(steps > 0, jnp.sqrt(jnp.minimum(jnp.abs(change), 1)), 1)

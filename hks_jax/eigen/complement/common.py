@@ -53,6 +53,12 @@ def first_beyond(values: Float[Array, " p"]) -> Float[Array, ""]:
     return values[-1] * (1 + 1 / values.size)
 
 
+def amplification(values: Float[Array, " p"], k: int) -> Float[Array, " k"]:
+    """Return the norms Λ/(Λ − λᵢ), relative to that for λ = 0, of the inverses on the complement."""
+    beyond = first_beyond(values)
+    return beyond / (beyond - values[:k])
+
+
 # The accuracy asked for is relative to the right-hand sides bᵢ as they were given, before Q = I − MΦΦᵀ took the known
 # eigenvectors out of them. What is left may be rounding alone: along T itself dK and dM are multiples of K and M, so
 # that bᵢ is one of Mφᵢ and Qbᵢ = 0. Relative to itself that noise has no solution, since most of it lies in the span of
@@ -65,23 +71,23 @@ def wanted_errors(
     before: Float[Array, " b"],
     after: Float[Array, " b"],
     largest: Float[Array, ""],
-    amplification: Float[Array, " b"],
+    amplified: Float[Array, " b"],
     tolerance: float,
     dtype: Any,
 ) -> Float[Array, " b"]:
     """Return the errors to reduce rows to, in the energy norm, relative to each row's own; infinite for zero.
 
     Args:
-        before: the norms of the right-hand sides bᵢ, by `norms`.
-        after: the norms of what the projection leaves of them, Qbᵢ.
-        largest: the largest norm of all right-hand sides, those of other blocks included.
-        amplification: Λ/(Λ − λᵢ).
+        before: the `norms` of the right-hand sides bᵢ.
+        after: those of what the projection leaves of them, Qbᵢ.
+        largest: the largest of all right-hand sides, other blocks included.
+        amplified: how much larger the solution of a row becomes than that of another as large.
         tolerance: the accuracy of the largest row.
         dtype: what the eigenvectors and the rows were rounded to.
     """
-    xp = before.__array_namespace__()
+    xp = amplified.__array_namespace__()
     # Where all rows are zero, none is asked for.
-    share = after / xp.where(largest > 0, largest, 1) * amplification
+    share = after / xp.where(largest > 0, largest, 1) * amplified
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
 
@@ -115,16 +121,34 @@ def shifts_between(
 ) -> Float[Array, " g"]:
     """Return a shift for each group of rows whose distances from Λ lie between the given ones.
 
-    The geometric mean of the two leaves the least condition, √ of their ratio. The shift is the middle of the gap in
-    the spectrum that is nearest to it, so that it is no eigenvalue.
+    The geometric mean of the two leaves the least condition, √ of their ratio.
     """
     xp = values.__array_namespace__()
-    targets = first_beyond(values) - xp.sqrt(nearest * farthest)
-    below = -0.1 * values[-1]
+    targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
         return xp.broadcast_to(below, targets.shape)
+    return middles_of_gaps(values, targets, below)
+
+
+def middles_of_gaps(
+    values: Float[Array, " p"], targets: Float[Array, " g"], otherwise: Float[Array, ""]
+) -> Float[Array, " g"]:
+    """Return the middle of the gap between two known eigenvalues that is nearest to each target: it is no eigenvalue.
+
+    Where all p ≥ 2 are equal it is ``otherwise``.
+    """
+    xp = values.__array_namespace__()
     gaps = xp.diff(values)
     typical = (values[-1] - values[0]) / (values.size - 1)
     distance = xp.abs(values[:-1] + gaps / 2 - targets[:, None])
     chosen = xp.argmin(xp.where(gaps >= 0.1 * typical, distance, xp.inf), axis=1)
-    return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, below)
+    return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, otherwise)
+
+
+def unsolved(failed: int | str, total: int) -> str:
+    """Say that solves for so many of all rows did not converge."""
+    return (
+        f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, and their part is NaN. k, "
+        "or an end of the interval, may cut a cluster of eigenvalues, or the eigenpairs themselves did not converge: "
+        "take another k, interval or solver, or set multiplet='drop' in `eigenpairs`"
+    )

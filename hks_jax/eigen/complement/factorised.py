@@ -6,6 +6,7 @@ by Weyl's law eigenvalues are spread evenly enough for that. The factorisations 
 all products with a Jacobian at one point.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -17,31 +18,32 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import (
+    amplification,
     attainable,
     definite_product,
     first_beyond,
     group_numbers,
-    norms,
     shifts_between,
-    wanted_errors,
 )
+from hks_jax.eigen.complement.in_blocks import solve_in_blocks
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, inner_products, products_with_columns
+from hks_jax.linear.products import combine, products_with_columns
 
-_BLOCK = 16
+BLOCK = 16
 """Rows solved at once."""
-_CHUNK = 128
-"""Rows that the known eigenvectors are taken out of at once."""
-_WINDOW = 32
+WINDOW = 32
 """Eigenvectors next to a shift that every step takes out."""
 _MEMORY = 5e8
 """Bytes that factorisations may take together."""
 
 
-class _Groups(NamedTuple):
+Factors = tuple[tuple[Array, ...], tuple[Array, ...], Int[Array, " groups"]]
+
+
+class Groups(NamedTuple):
     """How rows are grouped; static.
 
     Attributes:
@@ -87,12 +89,23 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 @partial(jax.jit, static_argnames=("k", "tolerance"))
 def _factorise(
     dissection: Dissection, pencil: SymmetricPencil, values: Float[Array, " p"], k: int, tolerance: float
-) -> tuple[tuple[Array, ...], tuple[Array, ...], Int[Array, " groups"]]:
+) -> Factors:
     groups = _group(dissection, values, k, tolerance)
     beyond = first_beyond(values)
     shifts = shifts_between(values, beyond - values[groups.last], beyond - values[groups.first])
+    return factorise_each(dissection, pencil, shifts)
+
+
+def factorise_each(dissection: Dissection, pencil: SymmetricPencil, shifts: Float[Array, " groups"]) -> Factors:
+    """Return the fields of the stacked factorisations of K − σM, without the dissection."""
     factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
     return factors.downward, factors.upward, factors.negative
+
+
+def of_group(factors: Factorisation, group: Int[Array, ""]) -> Factorisation:
+    """Return one of the stacked factorisations."""
+    matrices = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.negative))
+    return Factorisation(factors.dissection, *matrices)
 
 
 @partial(jax.jit, static_argnames="tolerance")
@@ -104,22 +117,12 @@ def _solve(
     rhs: Float[Array, "k n_dof"],
     tolerance: float,
 ) -> Float[Array, "k n_dof"]:
-    k, beyond, window = rhs.shape[0], first_beyond(values), min(_WINDOW, values.size)
-    tolerance, lumped = attainable(tolerance, rhs.dtype), pencil.mass.diagonal()
-    of_block = _group(factors.dissection, values, k, tolerance).of_block
-    chunks = -(-k // _CHUNK)
-    blocks = -(-of_block.size // chunks)
-    before = jax.lax.map(lambda b: norms(b[None], lumped)[0], rhs)
-    largest = jnp.max(before)
+    k, beyond, window = rhs.shape[0], first_beyond(values), min(WINDOW, values.size)
+    tolerance = attainable(tolerance, rhs.dtype)
+    of_block = jnp.asarray(_group(factors.dissection, values, k, tolerance).of_block)
 
-    def taken_out(b: Float[Array, "rows n_dof"]) -> Float[Array, "rows n_dof"]:
-        return b - pencil.mass.apply(combine(inner_products(vectors, b), vectors))
-
-    def solve_block(block: tuple[Array, Array, Array, Array]) -> Array:
-        g, shifts, b, wanted = block
-        matrices = jax.tree.map(lambda stacked: stacked[g], (factors.downward, factors.upward, factors.negative))
-        factor = Factorisation(factors.dissection, *matrices)
-
+    def solve_block(number: Array, b: Array, wanted: Array, shifts: Array) -> Array:
+        factor = of_group(factors, of_block[number])
         nearest = jnp.clip(factor.negative - window // 2, 0, values.size - window)
         near = jax.lax.dynamic_slice_in_dim(vectors, nearest, window)
         near_images = pencil.mass.apply(near)
@@ -132,33 +135,28 @@ def _solve(
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
-    # Known eigenvectors are taken out of many rows at once, and no array but the solution is as large as they are.
-    def solve_chunk(chunk: tuple[Array, Array, Array, Array]) -> Array:
-        g, at, shifts, before = chunk
-        b = rhs.at[at].get(mode="clip")
-        left = taken_out(b)
-        amplification = beyond / (beyond - shifts)
-        wanted = wanted_errors(before, norms(left, lumped), largest, amplification, tolerance, rhs.dtype)
-        wanted = jnp.where(at < k, wanted, jnp.inf)
-        parts = g, *(x.reshape(blocks, _BLOCK, *x.shape[1:]) for x in (shifts, left, wanted))
-        x = jax.lax.map(solve_block, parts).reshape(b.shape)
-        return x - combine(inner_products(vectors, pencil.mass.apply(x)), vectors)
-
-    # The last chunk is filled up with rows in which there is nothing to solve.
-    at = np.arange(chunks * blocks * _BLOCK).reshape(chunks, -1)
-    number = np.pad(of_block, (0, chunks * blocks - of_block.size), mode="edge").reshape(chunks, -1)
-    shifts, before = (x[np.minimum(at, k - 1)] for x in (values, before))
-    x = jax.lax.map(solve_chunk, (jnp.asarray(number), jnp.asarray(at), shifts, before))
-    return x.reshape(at.size, -1)[:k]
+    of_rows = amplification(values, k), values[:k]
+    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, *of_rows)
 
 
-def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> _Groups:
-    """Group blocks of the rows 0 … k−1 whose distance from Λ, by Weyl's law in 2D, is of one order."""
-    start = np.arange(0, k, _BLOCK)
-    end = np.minimum(start + _BLOCK, k)
-    distance = values.size + 1 - (start + end - 1) / 2
+def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> Groups:
+    """Group blocks of rows whose distance from Λ, by Weyl's law in 2D, is of one order."""
+    return group_blocks(dissection, lambda row: values.size + 1 - row, values.dtype, k, tolerance)
+
+
+def group_blocks(
+    dissection: Dissection,
+    distance_of: Callable[[Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
+    dtype: np.dtype,
+    k: int,
+    tolerance: float,
+) -> Groups:
+    """Group blocks of the rows 0 … k−1, each by what its middle row has for a distance; see `group_numbers`."""
+    start = np.arange(0, k, BLOCK)
+    end = np.minimum(start + BLOCK, k)
+    distance = distance_of((start + end - 1) / 2)
     entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
-    room = max(int(_MEMORY / (entries * values.dtype.itemsize)), 1)
+    room = max(int(_MEMORY / (entries * dtype.itemsize)), 1)
     number = group_numbers(distance, k, tolerance, room)
     _, first, of_block = np.unique(number, return_index=True, return_inverse=True)
-    return _Groups(of_block, start[first], np.append(start[first[1:]], k) - 1)
+    return Groups(of_block, start[first], np.append(start[first[1:]], k) - 1)

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import (
+    amplification,
     attainable,
     definite_product,
     first_beyond,
-    norms,
-    wanted_errors,
 )
+from hks_jax.eigen.complement.in_blocks import solve_in_blocks
 from hks_jax.eigen.filter.coarsening import finest_level
 from hks_jax.eigen.filter.damping import Band, correction, degree_for, upper_end
 from hks_jax.fem.columns import to_columns, to_rows
@@ -96,8 +96,7 @@ def _solve(
     def without_known(x: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
         return x - combine(inner_products(images, x), vectors)
 
-    def one_block(args: tuple[Array, Array, Array, Array]) -> Float[Array, "b n_dof"]:
-        shifts, references, b, wanted = args
+    def one_block(number: Array, b: Array, wanted: Array, shifts: Array, references: Array) -> Float[Array, "b n_dof"]:
         degree = jnp.ceil(jnp.clip(degree_for(band, jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
         def precondition(r: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
@@ -107,14 +106,5 @@ def _solve(
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
-    left = rhs - combine(inner_products(vectors, rhs), images)
-    before, after = (norms(rows, pencil.mass.diagonal()) for rows in (rhs, left))
-    wanted = wanted_errors(before, after, jnp.max(before), beyond / (beyond - values[:k]), tolerance, rhs.dtype)
-    count = -(-k // block)
-    spare = count * block - k  # rows that fill the last block up, with nothing to solve
-    parts = (
-        *(jnp.pad(v[:k], (0, spare)).reshape(count, block) for v in (values, quotients)),
-        jnp.pad(left, ((0, spare), (0, 0))).reshape(count, block, -1),
-        jnp.pad(wanted, (0, spare), constant_values=jnp.inf).reshape(count, block),
-    )
-    return jax.lax.map(one_block, parts).reshape(count * block, -1)[:k]
+    of_rows = amplification(values, k), values[:k], quotients[:k]
+    return solve_in_blocks(one_block, block, pencil, vectors, rhs, tolerance, *of_rows)

@@ -12,6 +12,7 @@ from hks_jax.eigen.filter.coarsening import GridLevel, interpolate
 from hks_jax.eigen.filter.damping import Band, correction, degree_for
 from hks_jax.eigen.filter.sharing import EVERYWHERE, own_blocks, shared, to_own_rows, to_slabs
 from hks_jax.eigen.filter.subspace import block_of, local_level, measure, rayleigh_ritz
+from hks_jax.eigen.quality import allowed_defects
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.columns import stencil, stencil_product, to_columns, to_rows
 from hks_jax.fem.halo import Slabs
@@ -111,8 +112,7 @@ def _converged(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Bo
 
 
 def _allowed(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Float[Array, " m"]:
-    scale = jnp.maximum(state.values, state.values[plan.n_null])
-    return jnp.maximum(plan.tolerance * scale, jnp.minimum(rounding, 0.01 * scale))
+    return allowed_defects(jnp.maximum(state.values, state.values[plan.n_null]), rounding, plan.tolerance)
 
 
 @partial(jax.jit, static_argnames=("periodic", "plan"))

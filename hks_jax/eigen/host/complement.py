@@ -22,11 +22,13 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import (
     SINGULAR,
+    amplification,
     attainable,
     first_beyond,
     group_numbers,
     norms,
     shifts_between,
+    unsolved,
     wanted_errors,
 )
 from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices
@@ -73,11 +75,7 @@ class HostAdjoint(Adjoint[Pencil]):
             x, errors = _solve(K, M, values, vectors, b, tolerance, rhs.dtype)
             failed = ~(errors <= 1)
             if failed.any():
-                warn_of_accuracy(
-                    f"derivative: the linear solves for {int(failed.sum())} of {failed.size} eigenpairs did not "
-                    f"converge, and their part is NaN. k may cut a cluster of eigenvalues: take another k, or set "
-                    "multiplet='drop' in `eigenpairs`",
-                )
+                warn_of_accuracy(unsolved(int(failed.sum()), failed.size))
                 x[failed] = np.nan
             return x.astype(rhs.dtype)
 
@@ -114,10 +112,8 @@ def _solve(
     x, errors = np.zeros_like(rhs), np.zeros(len(rhs))
     left = rhs - (rhs @ phi) @ m_phi.T
     before, after = (norms(rows, M.diagonal()) for rows in (rhs, left))
-    beyond = float(first_beyond(values))
-    amplification = beyond / (beyond - values[: len(rhs)])
-    wanted = wanted_errors(before, after, before.max(), amplification, tolerance, dtype)
-    rhs = left
+    wanted = wanted_errors(before, after, before.max(), amplification(values, len(rhs)), tolerance, dtype)
+    rhs, beyond = left, float(first_beyond(values))
     active = np.flatnonzero(np.isfinite(wanted))
 
     def solve(block: np.ndarray, factor: SuperLU) -> None:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
 from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, steps_for
-from hks_jax.eigen.quality import indistinct, values_and_defects
+from hks_jax.eigen.quality import allowed_defects, indistinct, values_and_defects
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
 
@@ -45,7 +45,7 @@ def _consider(
     known, below = jnp.sum(state.values < state.shift), negative - problem.negative
     missing = below - known
     complete = trial.sound & (missing == 0)
-    finished = complete & (known >= plan.wanted)
+    finished = complete & ((known >= plan.wanted) | (negative == problem.pencil.size))  # all, or there are no more
     too_many = trial.sound & (missing > plan.slice_size)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, tolerance, lowest))
@@ -126,8 +126,8 @@ def _accept(
     # Where nothing converged, as on a domain much longer than wide, it is rounding that is worse than usual: the
     # residuals say so.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
-    rounding = jnp.minimum(excuse * indistinct(problem.pencil, dtype) / scale, 0.01)
-    converged = (residuals <= jnp.maximum(tolerance, rounding) * scale) & (theta != 0)
+    allowed = allowed_defects(scale, excuse * indistinct(problem.pencil, dtype), tolerance)
+    converged = (residuals <= allowed) & (theta != 0)
     # Above the first that did not converge, or farther away than those looked at, some are missing.
     above = near > shift
     limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
