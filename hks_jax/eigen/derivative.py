@@ -25,21 +25,26 @@ Telling = Literal["nothing", "warning", "error"]
 
 Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
 Certified = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""]]
+Followed = tuple[
+    Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""], Float[Array, ""]
+]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5))
 def lowest(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, throw: bool, report: Report = silent
-) -> Certified:
-    """Return the k + extra lowest eigenvalues, their eigenvectors, these again as the frame, and the solver's bound.
+) -> Followed:
+    """Return the k lowest eigenvalues, their eigenvectors, these again as the frame, what follows, and a bound.
 
-    The derivative of the frame is that of the eigenvectors without what rotates them among the first k. The derivatives
-    of the last ``extra`` are set to zero. Where the derivative does not converge it is NaN: an error, if ``throw``;
-    else a warning where values are concrete.
+    The derivative of the frame is that of the eigenvectors without what rotates them among the k. What follows is the
+    next eigenvalue, where one ``extra`` is asked for, else infinity; the bound is the solver's: both are constants to
+    derivatives. Where the derivative does not converge it is NaN: an error, if ``throw``; else a warning where values
+    are concrete.
     """
     values, vectors, complete_below = _solve_pencil(solver, pencil, k + extra, report)
     values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
-    return values, vectors, vectors, complete_below
+    values, vectors, following = _cut(values, vectors, k)
+    return values, vectors, vectors, following, complete_below
 
 
 # From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ, with the force fᵢ = (dK − λᵢ dM) φᵢ,
@@ -69,7 +74,7 @@ def _lowest_jvp(
     report: Report,
     primals: tuple[SymmetricPencil],
     changes: tuple[SymmetricPencil],
-) -> tuple[Certified, Certified]:
+) -> tuple[Followed, Followed]:
     pencil, change = first_order_only(primals[0]), changes[0]
     n_dof = pencil.size
     total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
@@ -78,10 +83,10 @@ def _lowest_jvp(
     quiet = is_traced(primals) or solver.adjoint.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
     prepared = prepare(solver.adjoint, k, pencil, values)
-    tangents = tangents_of(solver.adjoint, k, extra, telling, prepared, pencil, change, values, vectors)
-    tangents = *tangents, jnp.zeros_like(complete_below)
-    values, vectors = _leading(values, vectors, k + extra)
-    return (values, vectors, vectors, complete_below), tangents
+    tangents = tangents_of(solver.adjoint, k, telling, prepared, pencil, change, values, vectors)
+    values, vectors, following = _cut(values, vectors, k)
+    constants = following, complete_below
+    return (values, vectors, vectors, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
 def _solve_pencil(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: Report) -> RawPairs:
@@ -89,11 +94,12 @@ def _solve_pencil(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: 
     return solver.lowest(pencil, k, report) if solver.batches else in_turn(_lowest, (solver, k, report), pencil)
 
 
-@partial(jax.jit, static_argnames="size")
-def _leading(
-    values: Float[Array, " p"], vectors: Float[Array, "p n_dof"], size: int
-) -> tuple[Float[Array, " size"], Float[Array, "size n_dof"]]:
-    return values[:size], vectors[:size]
+@partial(jax.jit, static_argnames="k")
+def _cut(
+    values: Float[Array, " p"], vectors: Float[Array, "p n_dof"], k: int
+) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]:
+    """Return the first k pairs, and the eigenvalue after them."""
+    return values[:k], vectors[:k], values[k] if len(values) > k else jnp.asarray(jnp.inf, values.dtype)
 
 
 # Apart from the tangents, so that many products with one Jacobian share it.
@@ -108,12 +114,11 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
 
 
 # What else were kept for the transpose would be copies of the eigenvectors.
-@partial(jax.jit, static_argnames=("adjoint", "k", "extra", "telling"))
-@partial(jax.checkpoint, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnames=("adjoint", "k", "telling"))
+@partial(jax.checkpoint, static_argnums=(0, 1, 2))
 def tangents_of(
     adjoint: Adjoint,
     k: int,
-    extra: int,
     telling: Telling,
     prepared: Any,
     pencil: SymmetricPencil,
@@ -121,7 +126,7 @@ def tangents_of(
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
 ) -> Lowest:
-    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs, and zeros for ``extra``.
+    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs.
 
     The pairs come in the order that the adjoint expects, for which it is prepared.
     """
@@ -139,8 +144,7 @@ def tangents_of(
     if _solves(pencil, k, len(values)):
         frame = frame + _outside(adjoint, telling, prepared, pencil, values, vectors, -force)
     d_vectors = jnp.matmul(within, functions, precision="highest") + frame
-    d_vectors, frame = (jnp.pad(d, ((0, extra), (0, 0))) for d in (d_vectors, frame))
-    return jnp.pad(jnp.diagonal(into), (0, extra)), d_vectors, frame
+    return jnp.diagonal(into), d_vectors, frame
 
 
 def _outside(

@@ -156,9 +156,9 @@ def _lowest(
         spacing = (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spacing)
     extra = min(1, n - number)
-    values, vectors, frame, bound = lowest(method, moved, number, extra, throw, report)
+    values, vectors, frame, following, bound = lowest(method, moved, number, extra, throw, report)
     pairs = _pairs(pencil, moved, origin, values[:k], vectors[:k], frame[:k], bound, method)
-    return pairs, (values[k] + origin if number + extra > k else jnp.asarray(jnp.inf, values.dtype))
+    return pairs, (values[k] if number > k else following) + origin
 
 
 def _in_interval(

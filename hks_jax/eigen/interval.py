@@ -47,7 +47,7 @@ def _in_interval_jvp(
     telling: Telling = "error" if throw else "nothing" if is_traced(primals) else "warning"
     adjoint = InteriorAdjoint(solver.adjoint.tolerance)
     prepared = prepare(adjoint, k, pencil, values)
-    tangents = tangents_of(adjoint, k, 0, telling, prepared, pencil, change, values, vectors)
+    tangents = tangents_of(adjoint, k, telling, prepared, pencil, change, values, vectors)
     values, vectors = values[:k], vectors[:k]
     return (values, vectors, vectors, bound), (*tangents, jnp.zeros_like(bound))
 

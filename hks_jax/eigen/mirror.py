@@ -22,7 +22,7 @@ from hks_jax.traced import is_traced
 def solve_mirror(
     pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str, throw: bool, report: Report
 ) -> Eigenpairs:
-    """Solve the mixed problems and return the k + extra lowest pairs of all.
+    """Solve the mixed problems and return the k lowest pairs of all, and with one ``extra`` the next eigenvalue.
 
     How many come from each part is not known beforehand. Where values are concrete, ask for what Weyl's law says, with
     a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask every part for all.
@@ -87,7 +87,8 @@ def _shares(pencil: MirrorPencil, total: int) -> list[int]:
 @partial(jax.jit, static_argnames=("k", "extra", "name"))
 def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
     values = jnp.concatenate([pairs.eigenvalues for pairs in solved])
-    lowest = jnp.argsort(values)[: k + extra]
+    order = jnp.argsort(values)
+    lowest = order[:k]
     # An eigenfunction of the doubled domain has unit norm there, hence 1/√2^m of it here.
     vectors = jnp.concatenate(
         [pencil.space.restrict(pairs.space.extend(pairs.vectors, outside=0.0)) for pairs in solved]
@@ -96,12 +97,12 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: 
     return Eigenpairs(
         values[lowest],
         vectors,
-        jnp.concatenate([_frame(vectors[:k], pencil, part[:k]), vectors[k:]]),
+        _frame(vectors, pencil, part),
         jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
         jnp.concatenate([pairs.converged for pairs in solved])[lowest],
         kept=jnp.ones(lowest.shape, bool),
         part=part,
-        next_eigenvalue=jnp.asarray(jnp.inf, values.dtype),
+        next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
         complete_below=jnp.min(jnp.stack([_complete_below(pairs) for pairs in solved])),
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         pencil=pencil,
@@ -129,5 +130,5 @@ def _frame(vectors: Float[Array, "k n_dof"], pencil: MirrorPencil, part: Int[Arr
 def _frame_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, pencil, part = first_order_only(primals)
     change = tangents[0]
-    inside = pencil.among(pencil.apply_mass(change, part), vectors, part)
+    inside = pencil.among(pencil.apply_mass(change, part), part, vectors, part)
     return vectors, change - jnp.matmul(inside, vectors, precision="highest")

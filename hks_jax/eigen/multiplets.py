@@ -26,39 +26,30 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
     """Keep k pairs, or as many fewer or more as make the last eigenvalue's multiplicity complete.
 
     Args:
-        pairs: more than k pairs where there are more, k + `SPARE` + 1 to complete.
+        pairs: k pairs with the eigenvalue that follows them; to complete, up to `SPARE` more.
         k: how many to keep.
         multiplet: ``"report"`` keeps exactly k; ``"drop"`` leaves out the copies of a multiple eigenvalue that k cuts
             (unless nothing would be left); ``"complete"`` takes its missing copies in if there are at most `SPARE`,
             and else drops it.
     """
-    size = min(pairs.k, k + SPARE) if multiplet == "complete" else k
-    values = jax.lax.stop_gradient(pairs.eigenvalues)
-    kept, following = _choose(values, pairs.multiplet_tolerance, k, size, multiplet)
-
-    def leading(p: Eigenpairs) -> tuple:
-        return p.eigenvalues, p.vectors, p.frame, p.residuals, p.converged, p.part
-
-    # Vectors and frame are the same array except to derivatives: to shorten it once saves memory.
-    distinct = {id(leaf): leaf for leaf in leading(pairs)}
-    shortened = dict(zip(distinct, _first(list(distinct.values()), size), strict=True))
-    shorter = eqx.tree_at(leading, pairs, tuple(shortened[id(leaf)] for leaf in leading(pairs)))
-    return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), shorter, (kept, following))
+    known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.multiplet_tolerance
+    chosen = _choose(*jax.lax.stop_gradient(known), k, multiplet)
+    return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), pairs, chosen)
 
 
-@partial(jax.jit, static_argnames="size")
-def _first(arrays: list[Array], size: int) -> list[Array]:
-    return [array[:size] for array in arrays]
-
-
-@partial(jax.jit, static_argnames=("k", "size", "multiplet"))
+@partial(jax.jit, static_argnames=("k", "multiplet"))
 def _choose(
-    values: Float[Array, " n"], multiplet_tolerance: Float[Array, ""], k: int, size: int, multiplet: MultipletChoice
-) -> tuple[Bool[Array, " size"], Float[Array, ""]]:
-    """Return which of the first pairs are kept, and the eigenvalue after them."""
-    sequence = jnp.concatenate([values, jnp.full(size + 1, jnp.inf, values.dtype)])[: size + 1]
+    values: Float[Array, " n"],
+    following: Float[Array, ""],
+    multiplet_tolerance: Float[Array, ""],
+    k: int,
+    multiplet: MultipletChoice,
+) -> tuple[Bool[Array, " n"], Float[Array, ""]]:
+    """Return which pairs are kept, and the eigenvalue after them."""
+    size = len(values)
+    sequence = jnp.append(values, following)
     index = jnp.arange(size)
-    tolerance = multiplet_tolerance * jnp.maximum(sequence[:-1], jnp.finfo(values.dtype).tiny)
+    tolerance = multiplet_tolerance * jnp.maximum(values, jnp.finfo(values.dtype).tiny)
     complete_up_to = jnp.diff(sequence) > tolerance
     if multiplet == "report":
         count = jnp.asarray(k)

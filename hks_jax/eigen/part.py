@@ -15,7 +15,7 @@ from hks_jax.fem.pencil import Pencil
 def solve_part(
     pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool, report: Report
 ) -> Eigenpairs:
-    """Return k + extra pairs of one pencil, the last ``extra`` of them without derivatives.
+    """Return k pairs of one pencil and, where one ``extra`` is asked for, the next eigenvalue.
 
     With ``throw``, a derivative that does not converge is an error.
     """
@@ -26,9 +26,9 @@ def solve_part(
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
-    values, vectors, frame, complete_below = lowest(solver, pencil, k, extra, throw, report)
+    values, vectors, frame, following, complete_below = lowest(solver, pencil, k, extra, throw, report)
     residuals, converged, *others = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)
-    kept, part, next_eigenvalue, multiplet_tolerance = others
+    kept, part, multiplet_tolerance = others
     return Eigenpairs(
         values,
         vectors,
@@ -37,7 +37,7 @@ def solve_part(
         converged,
         kept=kept,
         part=part,
-        next_eigenvalue=next_eigenvalue,
+        next_eigenvalue=following,
         complete_below=jnp.asarray(complete_below),  # of a constant JAX makes a number where it differentiates
         multiplet_tolerance=multiplet_tolerance,
         pencil=pencil,
@@ -54,4 +54,4 @@ def _quality(
     residuals, small, rounding = quality(pencil, values, vectors, first, tolerance)
     converged = small & (values >= 0)
     kept, part = jnp.ones(values.shape, bool), jnp.zeros(values.shape, int)
-    return residuals, converged, kept, part, jnp.asarray(jnp.inf, values.dtype), jnp.clip(rounding[-1], 1e-6, 1e-3)
+    return residuals, converged, kept, part, jnp.clip(rounding[-1], 1e-6, 1e-3)

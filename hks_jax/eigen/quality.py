@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.products import row_blocks
 
 _EXCUSED = 0.01
 """The relative residual that rounding excuses at most."""
@@ -19,7 +20,7 @@ def values_and_defects(
     """Return λ, if not given the Rayleigh quotient φᵀKφ / φᵀMφ, and ‖Kφ − λMφ‖ / ‖Mφ‖ of each vector."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     m, size = len(vectors), min(_ROWS, len(vectors))
-    starts = np.minimum(np.arange(0, m, size), m - size)  # the last may overlap the one before
+    starts, place = row_blocks(m, size)
 
     def measure(start: Array) -> tuple[Array, Array]:
         columns = jax.lax.optimization_barrier(jax.lax.dynamic_slice_in_dim(vectors, start, size).T)
@@ -31,8 +32,6 @@ def values_and_defects(
         return quotients, jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
     all_values, defects = jax.lax.map(measure, jnp.asarray(starts))
-    block = np.arange(m) // size
-    place = block, np.arange(m) - starts[block]
     return all_values[place], defects[place]
 
 

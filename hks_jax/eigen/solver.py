@@ -67,7 +67,7 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return how many pairs beyond k to compute where derivatives are wanted."""
-        return 8 + k // 20
+        return 8 + k // 50
 
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k that the method can deliver for n_dof degrees of freedom."""

@@ -55,8 +55,12 @@ class Pencil(SymmetricPencil):
         return self.mass.apply(x)
 
     def among(
-        self, images: Float[Array, "k n_dof"], vectors: Float[Array, "k n_dof"], part: Int[Array, " k"]
-    ) -> Float[Array, "k k"]:
+        self,
+        images: Float[Array, "b n_dof"],
+        of: Int[Array, " b"],
+        vectors: Float[Array, "k n_dof"],
+        part: Int[Array, " k"],
+    ) -> Float[Array, "b k"]:
         """Return the products of images under K, M or their derivatives (rows) with vectors (columns)."""
         return jnp.matmul(images, vectors.T, precision="highest")
 
@@ -99,11 +103,15 @@ class MirrorPencil(eqx.Module):
         return self._apply(lambda piece: piece.mass, x, part)
 
     def among(
-        self, images: Float[Array, "k n_dof"], vectors: Float[Array, "k n_dof"], part: Int[Array, " k"]
-    ) -> Float[Array, "k k"]:
-        """Return the products of images with vectors on the doubled domain: parts do not mix."""
+        self,
+        images: Float[Array, "b n_dof"],
+        of: Int[Array, " b"],
+        vectors: Float[Array, "k n_dof"],
+        part: Int[Array, " k"],
+    ) -> Float[Array, "b k"]:
+        """Return the products of images, of such parts, with vectors on the doubled domain: parts do not mix."""
         products = len(self.parts) * jnp.matmul(images, vectors.T, precision="highest")
-        return jnp.where(part[:, None] == part, products, 0)
+        return jnp.where(of[:, None] == part, products, 0)
 
     def _apply(self, operator: Callable[[Pencil], Operator], x: Array, part: Array) -> Array:
         total = jnp.zeros_like(x)

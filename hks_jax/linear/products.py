@@ -2,7 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Inexact
+import numpy as np
+from jaxtyping import Array, Float, Inexact, Int
 
 
 def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
@@ -42,3 +43,15 @@ def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
 def times(x: Float[Array, "n b"], mix: Float[Array, "b c"]) -> Float[Array, "n c"]:
     """Return linear combinations of columns."""
     return jnp.matmul(x, mix, precision="highest")
+
+
+def row_blocks(
+    count: int, size: int
+) -> tuple[Int[np.ndarray, " blocks"], tuple[Int[np.ndarray, " count"], Int[np.ndarray, " count"]]]:
+    """Return the first rows of blocks of one size, and where in them to find each row: (block, row within it).
+
+    The last block may overlap the one before.
+    """
+    starts = np.minimum(np.arange(0, count, size), count - size)
+    block = np.arange(count) // size
+    return starts, (block, np.arange(count) - starts[block])

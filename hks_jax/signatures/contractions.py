@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.products import products_with_columns
+from hks_jax.linear.products import products_with_columns, row_blocks
 from hks_jax.static_array import StaticArray
 
 _ROWS = 64
@@ -46,9 +46,9 @@ class Diagonal(Contraction):
     ) -> Float[Array, " n"]:
         """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x)."""
         (k, n), size = vectors.shape, min(_ROWS, len(vectors))
-        starts = np.minimum(np.arange(0, k, size), k - size)  # the last block may overlap the one before
+        starts, _ = row_blocks(k, size)
         rows = starts[:, None] + np.arange(size)
-        used = matters[rows] & (rows >= np.arange(0, k, size)[:, None])
+        used = matters[rows] & (rows >= size * np.arange(len(starts))[:, None])  # each row once
         blocks = jnp.where(used[..., None], jnp.where(matters, matrix, 2 * matrix)[rows], 0)
         count = jnp.max(jnp.where(jnp.any(used, axis=1), np.arange(1, len(starts) + 1), 0))
 

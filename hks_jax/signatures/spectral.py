@@ -13,9 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.linear.products import row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter
 from hks_jax.static_array import StaticArray
+
+_ROWS = 128
+"""Eigenvectors whose products with all others are computed together: what is computed from them takes memory."""
 
 
 def spectral_diagonal(
@@ -127,8 +131,16 @@ def _tangent(
     d_frame: Float[Array, "k n_dof"],
 ) -> Array:
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where it does not count
-    stiffness = pencil.among(d_pencil.apply_stiffness(vectors, part), vectors, part)
-    mass = pencil.among(d_pencil.apply_mass(vectors, part), vectors, part)
+    size = min(_ROWS, len(vectors))
+    starts, place = row_blocks(len(vectors), size)
+
+    @jax.checkpoint  # reverse mode would keep a copy of the vectors
+    def products(start: Array) -> tuple[Float[Array, "size k"], Float[Array, "size k"]]:
+        own, of = (jax.lax.dynamic_slice_in_dim(x, start, size) for x in (vectors, part))
+        stiffness, mass = d_pencil.apply_stiffness(own, of), d_pencil.apply_mass(own, of)
+        return pencil.among(stiffness, of, vectors, part), pencil.among(mass, of, vectors, part)
+
+    stiffness, mass = (blocks[place] for blocks in jax.lax.map(products, jnp.asarray(starts)))
     weights = _all_weights(filters, values, kept)
     _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (vectors,), (d_frame,))
 
