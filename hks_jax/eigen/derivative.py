@@ -18,6 +18,7 @@ from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.products import combine, products
 from hks_jax.traced import is_traced
 
 Telling = Literal["nothing", "warning", "error"]
@@ -130,20 +131,20 @@ def tangents_of(
 
     The pairs come in the order that the adjoint expects, for which it is prepared.
     """
-    eigenvalues, functions = values[:k], vectors[:k]
+    eigenvalues, functions, guards = values[:k], vectors[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
-    into = jnp.matmul(force, vectors.T, precision="highest")
     gap = eigenvalues[:, None] - values
     least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(jnp.abs(eigenvalues)[:, None], jnp.abs(values))
     apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
-    rotation = jnp.where(apart, into / jnp.where(apart, gap, 1), 0)
-    gauge = -jnp.matmul(moved, functions.T, precision="highest") / 2
-    within = jnp.where(apart[:, :k], rotation[:, :k], gauge)
-    frame = jnp.matmul(rotation[:, k:], vectors[k:], precision="highest")
+    inverse = jnp.where(apart, 1 / jnp.where(apart, gap, 1), 0)
+    # Apart from the guards: reverse mode of the frame needs the product with these alone.
+    into = products(force, functions)
+    within = jnp.where(apart[:, :k], inverse[:, :k] * into, -products(moved, functions) / 2)
+    frame = combine(inverse[:, k:] * products(force, guards), guards)
     if _solves(pencil, k, len(values)):
         frame = frame + _outside(adjoint, telling, prepared, pencil, values, vectors, -force)
-    d_vectors = jnp.matmul(within, functions, precision="highest") + frame
+    d_vectors = combine(within, functions) + frame
     return jnp.diagonal(into), d_vectors, frame
 
 
