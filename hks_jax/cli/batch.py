@@ -101,8 +101,8 @@ def run(args: argparse.Namespace) -> None:
     from hks_jax.cli.outputs import check_folder
     from hks_jax.cli.study_tasks import run_all
 
-    times, chosen_here = parse_times(args.times), args.boundary is not None
-    if not chosen_here:
+    times, settle = parse_times(args.times), args.boundary is None
+    if settle:
         args.boundary = _settled_boundary(args)
     subjects = read_subjects(args.subjects, args)
     chosen = _only(subjects, args.only)
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--names: it names labels; pass --atlas too, or a column atlas in the table")
     check_folder(args.output)
     progress = StudyProgress(len(chosen), args.quiet)
-    if not chosen_here:
+    if settle:
         progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
     with progress.catching_warnings():
         study = _open(args, times, subjects, progress)

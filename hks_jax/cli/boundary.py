@@ -39,8 +39,8 @@ def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
     def tuples(value: Any) -> Any:
         return tuple(map(tuples, value)) if isinstance(value, list) else value
 
-    found: BoundarySpec | None = tuples(settings.get("boundary"))
-    return found
+    boundary: BoundarySpec | None = tuples(settings.get("boundary"))
+    return boundary
 
 
 def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
