@@ -47,7 +47,9 @@ def setting(n: int, kind: str, refined: int = 1) -> tuple[hj.TensorField, np.nda
     """Return the truth on n² nodes, times, the target (made on a grid refined so many times), and k."""
     tensors, smallest = KINDS[kind]
     times = np.geomspace(smallest, 0.13, 7)
-    k = pairs_for(times, 1.0, 2, n * n)
+    grid = hj.Grid((n, n), 1 / (n - 1))
+    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (n, n, 2, 2)))
+    k = pairs_for(times, hj.assemble(flat), flat)
     fields = []
     for size in (n, refined * (n - 1) + 1):
         grid = hj.Grid((size, size), 1 / (size - 1))

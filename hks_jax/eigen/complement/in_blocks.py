@@ -41,7 +41,7 @@ def solve_in_blocks(
     k, lumped = len(rhs), pencil.mass.diagonal()
     count, parts = -(-k // size), -(-k // _ROWS)
     blocks = -(-count // parts)
-    before = jax.lax.map(lambda row: norms(row[None], lumped)[0], rhs)
+    before = norms(rhs, lumped)
     largest = jnp.max(before)
 
     def solve_part(part: tuple[Array, ...]) -> Float[Array, "rows n_dof"]:
