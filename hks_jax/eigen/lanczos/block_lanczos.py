@@ -80,7 +80,8 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
                     state = _make_room(plan, state.vectors, state._replace(vectors=None))
                 state = search(problem, factor, plan, self.tolerance, state)
             if report is not silent:  # to put numbers into words, the host waits for them
-                report(f"{state.known} of {plan.wanted} eigenpairs, all below {float(state.complete_below):.6g}")
+                known, bound = min(int(state.known), plan.wanted), float(state.complete_below)
+                report(f"{known} of {plan.wanted} eigenpairs, all below {bound:.6g}")
         return state
 
 
