@@ -16,6 +16,7 @@ from hks_jax.eigen.part import solve_part
 from hks_jax.eigen.solver import Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.pencil import MirrorPencil
+from hks_jax.linear.products import combine
 from hks_jax.traced import is_traced
 
 
@@ -131,4 +132,4 @@ def _frame_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, pencil, part = first_order_only(primals)
     change = tangents[0]
     inside = pencil.among(pencil.apply_mass(change, part), part, vectors, part)
-    return vectors, change - jnp.matmul(inside, vectors, precision="highest")
+    return vectors, change - combine(inside, vectors)

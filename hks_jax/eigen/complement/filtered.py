@@ -14,12 +14,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import (
-    amplification,
-    attainable,
-    definite_product,
-    first_beyond,
-)
+from hks_jax.eigen.complement.common import amplification, attainable, definite_product, first_beyond
 from hks_jax.eigen.complement.in_blocks import solve_in_blocks
 from hks_jax.eigen.filter.coarsening import finest_level
 from hks_jax.eigen.filter.damping import Band, correction, degree_for, upper_end
