@@ -451,7 +451,6 @@ def test_tissues_of_a_real_brain_differ_as_the_documentation_says(tmp_path):
 # ---------------------------------------------------------------------------------------------------- saved pairs
 
 
-@pytest.mark.slow
 def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsys):
     def boundary(out, *more):
         assert main(command(study, out, "--times", "3e3", *more)) == 0
@@ -468,6 +467,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
     assert boundary("old", "--replace") == "mean"
 
 
+@pytest.mark.slow
 def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit(study, monkeypatch):
     monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
     other = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume", "--only", "02", "-q")
