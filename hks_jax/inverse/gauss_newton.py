@@ -11,13 +11,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.inverse.smoothing import Euclidean, InnerProduct
+from hks_jax.inverse.smoothing import Euclidean, InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Values
-
-_SCALE = 2.0**40
-"""lineax's conjugate gradients stop when both the residual and the last change are small. With a right-hand side of
-length one and an operator so large that no change matters, the residual alone decides."""
-
+from hks_jax.linear.orthogonal_residuals import orthogonal_conjugate_gradients
 
 _TIGHTER, _LONGER = 30, 3
 """By what the linear systems are solved more exactly before a fit counts as converged."""
@@ -57,13 +53,14 @@ class _State(eqx.Module):
 class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
     """Solves (JᵀJ + μB) δ = −Jᵀr, with B an inner product of the unknowns and μ = damping / step size.
 
-    The conjugate gradients, preconditioned with B⁻¹, stop early: far from the solution more digits would be lost on the
-    linearisation. Their result is a descent direction whenever they stop.
+    The conjugate gradients stop early: far from the solution more digits would be lost on the linearisation. Their
+    result is a descent direction whenever they stop.
 
     Attributes:
         tolerance: what the unknowns still change, relative and absolute, when no further step is computed.
         damping: μ at step size 1.
         inner_product: B.
+        preconditioner: of the conjugate gradients.
         inner_tolerance: reduction of the linear residual.
         inner_steps: at most so many products with JᵀJ.
     """
@@ -71,6 +68,7 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
     tolerance: Float[Array, ""]
     damping: Float[Array, ""]
     inner_product: InnerProduct
+    preconditioner: Preconditioner
     inner_tolerance: Float[Array, ""]
     inner_steps: Int[Array, ""]
 
@@ -103,28 +101,19 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
 
     def _solve(self, step_size: Array, state: _State) -> Values:
         jacobian, gradient = state.f_info.jac, state.gradient
-        adjoint = jacobian.transpose()
-        damping = self.damping / step_size
+        adjoint, damping = jacobian.transpose(), self.damping / step_size
 
-        def normal(x: Values) -> Values:
-            return _SCALE * (adjoint.mv(jacobian.mv(x)) + damping * self.inner_product.apply(x))
+        def normal(x: Array) -> Array:
+            x = x.reshape(gradient.shape)
+            return jnp.ravel(adjoint.mv(jacobian.mv(x)) + damping * self.inner_product.apply(x))
 
-        structure = jax.eval_shape(lambda: gradient)
-        semidefinite = lx.positive_semidefinite_tag
-        operator = lx.FunctionLinearOperator(normal, structure, semidefinite)
-        preconditioner = lx.FunctionLinearOperator(self.inner_product.solve, structure, semidefinite)
+        def precondition(r: Array) -> Array:
+            return jnp.ravel(self.preconditioner.precondition(r.reshape(gradient.shape), damping))
+
         tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
         steps = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
-        size = jnp.linalg.norm(gradient)
-        scaled = gradient / jnp.where(size > 0, size, 1)
-        solution = lx.linear_solve(
-            operator,
-            scaled,
-            lx.CG(0.0, tolerance, optx.two_norm, stabilise_every=None, max_steps=steps),
-            options={"preconditioner": preconditioner},
-            throw=False,
-        )
-        return -size * _SCALE * solution.value
+        solution, _ = orthogonal_conjugate_gradients(normal, precondition, jnp.ravel(gradient), tolerance, steps)
+        return -solution.reshape(gradient.shape)
 
 
 class _Progress(eqx.Module):
@@ -172,7 +161,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
             `hks_jax.fit_metric`.
         damping: μ of the first step, relative to the scale of the data.
         growth: by what μ is divided after a step that kept what the linearisation promised.
-        inner_product: in which steps are small.
+        inner_product: B, in which steps are small.
+        preconditioner: what resembles JᵀJ up to a factor; B by default.
         inner_tolerance: reduction of the linear residual in each step; the last steps go 30 times further.
         inner_steps: at most so many products with JᵀJ in each step; in the last steps three times as many.
     """
@@ -189,7 +179,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         damping: float | Array = 1e-4,
         growth: float | Array = 10.0,
         inner_product: InnerProduct | None = None,
-        inner_tolerance: float | Array = 3e-2,
+        preconditioner: Preconditioner | None = None,
+        inner_tolerance: float | Array = 5e-2,
         inner_steps: int = 120,
     ) -> None:
         require_number("tolerance", tolerance)
@@ -199,10 +190,12 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         require_count("inner_steps", inner_steps)
         self.rtol = self.atol = jnp.asarray(tolerance)
         self.norm = optx.rms_norm
+        inner_product = inner_product or Euclidean()
         self.descent = DampedDescent(
             self.rtol,
             jnp.asarray(damping),
-            inner_product or Euclidean(),
+            inner_product,
+            preconditioner or inner_product,
             jnp.asarray(inner_tolerance),
             jnp.asarray(inner_steps),
         )

@@ -72,7 +72,7 @@ def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
 def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem) -> Any:
     """Return the solver's state before the first step."""
     struct, aux_struct = eqx.filter_eval_shape(fn, values, problem)
-    return optimiser.init(fn, values, problem, {}, struct, aux_struct, frozenset())
+    return _strongly_typed(optimiser.init(fn, values, problem, {}, struct, aux_struct, frozenset()))
 
 
 @eqx.filter_jit
@@ -83,7 +83,12 @@ def _advance(optimiser: Optimiser, fn: Callable, values: Values, problem: Proble
     if isinstance(optimiser, GaussNewton):
         told = _Told(told.values, told.loss, told.misfit, jnp.linalg.norm(jnp.ravel(state.descent.gradient)))
         step_size = state.step_size
-    return values, state, told, done, result == optx.RESULTS.successful, step_size
+    return values, _strongly_typed(state), told, done, result == optx.RESULTS.successful, step_size
+
+
+def _strongly_typed(state: Any) -> Any:
+    """Return the state without weak types, for which the second step would be compiled anew."""
+    return jax.tree.map(lambda x: x.astype(x.dtype) if eqx.is_array(x) else x, state)
 
 
 @eqx.filter_jit

@@ -18,7 +18,15 @@ from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 
 
-class InnerProduct(eqx.Module):
+class Preconditioner(eqx.Module):
+    """What resembles JᵀJ + μB, up to a factor: symmetric, positive definite, and with an inverse."""
+
+    @abstractmethod
+    def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
+        """Return the product of the inverse with the unknowns, for damping μ."""
+
+
+class InnerProduct(Preconditioner):
     """A symmetric positive definite operator on unknowns."""
 
     @abstractmethod
@@ -28,6 +36,10 @@ class InnerProduct(eqx.Module):
     @abstractmethod
     def solve(self, values: Values) -> Values:
         """Return the product of its inverse with the unknowns."""
+
+    def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
+        """Return `solve`: of JᵀJ nothing is known."""
+        return self.solve(values)
 
 
 class Euclidean(InnerProduct):
