@@ -27,7 +27,7 @@ from hks_jax.cli.cache import cache_folder
 from hks_jax.cli.picture import away_from_rim, bounding_box
 from hks_jax.cli.progress import Progress
 from hks_jax.eigen.solver import Status
-from hks_jax.inverse.fit import OPTIMISERS
+from hks_jax.inverse.method import OPTIMISERS
 from hks_jax.inverse.metric_fit import RESULTS
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.inverse.problem import pairs_for

@@ -13,6 +13,9 @@ from differences import directional, heat_kernel_by_contour
 from fields import random_spd
 
 import hks_jax as hj
+from hks_jax.eigen.complement.common import attainable
+from hks_jax.eigen.complement.factorised import group_blocks
+from hks_jax.linear.dissection import dissect
 
 SHAPE = (10, 10)
 GRID = hj.Grid(SHAPE, 0.1)
@@ -524,3 +527,17 @@ def test_no_array_is_larger_than_the_eigenvectors_or_the_divided_differences(rng
     guards = hj.ShiftInvert().guards(k, nodes)
     assembly = 4 * 4 * 4 * 4 * nodes  # element matrices with their quadrature points, whatever k is
     assert max(sizes(jaxpr.jaxpr)) <= max(nodes * (k + guards), n_times * max(nodes, k**2), assembly)
+
+
+def test_in_float32_rows_are_grouped_for_the_accuracy_that_there_is():
+    """So many factorisations as groups: `prepare` and `solve` must not group for different tolerances."""
+    pencil = hj.assemble(hj.TensorField(hj.Grid((20, 20)), np.broadcast_to(np.eye(2), (20, 20, 2, 2))))
+    dissection = dissect(pencil.pattern)
+
+    def groups(tolerance):
+        return group_blocks(dissection, lambda row: 201 - row, np.dtype(np.float32), 200, tolerance)
+
+    asked, reached = groups(1e-8), groups(attainable(1e-8, np.float32))
+    np.testing.assert_array_equal(asked.of_block, reached.of_block)
+    many = group_blocks(dissection, lambda row: 201 - row, np.dtype(np.float32), 200, 1e-8, solves=100)
+    assert len(many.first) > len(asked.first)

@@ -1,11 +1,10 @@
 """A preconditioner for fits of conformal factors to heat kernel signatures."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hks_jax.inverse.smoothing import Preconditioner, Smoothing
+from hks_jax.inverse.smoothing import InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Nodal, Values
 
 _TOP = 0.03
@@ -25,8 +24,8 @@ _POWER, _REACH = 3, 9.0
 class ConformalInformation(Preconditioner):
     """B½ (1 + L/λ₁)⁻³ B½, B the lumped mass and L the Laplacian of the initial metric by differences along edges.
 
-    Its inverse is a polynomial: it takes three products. Where JᵀJ is below μ, JᵀJ + μB falls off no further: λ₁ is then
-    so large that the preconditioner does not either.
+    Its inverse is a polynomial: it takes three products. Where JᵀJ is below μ, JᵀJ + μB falls off no further: λ₁ is so
+    large that the preconditioner does not either.
 
     Attributes:
         unknowns: the factors at the nodes.
@@ -38,7 +37,7 @@ class ConformalInformation(Preconditioner):
 
     unknowns: Nodal
     root: Float[Array, "n 1"]
-    weights: list[Float[Array, "*edges"]]
+    weights: list[Float[Array, "..."]]
     level: Float[Array, ""]
     largest: Float[Array, ""]
 
@@ -54,12 +53,12 @@ class ConformalInformation(Preconditioner):
         return back([weight * slope for weight, slope in zip(self.weights, slopes, strict=True)])[0] / self.root
 
 
-def conformal_information(unknowns: Nodal, mass: Smoothing, times: Float[Array, " n_times"]) -> ConformalInformation:
+def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Array, " n_times"]) -> ConformalInformation:
     """Return the preconditioner for signatures at these times.
 
     Args:
         unknowns: conformal factors of an initial field.
-        mass: the inner product, of length 0.
+        mass: the inner product, of smoothness 0.
         times: of the signatures that count.
     """
     grid, nodes = unknowns.init.grid, unknowns.nodes.value

@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_count, require_number, require_real
@@ -22,19 +21,16 @@ from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.inverse import checkpoint as files
-from hks_jax.inverse.conformal import conformal_information
-from hks_jax.inverse.gauss_newton import GaussNewton
+from hks_jax.inverse.method import choose_inner_product, choose_optimiser
 from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Loss, Observation, Signature, observe
 from hks_jax.inverse.optimise import Optimiser, loss_of, optimise
-from hks_jax.inverse.parametrisation import Conformal, Parametrisation, choose_parametrisation
+from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
 from hks_jax.inverse.problem import Problem, most_pairs, pairs_below, pairs_for, unknowns_of
 from hks_jax.inverse.regulariser import Regulariser
-from hks_jax.inverse.smoothing import Euclidean, InnerProduct, Preconditioner, Smoothing, smoothing
+from hks_jax.inverse.smoothing import InnerProduct
 from hks_jax.inverse.truncated import more_pairs, observed_times, truncation_misfit, truncation_shows
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
-
-OPTIMISERS = ("gauss-newton", "lbfgs", "bfgs")
 
 
 def fit_metric(
@@ -153,7 +149,7 @@ def fit_metric(
         chosen = choose_for_fit(pencil, pairs) if solver == "auto" else solver
         problems.append(Problem(unknowns, each, tuple(regularisers), pairs, boundary, chosen))
 
-    inner_product = _inner_product(unknowns, smoothness, noise)
+    inner_product = choose_inner_product(unknowns, smoothness, noise)
     first = unknowns.start()
     settings = (
         parametrisation,
@@ -186,7 +182,7 @@ def fit_metric(
         for log.stage in range(from_stage, len(problems)):
             # Early stages need no last digits.
             enough = tolerance if log.stage == len(problems) - 1 else 100 * tolerance
-            method = _optimiser(optimiser, enough, noise, inner_product, _preconditioner(problems[log.stage], inner_product), step_size)
+            method = choose_optimiser(optimiser, problems[log.stage], enough, noise, inner_product, step_size)
             values, result = optimise(
                 problems[log.stage], values, method, noise, max_steps, log, log.stage, log.start, clock
             )
@@ -213,7 +209,7 @@ def fit_metric(
             break
         chosen = choose_for_fit(pencil, wanted) if solver == "auto" else solver
         problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
-        method = _optimiser(optimiser, tolerance, noise, inner_product, _preconditioner(problem, inner_product), 1.0)
+        method = choose_optimiser(optimiser, problem, tolerance, noise, inner_product)
         log.best, best_result = optimise(problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock)
     if shows:
         warn_of_accuracy(
@@ -291,50 +287,6 @@ def _pairs(
     else:
         wanted = pairs_for(observed_times(observation), pencil, field)  # those of this stage
     return wanted if k is None else k
-
-
-def _inner_product(unknowns: Unknowns, smoothness: float | None, noise: float | None) -> InnerProduct:
-    if not isinstance(unknowns, Nodal):
-        return Euclidean()
-    grid = unknowns.init.grid
-    if smoothness is None:
-        extent = max(h * (n - 1) for h, n in zip(grid.spacing, grid.shape, strict=True))
-        smoothness = 0.1 * extent if unknowns.smooth or noise is not None else 0.0
-    return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype)
-
-
-def _preconditioner(problem: Problem, inner_product: InnerProduct) -> Preconditioner:
-    """Return what resembles JᵀJ, up to a factor and as far as that is known, and the inner product."""
-    unknowns, observation = problem.unknowns, problem.observation
-    alone = isinstance(inner_product, Smoothing) and inner_product.factor is None and not problem.regularisers
-    conformal = isinstance(unknowns, Nodal) and isinstance(unknowns.parametrisation, Conformal)
-    if not (alone and conformal and observation.signature == "hks"):
-        return inner_product
-    return conformal_information(unknowns, inner_product, jnp.asarray(observed_times(observation)))
-
-
-def _optimiser(
-    given: str | Optimiser,
-    tolerance: float,
-    noise: float | None,
-    inner_product: InnerProduct,
-    preconditioner: Preconditioner,
-    step_size: float,
-) -> Optimiser:
-    if given == "gauss-newton":
-        # Against noise small steps: the misfit must not fall far below what the noise explains.
-        damping, growth = (1e-4, 10.0) if noise is None else (1e-2, 3.0)
-        return GaussNewton(tolerance, damping / step_size, growth, inner_product, preconditioner)
-    if given in ("lbfgs", "bfgs"):
-        kind: Any = optx.LBFGS if given == "lbfgs" else optx.BFGS
-        traced = jnp.asarray(tolerance)  # a static one would compile every stage anew
-        return kind(traced, traced, optx.rms_norm)
-    if isinstance(given, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
-        return given
-    names = ", ".join(map(repr, OPTIMISERS))
-    raise ValueError(
-        f"optimiser: got {given!r}; expected {names}, or a least squares solver or minimiser of optimistix"
-    )
 
 
 def _moved(first: Any, inner_product: InnerProduct, spread: float, seed: int, start: int) -> Any:

@@ -60,17 +60,17 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
         tolerance: what the unknowns still change, relative and absolute, when no further step is computed.
         damping: μ at step size 1.
         inner_product: B.
-        preconditioner: of the conjugate gradients.
-        inner_tolerance: reduction of the linear residual.
+        inner_tolerance: reduction of the residual, in the norm of the preconditioner's inverse.
         inner_steps: at most so many products with JᵀJ.
+        preconditioner: of the conjugate gradients.
     """
 
     tolerance: Float[Array, ""]
     damping: Float[Array, ""]
     inner_product: InnerProduct
-    preconditioner: Preconditioner
     inner_tolerance: Float[Array, ""]
     inner_steps: Int[Array, ""]
+    preconditioner: Preconditioner
 
     def init(self, y: Values, f_info_struct: Any) -> _State:
         """Return a state of the right shape."""
@@ -162,9 +162,9 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         damping: μ of the first step, relative to the scale of the data.
         growth: by what μ is divided after a step that kept what the linearisation promised.
         inner_product: B, in which steps are small.
-        preconditioner: what resembles JᵀJ up to a factor; B by default.
         inner_tolerance: reduction of the linear residual in each step; the last steps go 30 times further.
         inner_steps: at most so many products with JᵀJ in each step; in the last steps three times as many.
+        preconditioner: of the conjugate gradients; B by default.
     """
 
     rtol: Float[Array, ""]  # type: ignore[assignment]
@@ -179,9 +179,9 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         damping: float | Array = 1e-4,
         growth: float | Array = 10.0,
         inner_product: InnerProduct | None = None,
-        preconditioner: Preconditioner | None = None,
-        inner_tolerance: float | Array = 5e-2,
+        inner_tolerance: float | Array = 1e-2,
         inner_steps: int = 120,
+        preconditioner: Preconditioner | None = None,
     ) -> None:
         require_number("tolerance", tolerance)
         require_number("damping", damping, inclusive=True)
@@ -195,9 +195,9 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
             self.rtol,
             jnp.asarray(damping),
             inner_product,
-            preconditioner or inner_product,
             jnp.asarray(inner_tolerance),
             jnp.asarray(inner_steps),
+            preconditioner or inner_product,
         )
         self.search = optx.ClassicalTrustRegion(high_cutoff=0.5, high_constant=jnp.asarray(growth))
 

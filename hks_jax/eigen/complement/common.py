@@ -103,6 +103,8 @@ def group_numbers(
 ) -> Int[np.ndarray, " m"]:
     """Return the group of each distance from Λ, of at most so many groups in geometric progression.
 
+    Rows count as often as they are solved for.
+
     With s groups of distances that differ by up to a ratio ρ the condition is ρ^(1/2s); s weighs factorisations against
     the steps for all rows.
     """

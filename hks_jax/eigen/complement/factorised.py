@@ -64,15 +64,17 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 
     Attributes:
         tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
+        solves: how often one preparation serves, about. Many solves are worth more factorisations.
     """
 
     tolerance: float = eqx.field(default=1e-8, static=True)
+    solves: int = eqx.field(default=1, static=True)
 
     def prepare(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Factorisation:
         """Factorise K − σM for each group of the first k of p eigenvalues; the results are stacked."""
         dissection = dissect(pencil.pattern)
         # Compiled without the dissection: what a compiled function hands through is copied.
-        return Factorisation(dissection, *_factorise(dissection, pencil, values, k, self.tolerance))
+        return Factorisation(dissection, *_factorise(dissection, pencil, values, k, self))
 
     def solve(
         self,
@@ -83,14 +85,14 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         rhs: Float[Array, "k n_dof"],
     ) -> Float[Array, "k n_dof"]:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
-        return _solve(prepared, pencil, values, vectors, rhs, self.tolerance)
+        return _solve(prepared, pencil, values, vectors, rhs, self)
 
 
-@partial(jax.jit, static_argnames=("k", "tolerance"))
+@partial(jax.jit, static_argnames=("k", "adjoint"))
 def _factorise(
-    dissection: Dissection, pencil: SymmetricPencil, values: Float[Array, " p"], k: int, tolerance: float
+    dissection: Dissection, pencil: SymmetricPencil, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint
 ) -> Factors:
-    groups = _group(dissection, values, k, tolerance)
+    groups = _group(dissection, values, k, adjoint)
     beyond = first_beyond(values)
     shifts = shifts_between(values, beyond - values[groups.last], beyond - values[groups.first])
     return factorise_each(dissection, pencil, shifts)
@@ -108,18 +110,18 @@ def of_group(factors: Factorisation, group: Int[Array, ""]) -> Factorisation:
     return Factorisation(factors.dissection, *matrices)
 
 
-@partial(jax.jit, static_argnames="tolerance")
+@partial(jax.jit, static_argnames="adjoint")
 def _solve(
     factors: Factorisation,
     pencil: SymmetricPencil,
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
     rhs: Float[Array, "k n_dof"],
-    tolerance: float,
+    adjoint: FactorisedAdjoint,
 ) -> Float[Array, "k n_dof"]:
     k, beyond, window = rhs.shape[0], first_beyond(values), min(WINDOW, values.size)
-    tolerance = attainable(tolerance, rhs.dtype)
-    of_block = jnp.asarray(_group(factors.dissection, values, k, tolerance).of_block)
+    tolerance = attainable(adjoint.tolerance, rhs.dtype)
+    of_block = jnp.asarray(_group(factors.dissection, values, k, adjoint).of_block)
 
     def solve_block(number: Array, b: Array, wanted: Array, shifts: Array) -> Array:
         factor = of_group(factors, of_block[number])
@@ -139,9 +141,13 @@ def _solve(
     return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, *of_rows)
 
 
-def _group(dissection: Dissection, values: Float[Array, " p"], k: int, tolerance: float) -> Groups:
+def _group(dissection: Dissection, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint) -> Groups:
     """Group blocks of rows whose distance from Λ, by Weyl's law in 2D, is of one order."""
-    return group_blocks(dissection, lambda row: values.size + 1 - row, values.dtype, k, tolerance)
+
+    def distance(row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        return values.size + 1 - row
+
+    return group_blocks(dissection, distance, values.dtype, k, adjoint.tolerance, adjoint.solves)
 
 
 def group_blocks(
@@ -150,6 +156,7 @@ def group_blocks(
     dtype: np.dtype,
     k: int,
     tolerance: float,
+    solves: int = 1,
 ) -> Groups:
     """Group blocks of the rows 0 … k−1, each by what its middle row has for a distance; see `group_numbers`."""
     start = np.arange(0, k, BLOCK)
@@ -157,6 +164,6 @@ def group_blocks(
     distance = distance_of((start + end - 1) / 2)
     entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
     room = max(int(_MEMORY / (entries * dtype.itemsize)), 1)
-    number = group_numbers(distance, k, tolerance, room)
+    number = group_numbers(distance, k * solves, attainable(tolerance, dtype), room)
     _, first, of_block = np.unique(number, return_index=True, return_inverse=True)
     return Groups(of_block, start[first], np.append(start[first[1:]], k) - 1)

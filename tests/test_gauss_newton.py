@@ -1,0 +1,113 @@
+"""The linear systems of Gauss–Newton steps: conjugate gradients and their preconditioners."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from fields import random_spd
+
+import hks_jax as hj
+from hks_jax.inverse.conformal import conformal_information
+from hks_jax.inverse.method import choose_inner_product
+from hks_jax.inverse.parametrisation import PARAMETRISATIONS
+from hks_jax.inverse.unknowns import Nodal, nodes_of
+from hks_jax.linear import orthogonal_residuals
+from hks_jax.linear.orthogonal_residuals import orthogonal_conjugate_gradients
+
+
+def ill_conditioned(rng, n):
+    """Return a matrix with eigenvalues from 1 to 1e-8, and a preconditioner that helps little."""
+    vectors = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    matrix = vectors * np.logspace(0, -8, n) @ vectors.T
+    return jnp.asarray(matrix), jnp.asarray(rng.uniform(0.5, 2, n))
+
+
+def solve(matrix, scale, rhs, tolerance, most=1000):
+    """Solve with a diagonal preconditioner."""
+    products = (lambda x: matrix @ x), (lambda r: scale * r)
+    return orthogonal_conjugate_gradients(*products, rhs, jnp.asarray(tolerance), jnp.asarray(most))
+
+
+def test_rounding_costs_no_steps(rng):
+    n = 60
+    matrix, scale = ill_conditioned(rng, n)
+    rhs = matrix @ rng.standard_normal(n)
+    x, steps = solve(matrix, scale, rhs, 1e-7)
+    residual = rhs - matrix @ x
+    assert jnp.vdot(residual, scale * residual) <= 1.1e-14 * jnp.vdot(rhs, scale * rhs)
+    assert steps <= n  # as in exact arithmetic
+
+
+def test_only_so_many_residuals_are_kept(rng, monkeypatch):
+    matrix, scale = ill_conditioned(rng, 40)
+    matrix, rhs = matrix + 1e-3 * jnp.eye(40), jnp.asarray(rng.standard_normal(40))
+
+    exact = np.linalg.solve(matrix, rhs)
+    monkeypatch.setattr(orthogonal_residuals, "_MOST", 7)
+    np.testing.assert_allclose(solve(matrix, scale, rhs, 1e-9)[0], exact, rtol=1e-6, atol=1e-6 * np.abs(exact).max())
+    x, steps = solve(matrix, scale, rhs, 1e-9, 3)
+    assert steps == 3
+    assert jnp.isfinite(x).all()
+
+
+def test_nothing_and_nan_are_told_apart():
+    x, steps = solve(jnp.eye(5), 1, jnp.zeros(5), 1e-3)
+    assert steps == 0
+    assert not x.any()
+    x, _ = solve(jnp.eye(5), 1, jnp.full(5, jnp.nan), 1e-3)
+    assert jnp.isnan(x).all()
+
+
+def preconditioner(field, times):
+    """Return the unknowns, the inner product and the inverse of the preconditioner as a function of damping."""
+    unknowns = Nodal(PARAMETRISATIONS["conformal"](), field, nodes_of(hj.assemble(field).space.domain))
+    mass = choose_inner_product(unknowns, 0.0, None)
+    information = conformal_information(unknowns, mass, jnp.asarray(times))
+    eye = jnp.eye(unknowns.start().size)
+
+    def inverse(damping):
+        damping = jnp.asarray(damping)
+        return np.asarray(jax.vmap(lambda x: information.precondition(x[:, None], damping)[:, 0])(eye))
+
+    return unknowns, np.asarray(mass.apply(jnp.ones((len(eye), 1))))[:, 0], inverse
+
+
+@pytest.mark.slow
+def test_the_information_on_conformal_factors_is_that_of_a_power_of_the_laplacian():
+    """The condition number of JᵀJ falls by much; damping bounds how far the preconditioner falls off."""
+    grid = hj.Grid((12, 11), (1 / 11, 1 / 10))
+    x, y = grid.nodes[..., 0], grid.nodes[..., 1]
+    times = np.geomspace(0.02, 0.2, 3)
+    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (12, 11, 2, 2)))
+    unknowns, mass, inverse = preconditioner(flat, times)
+
+    def residuals(u):
+        field = unknowns.field(u)
+        return jnp.log(hj.hks(hj.eigenpairs(field, 132), times)).ravel()
+
+    u = jnp.asarray((0.3 * np.sin(2 * x + y)).reshape(-1, 1))
+    jacobian = np.asarray(jax.jacfwd(residuals)(u))[..., 0]
+    information = jacobian.T @ jacobian
+    p = inverse(1e-12)
+    np.testing.assert_allclose(p, p.T, rtol=1e-10, atol=1e-12 * np.abs(p).max())
+    before = scipy.linalg.eigh(information, np.diag(mass), eigvals_only=True)
+    after = scipy.linalg.eigh(information, np.linalg.inv(p), eigvals_only=True)
+    # The constant is another matter: it moves all times together.
+    assert before[-1] / before[1] > 5 * after[-1] / after[1]
+    for damping in (1e-4, 1e-3):
+        values = scipy.linalg.eigh(inverse(damping), np.diag(1 / mass), eigvals_only=True)
+        assert values[0] >= 1 - 1e-9
+        assert values[-1] <= 0.03 / damping * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_preconditioner_is_definite_on_masks_and_for_any_metric(rng, d):
+    shape = (6, 5, 4)[:d]
+    mask = np.ones(shape, bool)
+    mask[(0,) * d] = mask[(-1,) * d] = False
+    field = hj.TensorField(hj.Grid(shape, 0.2, mask=mask), random_spd(rng, shape))
+    _, mass, inverse = preconditioner(field, [0.05])
+    p = inverse(1e-9)
+    np.testing.assert_allclose(p, p.T, rtol=1e-10, atol=1e-12 * np.abs(p).max())
+    assert scipy.linalg.eigh(p, np.diag(1 / mass), eigvals_only=True)[0] >= 1 - 1e-9
