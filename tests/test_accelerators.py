@@ -47,6 +47,17 @@ def test_block_lanczos_in_several_slices(rng, as_on_an_accelerator, traced):
     assert orthogonality < 1e-9
 
 
+@pytest.mark.slow
+def test_a_batch_is_solved_as_its_problems_are(rng, as_on_an_accelerator):
+    tensors = jnp.asarray(np.stack([random_spd(rng, (14, 13)) for _ in range(2)]))
+
+    def solve(tensors):
+        return hj.eigenpairs(hj.TensorField(hj.Grid((14, 13)), tensors), 6, solver="block-lanczos").eigenvalues
+
+    together = jax.jit(jax.vmap(solve))(tensors)
+    np.testing.assert_allclose(together, [solve(each) for each in tensors], rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("degree", [1, 2, 5, 8])
 def test_chebyshev_iterations_are_those_of_cpus(rng, monkeypatch, degree):
     stencil_of, w = jnp.asarray(rng.standard_normal((9, 6, 7))), jnp.asarray(rng.standard_normal((6, 7, 3)))

@@ -21,6 +21,7 @@ _TRAFFIC = 20e6
 _LAUNCHES = 4
 """Launches of a level in a solve: a gather and a product, upwards and downwards."""
 _BYTES = 8
+"""Of a number."""
 _ALIGNED = 64
 """Of how many nodes large fronts have a multiple: of others XLA would copy the matrices, with zeros around them."""
 
@@ -47,12 +48,13 @@ def merged(levels: tuple[Level, ...], n: int) -> Merged:
     """Merge levels of the elimination tree of n degrees of freedom."""
     groups = divided(levels, n)
     own, rows, places = zip(*(_own_nodes(levels[first:end], n) for first, end in groups), strict=True)
-    boundaries = [_boundary_nodes(levels, n)[first] for first, _ in groups]
+    of_levels = _boundary_nodes(levels, n)
+    boundaries = [of_levels[first] for first, _ in groups]
     nodes = [np.concatenate(both, axis=1) for both in zip(own, boundaries, strict=True)]
     children, result = np.zeros((0, *nodes[-1].shape), int), []
     for number in reversed(range(len(groups))):
         fronts, r = boundaries[number].shape
-        level, boundary = (own[number], children), np.zeros((fronts, r), int)
+        below, boundary = children, np.zeros((fronts, r), int)
         if number > 0:
             above = nodes[number - 1]
             front, slot = np.nonzero(boundaries[number] < n)
@@ -63,7 +65,7 @@ def merged(levels: tuple[Level, ...], n: int) -> Merged:
             children = np.full((max(int(counts.max()), 1), above.size), fronts * r)
             children[within_groups(counts), place[ascending]] = (front * r + slot)[ascending]
             children = children.reshape(-1, *above.shape)
-        result.append(Level(*(field.astype(np.int32) for field in (level[0], boundary, level[1]))))
+        result.append(Level(*(field.astype(np.int32) for field in (own[number], boundary, below))))
     order = np.empty(n + 1, np.int32)
     order[np.concatenate([nodes.ravel() for nodes in own])] = np.arange(sum(nodes.size for nodes in own))
     return Merged(tuple(result[::-1]), order[:n], rows, places)

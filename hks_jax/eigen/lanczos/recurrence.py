@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.basis import Basis, begin, combined, within, write
@@ -141,7 +141,7 @@ def _advance(
                 first // 2, last // 2, lambda two, state: steps(2 * two, state, (every == 1, True)), state
             )
 
-        return jax.lax.cond(shifted.passes > 1, partial(by_two, 2), partial(by_two, 1), state)
+        return jax.lax.cond(_in_any(jnp.asarray(shifted.passes > 1)), partial(by_two, 2), partial(by_two, 1), state)
     steps = _stepping(pencil, shifted, offset)
     return jax.lax.fori_loop(
         first, last, lambda number, state: steps(number, state, ((number + 1) % every == 0,)), state
@@ -215,6 +215,19 @@ def _stepping(
         return _Recurrence(basis, blocks, matrix)
 
     return steps
+
+
+# Of a condition that differs within a batch both branches would be computed, for all of it. To solve again is right
+# where it is not needed, too.
+@jax.custom_batching.custom_vmap
+def _in_any(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Return a condition; within a batch, whether it holds for any problem of it."""
+    return condition
+
+
+@_in_any.def_vmap
+def _in_any_of_batch(size: int, batched: list[bool], conditions: Bool[Array, " batch"]) -> tuple[Bool[Array, ""], bool]:
+    return jnp.any(conditions), False
 
 
 def _every(dtype: np.dtype) -> int:
