@@ -1,8 +1,8 @@
 """What block Lanczos does with blocks of a few long columns, in one launch of a kernel each, for CUDA devices.
 
 Written with XLA's operations, inner products and what is made of them take four launches: parts of the sums, their sum,
-a small matrix computed from it, and combinations of columns. Here the parts go to the kernel that needs them: each of
-its programs adds them up, computes the small matrix for itself, and combines its own rows.
+a small matrix computed from it, and combinations of columns. Instead the parts go to the kernel that needs them: each
+of its programs adds them up, computes the small matrix for itself, and combines its own rows.
 """
 
 from collections.abc import Callable
