@@ -90,8 +90,8 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     def consider(problem: Any, negative: Any, trial: Any, state: Any) -> Any:
         return slicing._consider(problem, negative, trial, plan, TOLERANCE, state)
 
-    def accept(problem: Any, ritz: Any, interval: Any, vectors: Any, state: Any) -> Any:
-        return slicing._accept(problem, plan, TOLERANCE, ritz, interval, vectors, state)
+    def accept(problem: Any, ritz: Any, interval: Any, state: Any) -> Any:
+        return slicing._accept(problem, plan, TOLERANCE, ritz, interval, state)
 
     def steps(pencil: Any, factor: Any, shift: Any, going: Any, first: Any) -> Any:
         return recurrence._advance_by_two(pencil, factor, shift, going, plan.window, first, 1)
@@ -112,15 +112,10 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     yield "decisions", nodes, k, lambda: (consider, (problem, factor.negative, trial, apart))
     yield "window", nodes, k, lambda: (lambda *given: slicing._window(given[0], plan, given[1]), (problem, state))
     yield "first block", nodes, k, lambda: (begin, (pencil, state.start, known))
-    yield (
-        "acceptance",
-        nodes,
-        k,
-        lambda: (
-            jax.jit(accept, donate_argnums=3),
-            (problem, ritz, (window.low, window.high), state.vectors, apart),
-        ),
-    )
+    yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, (window.low, window.high), apart))
+    order = jax.ShapeDtypeStruct((plan.ritz,), int)
+    store = jax.jit(slicing._stored, donate_argnums=0)
+    yield "storing", nodes, k, lambda: (store, (state.vectors, ritz[1], order, state.known))
 
 
 def whole(rows: list[dict], n: int, k: int) -> Iterator[dict]:
@@ -131,7 +126,7 @@ def whole(rows: list[dict], n: int, k: int) -> Iterator[dict]:
     plan = hj.BlockLanczos().plan(k, 1)
     parts = {row["what"]: row for row in rows if (row["nodes"], row["k"]) == (f"{n}²", k)}
     of_cut = dict.fromkeys(("factorisation", "trial of it", "decisions"), 1)
-    of_search = dict.fromkeys(("window", "first block", "Ritz pairs", "acceptance"), 1)
+    of_search = dict.fromkeys(("window", "first block", "Ritz pairs", "acceptance", "storing"), 1)
     of_search["two Lanczos steps"] = plan.steps // 2
     if not parts.keys() >= of_cut.keys() | of_search.keys():
         return

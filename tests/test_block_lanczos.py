@@ -156,7 +156,7 @@ def test_components_on_a_basis_in_pieces(rng, dtype, accuracy, size):
         basis = write(basis, vectors[row : row + 4].T, jnp.asarray(row))
     x = x + size * vectors[::20].T @ jnp.asarray(rng.standard_normal((14, 4)), dtype)
     parts = jax.jit(bases.within)(basis, x, filled)
-    np.testing.assert_allclose(vectors @ (x - parts.T), 0, atol=accuracy * np.linalg.norm(x, axis=0).max())
+    np.testing.assert_allclose(vectors @ (x - parts), 0, atol=accuracy * np.linalg.norm(x, axis=0).max())
     mix = rng.standard_normal((3, 400))
     mix[:, filled:] = 0
     np.testing.assert_allclose(

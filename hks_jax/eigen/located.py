@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.count import count_once
-from hks_jax.linear.dissection import dissect
+from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.operators import SparseOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
@@ -74,14 +74,20 @@ class _Descent(NamedTuple):
     tries: Int[Array, ""]
 
 
-@jit_quickly(static_argnames=("most", "probes"))
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Return how far to lower an origin, and how many eigenvalues it passes: at most so many, and half of them or more.
 
     Fewer only where there are no more, or where the next is a multiple one that would be too many. Each factorisation
     is tried out on so many random right-hand sides.
     """
-    dissection, dtype = dissect(pencil.pattern), pencil.stiffness.dtype
+    return _lowered(pencil, dissect(pencil.pattern), most, probes)
+
+
+@jit_quickly(static_argnames=("most", "probes"))
+def _lowered(
+    pencil: LocatedPencil, dissection: Dissection, most: int, probes: int
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    dtype = pencil.stiffness.dtype
     tried = jax.random.normal(jax.random.key(0), (pencil.size, probes), dtype)
 
     def unfinished(state: _Descent) -> Bool[Array, ""]:

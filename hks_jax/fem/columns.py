@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.linear import accelerators
+
 
 def stencil(
     coefficients: Float[Array, "offsets *shape"], periodic: tuple[bool, ...]
@@ -29,17 +31,23 @@ def stencil(
     # Node after node in one row, a neighbour is a fixed distance away. Across the sides, where the row goes on
     # elsewhere, there is nothing: elements end there, and their entries were never written.
     shape = coefficients.shape[1:]
-    together, nodes = side_by_side(coefficients), math.prod(shape)
+    nodes = math.prod(shape)
     strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
     distances = [sum(map(mul, offset, strides)) for offset in product((-1, 0, 1), repeat=len(shape))]
     reach = distances[-1]
+    row = side_by_side(coefficients).reshape(nodes, -1)
+    # On accelerators an array for each offset, behind a barrier: XLA would take them apart anew for each product.
+    apart = (
+        jax.lax.optimization_barrier(tuple(jnp.split(row, len(distances), axis=1))) if accelerators.at_hand() else ()
+    )
 
     def apply(x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
         b = x.shape[-1]
         padded = jnp.pad(x.reshape(nodes, b), ((reach, reach), (0, 0)))
-        row, y = together.reshape(nodes, -1), jnp.zeros((), x.dtype)
+        y = jnp.zeros((), x.dtype)
         for o, distance in enumerate(distances):
-            y = y + row[:, o, None] * jax.lax.slice(padded, (reach + distance, 0), (reach + distance + nodes, b))
+            own = apart[o] if apart else row[:, o, None]
+            y = y + own * jax.lax.slice(padded, (reach + distance, 0), (reach + distance + nodes, b))
         return y.reshape(x.shape)
 
     return apply

@@ -13,31 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from hks_jax.linear import accelerators
 from hks_jax.linear.bisection import within_groups
+from hks_jax.linear.level import Level
+from hks_jax.linear.merging import Merged, merged
 from hks_jax.linear.pattern import Pattern
-
-
-class Level(NamedTuple):
-    """The fronts of one level: each eliminates its own s nodes, and is coupled to r boundary nodes eliminated later.
-
-    Where a front has fewer, indices are padded with the first number that is out of range.
-
-    Attributes:
-        own: (fronts, s) the degrees of freedom eliminated.
-        boundary: (fronts, r) the places of the boundary nodes among the (fronts, s + r) nodes of the level above.
-        children: (2, fronts, s + r) the places of the front's nodes among the (fronts, r) boundary nodes of the level
-            below: those of the first child, and those of the second. Empty for cells.
-    """
-
-    own: Int[np.ndarray, "fronts s"]
-    boundary: Int[np.ndarray, "fronts r"]
-    children: Int[np.ndarray, "two fronts s_plus_r"]
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(fronts, s + r, s): that of the blocks which hold the columns of the own nodes."""
-        fronts, s = self.own.shape
-        return fronts, s + self.boundary.shape[1], s
 
 
 class Dissection(NamedTuple):
@@ -50,6 +30,7 @@ class Dissection(NamedTuple):
         places: (m,) their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column,
             unless its row is eliminated before.
         padding: (p,) the places of the diagonal entries that belong to no node.
+        merged: what solves go along on accelerators; None where it is the tree itself.
     """
 
     levels: tuple[Level, ...]
@@ -57,15 +38,20 @@ class Dissection(NamedTuple):
     entries: Int[np.ndarray, " m"]
     places: Int[np.ndarray, " m"]
     padding: Int[np.ndarray, " p"]
+    merged: Merged | None
 
 
-@lru_cache(maxsize=16)
 def dissect(pattern: Pattern) -> Dissection:
     """Return the elimination tree of a matrix with this pattern.
 
     Raises:
         ValueError: more entries in the factors than an index can count.
     """
+    return _dissect(pattern, accelerators.at_hand())
+
+
+@lru_cache(maxsize=16)
+def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     entries, rows, cols = pattern.places()
     n = pattern.size
     level, front, depth = pattern.bisect()
@@ -118,8 +104,9 @@ def dissect(pattern: Pattern) -> Dissection:
         for first, h, s, nodes in zip(start[:-1], height, stride, own, strict=True)
         for q, j in [np.nonzero(nodes == n)]
     ]
-    fields = order[:n], entries[mine], places, np.concatenate(padding)
-    return Dissection(tuple(levels), *(field.astype(np.int32) for field in fields))
+    order, entries, places = (field.astype(np.int32) for field in (order[:n], entries[mine], places))
+    several = merged(tuple(levels), n) if merge else None
+    return Dissection(tuple(levels), order, entries, places, np.concatenate(padding).astype(np.int32), several)
 
 
 def _own_nodes(level: np.ndarray, front: np.ndarray, depth: int) -> tuple[list[np.ndarray], np.ndarray]:

@@ -17,8 +17,10 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear.dissection import Dissection
+from hks_jax.linear.level import Level
+from hks_jax.linear.merging import Merged
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import gram
+from hks_jax.linear.products import batched, gram, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
@@ -33,7 +35,7 @@ class Factorisation(eqx.Module):
 
     Attributes:
         dissection: the elimination tree.
-        downward: A⁻¹ above BA⁻¹ for each level, (fronts, s + r, s).
+        downward: A⁻¹ above BA⁻¹ for each level, of the tree or merged, (fronts, s + r, s).
         upward: (BA⁻¹)ᵀ, (fronts, s, r).
         negative: how many eigenvalues are negative: by Sylvester's law of inertia, the number of the pencil's
             eigenvalues below σ.
@@ -136,8 +138,31 @@ def _eliminate(
 
     levels = eliminate(dissection, matrix, inverted)
     downward = tuple(jnp.concatenate(level, axis=1) for level in levels)
-    upward = tuple(jnp.swapaxes(coupling, 1, 2) for _, coupling in levels)
+    upward = tuple(transposed(coupling) for _, coupling in levels)
+    if dissection.merged is not None:
+        downward, upward = _merged(dissection.levels, dissection.merged, downward, upward)
     return downward, upward, jnp.sum(jnp.concatenate(pivots) < 0)
+
+
+def _merged(
+    levels: tuple[Level, ...], merged: Merged, downward: tuple[Array, ...], upward: tuple[Array, ...]
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return the matrices of merged levels: what substitution along the levels in them makes of the identity."""
+    inverses, couplings, first = [], [], 0
+    for rows, places in zip(merged.rows, merged.places, strict=True):
+        (fronts, s), group = places.shape, slice(first, first + len(rows))
+        first = group.stop
+        if len(rows) == 1:
+            inverses.append(downward[group][0])
+            couplings.append(upward[group][0])
+            continue
+        within = tuple(Level(own, *level[1:]) for own, level in zip(rows, levels[group], strict=True))
+        identity = jnp.tile(jnp.eye(s, dtype=downward[0].dtype), (fronts, 1))
+        x, passed = _substituted(within, downward[group], upward[group], identity)
+        inverse = x.at[places].get(mode="fill", fill_value=0, wrap_negative_indices=False)
+        inverses.append(jnp.concatenate([inverse, -passed], axis=1))
+        couplings.append(-transposed(passed))
+    return tuple(inverses), tuple(couplings)
 
 
 def eliminate(
@@ -179,28 +204,40 @@ def eliminate(
 
 @jax.jit
 def _solve(factor: Factorisation, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+    tree = factor.dissection.merged or factor.dissection
+    x, _ = _substituted(tree.levels, factor.downward, factor.upward, rhs)
+    return taken(x, tree.order)
+
+
+def _substituted(
+    levels: tuple[Level, ...], downward: tuple[Array, ...], upward: tuple[Array, ...], rhs: Float[Array, "n b"]
+) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
+    """Solve along some levels: zero at the boundary of the first of them.
+
+    Returns:
+        The solution at the own nodes of the levels, concatenated, and what it leaves to the boundary.
+    """
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None
-    for level, matrix in zip(factor.dissection.levels[::-1], factor.downward[::-1], strict=True):
+    for level, matrix in zip(levels[::-1], downward[::-1], strict=True):
         s = level.own.shape[1]
         force, onward = taken(rhs, level.own), jnp.zeros((), rhs.dtype)
         if passed is not None:
             # What a child does not have is found in the row of zeros.
-            padded = jnp.concatenate([passed, jnp.zeros((1, width), rhs.dtype)])
-            total = taken(padded, level.children[0]) + taken(padded, level.children[1])
+            padded = jnp.pad(passed.reshape(-1, width), ((0, 1), (0, 0)))
+            total = sum((taken(padded, places) for places in level.children), jnp.zeros((), rhs.dtype))
             force, onward = force + total[:, :s], total[:, s:]
-        product = jnp.matmul(matrix, force, precision="highest")
+        product = batched(matrix, force)
         own.append(product[:, :s])
-        passed = (onward - product[:, s:]).reshape(-1, width)
-    solutions: list[Array] = []
-    above = jnp.zeros((0, width), rhs.dtype)
-    for level, matrix in zip(factor.dissection.levels, factor.upward, strict=True):
+        passed = onward - product[:, s:]
+    assert passed is not None
+    solutions, boundary = [own.pop()], jnp.zeros_like(passed)
+    for level, matrix in zip(levels[1:], upward[1:], strict=True):
+        above = jnp.concatenate([solutions[-1], boundary], axis=1).reshape(-1, width)
         boundary = taken(above, level.boundary)
-        x = own.pop() - jnp.matmul(matrix, boundary, precision="highest")
-        above = jnp.concatenate([x, boundary], axis=1).reshape(-1, width)
-        solutions.append(x.reshape(-1, width))
-    return taken(jnp.concatenate(solutions), factor.dissection.order)
+        solutions.append(own.pop() - batched(matrix, boundary))
+    return jnp.concatenate([x.reshape(-1, width) for x in solutions]), passed
 
 
 def taken(x: Inexact[Array, "n *b"], index: Int[ArrayLike, "*m"]) -> Inexact[Array, "*m_and_b"]:

@@ -1,4 +1,4 @@
-"""A growing M-orthonormal basis of many long vectors, kept as rows."""
+"""A growing M-orthonormal basis of many long vectors, kept as rows; on accelerators as columns."""
 
 from itertools import accumulate
 from typing import NamedTuple
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.linear import accelerators
-from hks_jax.linear.products import combine, products_with_columns
+from hks_jax.linear.products import combine, gram, products_with_columns, times
 
 _PIECE = 128
 """Rows kept together: vectors are projected on whole pieces, but not on those that are still empty."""
@@ -27,17 +27,18 @@ class Piece(NamedTuple):
     single: Float[Array, "rows n_dof"] | None
 
 
-Basis = tuple[Piece, ...]
+Basis = tuple[Piece, ...] | Float[Array, "n_dof rows"]
 
 
 def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
     """Return a basis of the known vectors, with room for ``size`` rows in all; the others are zero.
 
     Known vectors and size are multiples of ``block``, which is how many rows are written at once. On accelerators it is
-    one piece in its own precision: to find out what may be left out, they wait longer than to compute it.
+    one array in its own precision: to find out what may be left out, they wait longer than to compute it; and its
+    vectors are columns, as blocks are, for which no kernel has to transpose any.
     """
     if accelerators.at_hand():
-        return (Piece(jnp.pad(known, ((0, size - len(known)), (0, 0))), None),)
+        return jnp.pad(known.T, ((0, 0), (0, size - len(known))))
     step = max(_PIECE // block, 1) * block
     pieces = []
     for at in range(0, size, step):
@@ -49,6 +50,8 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
 
 def write(basis: Basis, block: Float[Array, "n_dof b"], row: Int[Array, ""]) -> Basis:
     """Return the basis with columns as its rows from the given one on, a multiple of b."""
+    if not isinstance(basis, tuple):
+        return jax.lax.dynamic_update_slice_in_dim(accelerators.row_by_row(basis), block, row, axis=1)
     # The barrier keeps XLA from transposing anew for each piece.
     block, written = jax.lax.optimization_barrier(block.T), []
     for piece, at in zip(basis, _starts(basis), strict=True):
@@ -63,11 +66,10 @@ def write(basis: Basis, block: Float[Array, "n_dof b"], row: Int[Array, ""]) -> 
 # what two steps make of rounding is c = VᵀMx of 1e-14 to 1e-9. Its sums need double precision, as rounding is otherwise
 # as large as c itself. To take Vc away does not: single precision leaves 6e-8 c. Where the shift is so near to an
 # eigenvalue that c is not small, V is taken in its own precision.
-def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "c n_dof"]:
-    """Return what columns x, given as Mx, have in the first rows of the basis, as rows: (VᵀMx)ᵀVᵀ."""
-    if accelerators.at_hand():
-        rows = basis[0].rows
-        return accelerators.row_by_row(combine(products_with_columns(rows, images).T, rows))
+def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
+    """Return what columns x, given as Mx, have in the first vectors of the basis: VVᵀMx."""
+    if not isinstance(basis, tuple):
+        return times(accelerators.row_by_row(basis), gram(basis, images))
     used = [filled > at for at in _starts(basis)]
 
     def none(rows: Array, x: Array) -> Float[Array, "rows c"]:
@@ -89,15 +91,15 @@ def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]
     whole = [piece.rows for piece in basis]
     single = [piece.single for piece in basis if piece.single is not None]
     if not single:
-        return taken(whole)
+        return taken(whole).T
     small: Bool[Array, ""] = jnp.max(jnp.abs(jnp.concatenate(products))) < _SMALL
-    return jax.lax.cond(small, lambda: taken(single), lambda: taken(whole))
+    return jax.lax.cond(small, lambda: taken(single), lambda: taken(whole)).T
 
 
 def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     """Return many linear combinations of all rows of the basis."""
-    if accelerators.at_hand():
-        return combine(mix, basis[0].rows)
+    if not isinstance(basis, tuple):
+        return combine(mix, basis.T)
     n = basis[0].rows.shape[1]
     width = min(_NODES, n)
     mixes = jnp.split(mix, _starts(basis)[1:], axis=1)

@@ -1,20 +1,21 @@
 """Block Lanczos for the eigenvalues nearest to a shift."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.basis import Basis, begin, combined, within, write
-from hks_jax.linear import accelerators, orthonormal_kernel
+from hks_jax.eigen.lanczos.columns import orthonormal, recur, without
+from hks_jax.linear import accelerators
 from hks_jax.linear.multifrontal import Factorisation
-from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, gram, products_with_columns, times
+from hks_jax.linear.products import combine, products_with_columns
 from hks_jax.traced import is_traced
 
 _STRETCH = 16
@@ -27,7 +28,8 @@ class ShiftedSolve(NamedTuple):
     Attributes:
         factor: the factorisation of K − σM.
         shift: σ.
-        passes: how often to solve: once, or again with the defect, where the factorisation is inaccurate.
+        passes: how often to solve: once, or again with the defect, where the factorisation is inaccurate; at most twice
+            on accelerators.
     """
 
     factor: Factorisation
@@ -50,14 +52,12 @@ class _Recurrence(NamedTuple):
     Attributes:
         basis: known eigenvectors and the blocks so far, M-orthonormal rows; the rest is zero.
         blocks: the last two blocks, of which the latter is not yet in the basis.
-        diagonal: the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV.
-        below: the blocks below it.
+        matrix: the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, and those below it.
     """
 
     basis: Basis
     blocks: _Blocks
-    diagonal: Float[Array, "steps b b"]
-    below: Float[Array, "steps b b"]
+    matrix: Float[Array, "steps two b b"]
 
 
 def block_lanczos(
@@ -115,10 +115,10 @@ def _begin(
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2):
         block = block - combine(products_with_columns(known, mass(block)).T, known).T
-        block, image, _ = _orthonormal(mass, block)
+        block, image, _ = orthonormal(mass, block)
     basis = begin(known, len(known) + room * b, b)
-    none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, b, b), start.dtype)
-    return _Recurrence(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix, matrix)
+    none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, 2, b, b), start.dtype)
+    return _Recurrence(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix)
 
 
 @jit_quickly(static_argnames="offset", donate_argnames="state")
@@ -131,14 +131,21 @@ def _advance(
     last: int | Array,
 ) -> _Recurrence:
     """Take the steps from the first to before the last; their blocks begin at the basis' row ``offset``."""
-    step, every = _stepping(pencil, shifted, offset), _every(state.blocks.block.dtype)
+    every = _every(state.blocks.block.dtype)
     if accelerators.at_hand():
-        # Whether to project is known of every step in two.
-        def two(number: Array, state: _Recurrence) -> _Recurrence:
-            return step(2 * number + 1, step(2 * number, state, every == 1), True)
+        # Whether to project is known of every step in two. How often to solve is asked once, and not in each step, for
+        # which the host would wait.
+        def by_two(passes: int, state: _Recurrence) -> _Recurrence:
+            steps = _stepping(pencil, shifted._replace(passes=passes), offset)
+            return jax.lax.fori_loop(
+                first // 2, last // 2, lambda two, state: steps(2 * two, state, (every == 1, True)), state
+            )
 
-        return jax.lax.fori_loop(first // 2, last // 2, two, state)
-    return jax.lax.fori_loop(first, last, lambda number, state: step(number, state, (number + 1) % every == 0), state)
+        return jax.lax.cond(_in_any(jnp.asarray(shifted.passes > 1)), partial(by_two, 2), partial(by_two, 1), state)
+    steps = _stepping(pencil, shifted, offset)
+    return jax.lax.fori_loop(
+        first, last, lambda number, state: steps(number, state, ((number + 1) % every == 0,)), state
+    )
 
 
 @jit_quickly(static_argnames=("offset", "passes"), donate_argnames="state")
@@ -152,14 +159,14 @@ def _advance_by_two(
     passes: int,
 ) -> _Recurrence:
     """Take two steps without a loop or a condition, so that nothing has to wait for the device."""
-    step, number = _stepping(pencil, ShiftedSolve(factor, shift, passes), offset), jnp.asarray(first)
-    return step(number + 1, step(number, state, _every(state.blocks.block.dtype) == 1), True)
+    steps = _stepping(pencil, ShiftedSolve(factor, shift, passes), offset)
+    return steps(jnp.asarray(first), state, (_every(state.blocks.block.dtype) == 1, True))
 
 
 def _stepping(
     pencil: SymmetricPencil, shifted: ShiftedSolve, offset: int
-) -> Callable[[Array, _Recurrence, bool | Array], _Recurrence]:
-    """Return how to take a step: of its number, the state, and whether to project on the whole basis."""
+) -> Callable[[Array, _Recurrence, tuple[bool | Array, ...]], _Recurrence]:
+    """Return how to take steps: of the first one's number, the state, and whether each projects on the whole basis."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     factor, shift, passes = shifted
 
@@ -177,32 +184,50 @@ def _stepping(
             return jax.lax.fori_loop(0, passes - 1, refined, factor.solve_columns(rhs))
         return jax.lax.fori_loop(0, passes, refine, (jnp.zeros_like(rhs), rhs))[0]
 
-    def step(number: Array, state: _Recurrence, now: bool | Array) -> _Recurrence:
+    def step(
+        number: Array, basis: Basis, blocks: _Blocks, now: bool | Array
+    ) -> tuple[Basis, _Blocks, Float[Array, "two b b"]]:
         # Write the last block into the basis, and find the one that follows it.
-        _, block, image, _ = state.blocks
+        before, block, image, coupling = blocks
         b = block.shape[1]
-        solved = solve(image)
-        diagonal, onward = _recur(state.blocks, solved)
+        onward, diagonal = recur(block, image, before, coupling, solve(image))
         row = offset + b * number
 
         def project(block: Array, onward: Array) -> tuple[Array, Array]:
-            parts = within(state.basis, jnp.concatenate([image, mass(onward)], axis=1), row)
-            block, onward = block - parts[:b].T, onward - parts[b:].T
-            return block, onward - times(block, gram(image, onward))
+            parts = within(basis, jnp.concatenate([image, mass(onward)], axis=1), row)
+            block = block - parts[:, :b]
+            return block, without(block, image, onward - parts[:, b:])
 
         if not isinstance(now, bool):
             block, onward = jax.lax.cond(now, project, lambda block, onward: (block, onward), block, onward)
         elif now:
             block, onward = project(block, onward)
-        following, its_image, coupling = _orthonormal(mass, onward)
-        return _Recurrence(
-            write(state.basis, block, row),
-            _Blocks(block, following, its_image, coupling),
-            state.diagonal.at[number].set(diagonal),
-            state.below.at[number].set(coupling),
-        )
+        following, its_image, coupling = orthonormal(mass, onward)
+        blocks = _Blocks(block, following, its_image, coupling)
+        return write(basis, block, row), blocks, jnp.stack([diagonal, coupling])
 
-    return step
+    def steps(number: Array, state: _Recurrence, projecting: tuple[bool | Array, ...]) -> _Recurrence:
+        basis, blocks, entries = state.basis, state.blocks, []
+        for ahead, now in enumerate(projecting):
+            basis, blocks, entry = step(number + ahead, basis, blocks, now)
+            entries.append(entry)
+        matrix = jax.lax.dynamic_update_slice_in_dim(state.matrix, jnp.stack(entries), number, axis=0)
+        return _Recurrence(basis, blocks, matrix)
+
+    return steps
+
+
+# Of a condition that differs within a batch both branches would be computed, for all of it. To solve again is right
+# where it is not needed, too.
+@jax.custom_batching.custom_vmap
+def _in_any(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Return a condition; within a batch, whether it holds for any problem of it."""
+    return condition
+
+
+@_in_any.def_vmap
+def _in_any_of_batch(size: int, batched: list[bool], conditions: Bool[Array, " batch"]) -> tuple[Bool[Array, ""], bool]:
+    return jnp.any(conditions), False
 
 
 def _every(dtype: np.dtype) -> int:
@@ -214,56 +239,16 @@ def _every(dtype: np.dtype) -> int:
     return 2 if jnp.finfo(dtype).bits == 64 else 1
 
 
-def _recur(blocks: _Blocks, x: Float[Array, "n_dof b"]) -> tuple[Float[Array, "b b"], Float[Array, "n_dof b"]]:
-    """Return what x = (K − σM)⁻¹M · block has in the block itself, and x without that block and the one before."""
-    before, block, image, coupling = blocks
-    diagonal = gram(image, x)
-    diagonal = (diagonal + diagonal.T) / 2
-    return diagonal, x - times(block, diagonal) - times(before, coupling)
-
-
-def _orthonormal(
-    mass: OfColumns, x: Float[Array, "n_dof b"]
-) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"], Float[Array, "b b"]]:
-    """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ."""
-    total = jnp.eye(x.shape[1], dtype=x.dtype)
-    for _ in range(2):
-        image = mass(x)
-        products = gram(x, image)
-        factor, change = _factored(products)
-        x = times(x, change)
-        total = times(total, factor)
-    return x, times(image, change), total
-
-
-def _factored(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float[Array, "b b"]]:
-    """Return F with FFᵀ = G, the inner products, and F⁻ᵀ, of what rounding leaves: nothing becomes infinite.
-
-    By eigenvalues; where kernels compile, for which these take long, by a pivoted Cholesky factorisation.
-    """
-    if accelerators.kernels_compile() and len(products) <= orthonormal_kernel.LARGEST:
-        kernel = orthonormal_kernel.cholesky_and_inverse
-        return jax.lax.platform_dependent(products, cuda=kernel, default=_factored_by_eigenvalues)
-    return _factored_by_eigenvalues(products)
-
-
-def _factored_by_eigenvalues(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float[Array, "b b"]]:
-    norms = jnp.sqrt(jnp.diagonal(products))
-    norms = jnp.where(norms > 0, norms, 1)
-    sizes, mix = jnp.linalg.eigh(products / norms / norms[:, None])
-    sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(products.dtype).eps * sizes[-1]))
-    return norms[:, None] * mix * sizes, mix / sizes / norms[:, None]
-
-
 @jit_quickly(static_argnames=("offset", "wanted"))
 def _ritz_pairs(
     state: _Recurrence, offset: int, steps: int | Int[Array, ""], wanted: int
 ) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
-    room, b, _ = state.diagonal.shape
+    room, _, b, _ = state.matrix.shape
     i = jnp.arange(room)
+    diagonal, below = state.matrix[:, 0], state.matrix[:-1, 1]
     # The last block is coupled to one that is not in the basis.
-    below = jnp.where((i < steps - 1)[:, None, None], state.below, 0)[:-1]
-    full = jnp.zeros((room, b, room, b), below.dtype).at[i, :, i, :].set(state.diagonal)
+    below = jnp.where((i[:-1] < steps - 1)[:, None, None], below, 0)
+    full = jnp.zeros((room, b, room, b), below.dtype).at[i, :, i, :].set(diagonal)
     full = full.at[i[:-1], :, i[1:], :].set(below)
     full = full.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
     theta, modes = jnp.linalg.eigh(full.reshape(room * b, room * b))

@@ -82,7 +82,9 @@ def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float
     window, shifted = _window(problem, plan, state), ShiftedSolve(factor, state.shift, state.passes)
     ritz = block_lanczos(problem.pencil, shifted, state.start, window.vectors, plan.steps, window.steps, plan.ritz)
     interval = window.low, window.high
-    return _accept(problem, plan, tolerance, ritz, interval, state.vectors, state._replace(vectors=None))
+    order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
+    # Apart, so that nothing else is in memory besides the two arrays of vectors.
+    return following._replace(vectors=_stored(state.vectors, ritz[1], order, state.known))
 
 
 @jit_quickly(static_argnames="plan")
@@ -101,20 +103,32 @@ def _window(problem: Problem, plan: Plan, state: SlicingState) -> Window:
     return Window(vectors, low, high, jnp.minimum(steps_for(plan, size), plan.steps))
 
 
-@jit_quickly(static_argnames=("plan", "tolerance"), donate_argnames="known_vectors")
+@jit_quickly(donate_argnames="known_vectors")
+def _stored(
+    known_vectors: Float[Array, "capacity n_dof"],
+    vectors: Float[Array, "ritz n_dof"],
+    order: Int[Array, " ritz"],
+    known: Int[Array, ""],
+) -> Float[Array, "capacity n_dof"]:
+    """Return the known vectors with others, in that order, behind them: in place."""
+    return jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], known, 0)
+
+
+@jit_quickly(static_argnames=("plan", "tolerance"))
 def _accept(
     problem: Problem,
     plan: Plan,
     tolerance: float,
     ritz: tuple[Float[Array, " ritz"], Float[Array, "ritz n_dof"]],
     interval: tuple[Float[Array, ""], Float[Array, ""]],
-    known_vectors: Float[Array, "capacity n_dof"],
     state: SlicingState,
-) -> SlicingState:
+) -> tuple[Int[Array, " ritz"], SlicingState]:
     """Take what converged of the Ritz pairs in the interval, and choose the next shift.
 
-    What is known outside that interval may have been found again: nothing out there is taken. The state's eigenvectors
-    come apart from it, and are overwritten.
+    What is known outside that interval may have been found again: nothing out there is taken.
+
+    Returns:
+        In which order to store the Ritz vectors, those that are taken first, and the state without its vectors.
     """
     (theta, vectors), (low, high) = ritz, interval
     shift, index, dtype = state.shift, jnp.arange(plan.capacity), vectors.dtype
@@ -145,7 +159,6 @@ def _accept(
     count = jnp.sum(accepted)
     new = jnp.where(jnp.arange(plan.ritz) < count, values[order], jnp.inf)
     all_values = jax.lax.dynamic_update_slice_in_dim(state.values, new, state.known, 0)
-    all_vectors = jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], state.known, 0)
     known = state.known + count
     # Between the shift and the end all are known.
     gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
@@ -162,7 +175,6 @@ def _accept(
     noise = 0.01 * jnp.std(vectors) * jnp.roll(state.noise, state.slices, axis=0)
     state = state._replace(
         values=all_values,
-        vectors=all_vectors,
         known=known,
         reached=jnp.where(
             complete, jnp.maximum(gapless, state.reached), jnp.where(seen, state.reached, state.complete_below)
@@ -173,7 +185,7 @@ def _accept(
         passes=jnp.where(complete | stuck, 1, 2),
         stuck=stuck,
     )
-    return state._replace(shift=jnp.where(complete, _next_shift(problem, plan, state), again))
+    return order, state._replace(shift=jnp.where(complete, _next_shift(problem, plan, state), again))
 
 
 def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Float[Array, ""]:

@@ -1,0 +1,257 @@
+"""What block Lanczos does with blocks of a few long columns, in one launch of a kernel each, for CUDA devices.
+
+Written with XLA's operations, inner products and what is made of them take four launches: parts of the sums, their sum,
+a small matrix computed from it, and combinations of columns. Instead the parts go to the kernel that needs them: each
+of its programs adds them up, computes the small matrix for itself, and combines its own rows.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+LARGEST = 32
+"""Columns of the widest blocks."""
+
+_SMALLEST = 8
+_NUMBERS = 1 << 13
+"""Numbers of which a program keeps sums at once."""
+_PARTS, _ROWS = 256, 512
+"""Parts of a sum at most, and rows of each at least."""
+
+
+def parts_of_products(
+    x: Float[Array, "n b"], y: Float[Array, "n b"], interpret: bool = False
+) -> Float[Array, "parts b b"]:
+    """Return xᵀy in parts, to be added up.
+
+    Args:
+        x: columns.
+        y: as many.
+        interpret: whether to run on any device by XLA's operations instead, for tests.
+    """
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    (n, b), size = x.shape, _padded(x.shape[1])
+    tile = max(_NUMBERS // size**2, 1)
+    parts, rows = _divided(n, tile)
+
+    def kernel(x: Any, y: Any, products: Any) -> None:
+        index = jax.lax.broadcasted_iota(jnp.int32, (tile, size), 0)
+        column = jax.lax.broadcasted_iota(jnp.int32, (tile, size), 1)
+        left_over = n - pl.program_id(0) * rows
+
+        def add(number: Array, total: Array) -> Array:
+            own = pl.ds(number * tile, tile)
+            inside = (number * tile + index < left_over) & (column < b)
+            left = triton.load(x.at[own, :], mask=inside, other=0)
+            right = triton.load(y.at[own, :], mask=inside, other=0)
+            return total + left[:, :, None] * right[:, None, :]
+
+        total = jax.lax.fori_loop(0, rows // tile, add, jnp.zeros((tile, size, size), products.dtype))
+        triton.store(products.at[:, :], jnp.sum(total, axis=0), mask=_square(size, b))
+
+    block = pl.BlockSpec((rows, size), lambda i: (i, 0))
+    return pl.pallas_call(
+        kernel,
+        grid=(parts,),
+        in_specs=[block, block],
+        out_specs=pl.BlockSpec((None, size, size), lambda i: (i, 0, 0)),
+        out_shape=jax.ShapeDtypeStruct((parts, b, b), x.dtype),
+        compiler_params=triton.CompilerParams(num_warps=8, num_stages=1),
+        interpret=interpret,
+        name="parts_of_products",
+    )(x, y)
+
+
+def remainder(
+    x: Float[Array, "n b"],
+    block: Float[Array, "n b"],
+    parts: Float[Array, "parts b b"],
+    before: tuple[Float[Array, "n b"], Float[Array, "b b"]] | None = None,
+    interpret: bool = False,
+) -> tuple[Float[Array, "n b"], Float[Array, "b b"]]:
+    """Return x less the block times D, and D.
+
+    Args:
+        x: columns.
+        block: what they have of these is taken away.
+        parts: D in parts.
+        before: another block and its coefficients, of which x loses the product too; D is then made symmetric.
+        interpret: whether to run on any device by XLA's operations instead, for tests.
+    """
+    columns, matrices = ((x, block), ()) if before is None else ((x, block, before[0]), before[1:])
+
+    def small(total: Array, *matrices: Array) -> tuple[_Terms, Array]:
+        total = (total + total.T) / 2 if matrices else total
+        return [[(0, None), (1, -total), *((2, -matrix) for matrix in matrices)]], total
+
+    (rest,), total = _combined(small, parts, matrices, columns, 1, interpret, "remainder")
+    return rest, total
+
+
+def orthonormal(
+    parts: Float[Array, "parts b b"],
+    columns: tuple[Float[Array, "n b"], ...],
+    before: Float[Array, "b b"],
+    interpret: bool = False,
+) -> tuple[tuple[Float[Array, "n b"], ...], Float[Array, "b b"]]:
+    """Return columns times F⁻ᵀ, and a matrix times F, where FFᵀ = G: with G = xᵀMx the columns xF⁻ᵀ are M-orthonormal.
+
+    For F the columns are scaled to length one, and taken in the order of what the ones before leave of them; of those
+    that depend on the ones before, to rounding, the least length that rounding tells from zero is kept.
+
+    Args:
+        parts: G in parts, at most 32 rows.
+        columns: one or several blocks.
+        before: the matrix.
+        interpret: whether to run on any device by XLA's operations instead, for tests.
+    """
+    b = len(before)
+    floor = b * float(jnp.finfo(before.dtype).eps)
+
+    def small(total: Array, before: Array) -> tuple[_Terms, Array]:
+        size = total.shape[0]
+        diagonal, inside = _identity(size), _square(size, b)
+        norms = jnp.sqrt(jnp.sum(jnp.where(diagonal, total, 0), axis=1))
+        norms = jnp.where(norms > 0, norms, 1)
+        scaled = jnp.where(diagonal & ~inside, 1, total / norms[:, None] / norms[None, :])
+        lower, inverted = _pivoted_cholesky(scaled, floor, b)
+        change = inverted / norms[:, None]
+        return [[(number, change)] for number in range(len(columns))], _product(before, norms[:, None] * lower)
+
+    return _combined(small, parts, (before,), columns, len(columns), interpret, "orthonormal")
+
+
+_Terms = list[list[tuple[int, Array | None]]]
+"""For each block of columns that is wanted the sum of which blocks times which matrices it is, None the identity."""
+
+
+def _combined(
+    small: Callable[..., tuple[_Terms, Array]],
+    parts: Float[Array, "parts b b"],
+    matrices: tuple[Float[Array, "b b"], ...],
+    columns: tuple[Float[Array, "n b"], ...],
+    wanted: int,
+    interpret: bool,
+    name: str,
+) -> tuple[tuple[Float[Array, "n b"], ...], Float[Array, "b b"]]:
+    """Return combinations of blocks of columns, and a small matrix, as computed from a sum in parts and matrices."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    (n, b), size, dtype = columns[0].shape, _padded(columns[0].shape[1]), parts.dtype
+    tile, several = max(_NUMBERS // size**2, 1), max(_NUMBERS // size**2 // 8, 1)
+    programs, rows = _divided(n, tile)
+
+    def kernel(*references: Any) -> None:
+        first_column, first_result = 1 + len(matrices), 1 + len(matrices) + len(columns)
+        parts, own_matrices = references[0], references[1:first_column]
+        blocks, results = references[first_column:first_result], references[first_result:-1]
+        square, first = _square(size, b), pl.program_id(0) == 0
+        left_over = n - pl.program_id(0) * rows
+
+        def add(number: Array, total: Array) -> Array:
+            which = number * several + jax.lax.broadcasted_iota(jnp.int32, (several, size, size), 0)
+            inside = (which < count) & square[None]
+            part = triton.load(parts.at[pl.ds(number * several, several), :, :], mask=inside, other=0)
+            return total + jnp.sum(part, axis=0)
+
+        total = jax.lax.fori_loop(0, -(-count // several), add, jnp.zeros((size, size), dtype))
+        loaded = [triton.load(matrix.at[:, :], mask=square, other=0) for matrix in own_matrices]
+        terms, matrix = small(total, *loaded)
+        triton.store(references[-1].at[:, :], matrix, mask=square & first)
+        index = jax.lax.broadcasted_iota(jnp.int32, (tile, size), 0)
+        column = jax.lax.broadcasted_iota(jnp.int32, (tile, size), 1)
+
+        def combine(number: Array, _: None) -> None:
+            own = pl.ds(number * tile, tile)
+            inside = (number * tile + index < left_over) & (column < b)
+            given = [triton.load(block.at[own, :], mask=inside, other=0) for block in blocks]
+            for result, sums in zip(results, terms, strict=True):
+                products = [given[k] if mix is None else _product(given[k], mix) for k, mix in sums]
+                triton.store(result.at[own, :], sum(products[1:], products[0]), mask=inside)
+
+        jax.lax.fori_loop(0, rows // tile, combine, None)
+
+    count = len(parts)
+    whole = pl.BlockSpec((size, size), lambda i: (0, 0))
+    block = pl.BlockSpec((rows, size), lambda i: (i, 0))
+    *results, matrix = pl.pallas_call(
+        kernel,
+        grid=(programs,),
+        in_specs=[
+            pl.BlockSpec((-(-count // several) * several, size, size), lambda i: (0, 0, 0)),
+            *[whole] * len(matrices),
+            *[block] * len(columns),
+        ],
+        out_specs=[*[block] * wanted, whole],
+        out_shape=[*[jax.ShapeDtypeStruct((n, b), dtype)] * wanted, jax.ShapeDtypeStruct((b, b), dtype)],
+        compiler_params=triton.CompilerParams(num_warps=8, num_stages=1),
+        interpret=interpret,
+        name=name,
+    )(parts, *matrices, *columns)
+    return tuple(results), matrix
+
+
+def _padded(b: int) -> int:
+    """Return a power of two, as Triton's arrays need it, that is not below b."""
+    return max(_SMALLEST, 1 << (b - 1).bit_length())
+
+
+def _divided(n: int, tile: int) -> tuple[int, int]:
+    """Return among how many programs to divide n rows, and how many rows, in whole tiles, each takes."""
+    rows = max(-(-n // _PARTS), min(_ROWS, n))
+    rows = -(-rows // tile) * tile
+    return -(-n // rows), rows
+
+
+def _identity(size: int) -> Bool[Array, "size size"]:
+    index = jax.lax.broadcasted_iota(jnp.int32, (size,), 0)
+    return index[:, None] == index[None, :]
+
+
+def _square(size: int, b: int) -> Bool[Array, "size size"]:
+    """Return what of a padded matrix belongs to it."""
+    index = jax.lax.broadcasted_iota(jnp.int32, (size,), 0)
+    return (index < b)[:, None] & (index < b)[None, :]
+
+
+def _product(x: Float[Array, "m s"], y: Float[Array, "s s"]) -> Float[Array, "m s"]:
+    return jnp.sum(x[:, :, None] * y[None, :, :], axis=1)
+
+
+def _pivoted_cholesky(
+    a: Float[Array, "n n"], floor: float, rank: int
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """Return F with FFᵀ = A but for pivots that are raised to the floor, and F⁻ᵀ; the first ``rank`` columns of both.
+
+    The k-th column of C = F⁻ᵀ follows from CFᵀ = I, whose column for the k-th row p chosen has no terms beyond: F[p, k]
+    times it is e_p less those of the columns before.
+    """
+    index = jax.lax.broadcasted_iota(jnp.int32, (a.shape[0],), 0)
+
+    def eliminate(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        a, left, factor, inverse = state
+        diagonal = jnp.sum(jnp.where(index[:, None] == index[None, :], a, 0), axis=1)
+        chosen = index == jax.lax.argmax(jnp.where(left > 0, diagonal, -jnp.inf), 0, jnp.int32)
+        root = jnp.sqrt(jnp.maximum(jnp.sum(jnp.where(chosen, diagonal, 0), axis=0), floor))
+        column = jnp.sum(jnp.where(chosen[None, :], a, 0), axis=1) / root
+        column = jnp.where(chosen, root, jnp.where(left > 0, column, 0))
+        before = jnp.sum(jnp.where(chosen[:, None], factor, 0), axis=0)
+        its_inverse = (chosen.astype(a.dtype) - jnp.sum(inverse * before[None, :], axis=1)) / root
+        is_pivot = (index == k)[None, :]
+        factor, inverse = (
+            jnp.where(is_pivot, column[:, None], factor),
+            jnp.where(is_pivot, its_inverse[:, None], inverse),
+        )
+        return a - column[:, None] * column[None, :], jnp.where(chosen, 0, left), factor, inverse
+
+    # What is beyond the matrix is never chosen.
+    left = (index < rank).astype(a.dtype)
+    zeros = jnp.zeros_like(a)
+    _, _, factor, inverse = jax.lax.fori_loop(0, rank, eliminate, (a, left, zeros, zeros))
+    return factor, inverse
