@@ -78,6 +78,18 @@ def test_products_with_a_few_long_rows(matrix, rng):
     assert operator.structure.table.entries.size <= max(3 * matrix.nnz, matrix.shape[0])
 
 
+def test_tables_of_a_pattern_are_arguments_of_what_is_compiled(matrix, rng):
+    plain = hj.sparse_pencil(matrix)
+    pencil, x = plain.tabulated(), jnp.asarray(rng.standard_normal((matrix.shape[0], 3)))
+    largest = []
+    for each in (plain, pencil):
+        traced = jax.make_jaxpr(lambda p, x: (p.stiffness.of_columns()(x), p.stiffness.diagonal()))(each, x)
+        largest.append(max((np.size(constant) for constant in traced.consts), default=0))
+    assert largest[0] >= matrix.shape[0] > 1 >= largest[1]
+    np.testing.assert_allclose(pencil.stiffness.of_columns()(x), matrix @ x, atol=1e-12)
+    np.testing.assert_array_equal(pencil.stiffness.diagonal(), matrix.diagonal())
+
+
 def test_factorisation_of_any_pattern_solves_and_counts(matrix, rng):
     pencil = hj.sparse_pencil(matrix)
     factor = factorise(dissect(pencil.pattern), pencil.stiffness.flat())

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Inexact, Int
 from scipy.sparse import coo_matrix, csc_matrix
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.linear.pattern import Pattern, SparsePattern
+from hks_jax.linear.pattern import Ellpack, Pattern, SparsePattern
 
 Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
@@ -105,10 +105,13 @@ class SparseOperator(PatternedOperator):
     Attributes:
         entries: (m,) in the order of the pattern.
         structure: the pattern; static.
+        table: the pattern's table as arrays, which compiled computations take for arguments; None makes constants of
+            it, which the compiler reads. Of a million rows that takes seconds for each computation.
     """
 
     entries: Float[Array, " m"]
     structure: SparsePattern = eqx.field(static=True)
+    table: Ellpack | None = None
 
     @property
     def pattern(self) -> SparsePattern:
@@ -119,6 +122,14 @@ class SparseOperator(PatternedOperator):
         """Return the entries."""
         return self.entries
 
+    @property
+    def _places(self) -> Ellpack:
+        return self.pattern.table if self.table is None else self.table
+
+    def diagonal(self) -> Float[Array, " n_dof"]:
+        """Return the main diagonal."""
+        return self.entries[self._places.diagonal]
+
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""
         columns = jnp.moveaxis(x, -1, 0).reshape(self.size, -1)
@@ -126,17 +137,16 @@ class SparseOperator(PatternedOperator):
 
     def of_columns(self) -> OfColumns:
         """Return the product with a block of columns."""
-        table, pattern = self.pattern.table, self.pattern
+        table = self._places
         ordered = self.entries.at[table.entries].get(mode="fill", fill_value=0, wrap_negative_indices=False)
 
         def product(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
             y = jnp.zeros((), x.dtype)
             for entries, cols in zip(ordered, table.cols, strict=True):
                 y = y + entries[:, None] * x.at[cols].get(mode="promise_in_bounds")
-            if table.others.size:
-                rows, cols = pattern.rows[table.others], pattern.cols[table.others]
-                terms = self.entries[table.others, None] * x[cols]
-                y = y + jax.ops.segment_sum(terms, rows, pattern.size, indices_are_sorted=True)
+            if len(table.others):
+                terms = self.entries[table.others, None] * x[table.other_cols]
+                y = y + jax.ops.segment_sum(terms, table.other_rows, self.size, indices_are_sorted=True)
             return y
 
         return product

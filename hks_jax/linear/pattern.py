@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Int
 
 from hks_jax.linear.bisection import Parts, bisect_graph
 from hks_jax.static_array import StaticArray
@@ -40,12 +40,18 @@ class Ellpack(NamedTuple):
     Attributes:
         entries: (width, n) indices into the entries; out of range where a row has fewer.
         cols: (width, n) their columns.
-        others: (m,) the places of the entries that are left.
+        others: (m,) the places of the entries that are left,
+        other_rows: (m,) their rows,
+        other_cols: (m,) and their columns.
+        diagonal: (n,) the places of the diagonal entries.
     """
 
-    entries: Int[np.ndarray, "width n"]
-    cols: Int[np.ndarray, "width n"]
-    others: Int[np.ndarray, " m"]
+    entries: Int[np.ndarray | Array, "width n"]
+    cols: Int[np.ndarray | Array, "width n"]
+    others: Int[np.ndarray | Array, " m"]
+    other_rows: Int[np.ndarray | Array, " m"]
+    other_cols: Int[np.ndarray | Array, " m"]
+    diagonal: Int[np.ndarray | Array, " n"]
 
 
 _SCATTERED = 3
@@ -96,7 +102,8 @@ class SparsePattern(Pattern):
         entries = np.where(valid, start + slot, self.rows.size)
         cols = np.where(valid, self.cols[np.where(valid, entries, 0)], 0)
         others = np.flatnonzero(np.arange(self.rows.size) - start[self.rows] >= width)
-        return Ellpack(entries.astype(np.int32), cols.astype(np.int32), others.astype(np.int32))
+        fields = entries, cols, others, self.rows[others], self.cols[others], self.diagonal()
+        return Ellpack(*(field.astype(np.int32) for field in fields))
 
     def __eq__(self, other: object) -> bool:
         return self is other or (

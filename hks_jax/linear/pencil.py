@@ -1,10 +1,11 @@
 """A pair of symmetric matrices, of which one is positive definite: what eigensolvers know of a problem."""
 
 import equinox as eqx
+import jax
 from jaxtyping import Array, Float
 
-from hks_jax.linear.operators import Operator, PatternedOperator, shifted
-from hks_jax.linear.pattern import Pattern
+from hks_jax.linear.operators import Operator, PatternedOperator, SparseOperator, shifted
+from hks_jax.linear.pattern import Pattern, SparsePattern
 
 
 class SymmetricPencil(eqx.Module):
@@ -37,6 +38,18 @@ class SymmetricPencil(eqx.Module):
     def parts(self) -> tuple["SymmetricPencil", ...]:
         """The pencil itself: one problem."""
         return (self,)
+
+    def tabulated(self) -> "SymmetricPencil":
+        """Return the pencil with what products need of its pattern as arrays: to hand over to several computations."""
+        pattern = self.pattern
+        if not isinstance(pattern, SparsePattern):
+            return self
+        table = jax.device_put(pattern.table)
+        operators = tuple(
+            SparseOperator(x.entries, pattern, table) if isinstance(x, SparseOperator) else x
+            for x in (self.stiffness, self.mass)
+        )
+        return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), self, operators)
 
     def shifted(self, shift: Float[Array, ""]) -> Float[Array, " m"]:
         """Return the entries of K − σM at the places of K's pattern."""

@@ -71,6 +71,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         dissection = dissect(problem.pencil.pattern)
         if is_traced(problem):
             return _slice_traced(problem, dissection, plan, self.tolerance)
+        problem = problem._replace(pencil=problem.pencil.tabulated())
         dissection, state = jax.device_put(dissection), _first_state(problem, plan)
         while _unfinished(plan, state):
             factor, searchable, state = cut(problem, dissection, plan, self.tolerance, state)
