@@ -10,6 +10,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.quality import quality
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.pencil import tabulated
 
 
 def solve_part(
@@ -27,7 +28,8 @@ def solve_part(
             "Use a smaller k or the dense solver"
         )
     values, vectors, frame, following, complete_below = lowest(solver, pencil, k, extra, throw, report)
-    residuals, converged, *others = _quality(*jax.lax.stop_gradient((pencil, values, vectors)), solver.tolerance)
+    known = jax.lax.stop_gradient((tabulated(pencil), values, vectors))
+    residuals, converged, *others = _quality(*known, solver.tolerance)
     kept, part, multiplet_tolerance = others
     return Eigenpairs(
         values,

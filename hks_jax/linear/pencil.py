@@ -1,5 +1,7 @@
 """A pair of symmetric matrices, of which one is positive definite: what eigensolvers know of a problem."""
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 from jaxtyping import Array, Float
@@ -39,18 +41,22 @@ class SymmetricPencil(eqx.Module):
         """The pencil itself: one problem."""
         return (self,)
 
-    def tabulated(self) -> "SymmetricPencil":
-        """Return the pencil with what products need of its pattern as arrays: to hand over to several computations."""
-        pattern = self.pattern
-        if not isinstance(pattern, SparsePattern):
-            return self
-        table = jax.device_put(pattern.table)
-        operators = tuple(
-            SparseOperator(x.entries, pattern, table) if isinstance(x, SparseOperator) else x
-            for x in (self.stiffness, self.mass)
-        )
-        return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), self, operators)
-
     def shifted(self, shift: Float[Array, ""]) -> Float[Array, " m"]:
         """Return the entries of K − σM at the places of K's pattern."""
         return shifted(self.stiffness, self.mass, shift)
+
+
+P = TypeVar("P", bound=SymmetricPencil)
+
+
+def tabulated(pencil: P) -> P:
+    """Return a pencil with what products need of a sparse pattern as arrays, to hand over to several computations."""
+    pattern = pencil.pattern
+    if not isinstance(pattern, SparsePattern):
+        return pencil
+    table = jax.device_put(pattern.table)
+    operators = tuple(
+        SparseOperator(operator.entries, pattern, table) if isinstance(operator, SparseOperator) else operator
+        for operator in (pencil.stiffness, pencil.mass)
+    )
+    return eqx.tree_at(lambda p: (p.stiffness, p.mass), pencil, operators)

@@ -18,7 +18,7 @@ from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.dissection import Dissection, dissect
-from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 SLICE = 170
@@ -71,7 +71,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         dissection = dissect(problem.pencil.pattern)
         if is_traced(problem):
             return _slice_traced(problem, dissection, plan, self.tolerance)
-        problem = problem._replace(pencil=problem.pencil.tabulated())
+        problem = problem._replace(pencil=tabulated(problem.pencil))
         dissection, state = jax.device_put(dissection), _first_state(problem, plan)
         while _unfinished(plan, state):
             factor, searchable, state = cut(problem, dissection, plan, self.tolerance, state)
