@@ -300,7 +300,6 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
 
 def _report(args: argparse.Namespace, fit: "MetricFit", target: Target) -> dict[str, Any]:
     from hks_jax.inverse.metric_fit import RESULTS
-    from hks_jax.inverse.truncated import truncation_misfit
 
     chosen = ("init", "metric", "interpolation", "boundary", "noise", "smoothness", "h1", "tv", "max_steps")
     more = ("continuation", "starts", "seed", "optimiser", "checkpoint", "dtype")
@@ -320,7 +319,7 @@ def _report(args: argparse.Namespace, fit: "MetricFit", target: Target) -> dict[
         "steps": fit.steps,
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
-        "truncation_misfit": float(truncation_misfit(fit.problem, fit.values)),
+        "truncation_misfit": fit.truncation_misfit,
         "parametrisation": args.parametrisation,
         "settings": {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()},
     }

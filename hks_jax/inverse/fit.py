@@ -24,12 +24,12 @@ from hks_jax.inverse import checkpoint as files
 from hks_jax.inverse.method import choose_inner_product, choose_optimiser
 from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Loss, Observation, Signature, observe
-from hks_jax.inverse.optimise import Optimiser, loss_of, optimise
+from hks_jax.inverse.optimise import Optimiser, optimise
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
 from hks_jax.inverse.problem import Problem, most_pairs, pairs_below, pairs_for, unknowns_of
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.smoothing import InnerProduct
-from hks_jax.inverse.truncated import more_pairs, observed_times, truncation_misfit, truncation_shows
+from hks_jax.inverse.truncated import more_pairs, observed_times, outcome_of, truncation_shows
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
 
 
@@ -189,7 +189,7 @@ def fit_metric(
             step_size = 1.0
             if result in ("interrupted", "not finite"):
                 break
-        reached = float(loss_of(problems[-1], values)[0])
+        reached = float(outcome_of(problems[-1], values).loss)
         if not log.losses or not reached >= min(log.losses):
             log.best, best_result = values, result
         log.losses.append(reached)
@@ -201,8 +201,8 @@ def fit_metric(
     log.stage = len(problems)
     # k was chosen for the volume of the start: the fit may have come to more of it.
     while True:
-        final, misfit = map(float, loss_of(problem, log.best))
-        left = float(truncation_misfit(problem, log.best))
+        *numbers, pairs = outcome_of(problem, log.best)
+        final, misfit, left = map(float, numbers)
         shows = truncation_shows(misfit, left)
         wanted = more_pairs(problem, log.best) if shows and k is None else problem.k
         if wanted <= problem.k or best_result in ("interrupted", "not finite"):
@@ -211,6 +211,8 @@ def fit_metric(
         problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
         method = choose_optimiser(optimiser, problem, tolerance, noise, inner_product)
         log.best, best_result = optimise(problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock)
+    for message in pairs.messages():
+        warn_of_accuracy(message)
     if shows:
         warn_of_accuracy(
             f"k: {problem.k} eigenpairs leave out what amounts to a misfit of about {left:.1e}, and the fit's is "
@@ -218,7 +220,7 @@ def fit_metric(
             f"more; only if the target was itself computed with {problem.k} pairs is nothing wrong"
         )
     history, losses = tuple(log.history), tuple(log.losses)
-    return MetricFit(unknowns.field(log.best), final, misfit, history, best_result, log.best, problem, losses)
+    return MetricFit(unknowns.field(log.best), final, misfit, left, history, best_result, log.best, problem, losses)
 
 
 @dataclasses.dataclass

@@ -59,6 +59,8 @@ class MetricFit:
         field: the fitted metric.
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the part of the data.
+        truncation_misfit: an estimate of the misfit that the metric itself would have to a target of all eigenpairs, as
+            k are computed; 0 for signatures that k pairs define.
         history: one entry for each step.
         result: one of the keys of `RESULTS`, which say what they mean.
         values: the unknowns, as the parametrisation has them.
@@ -69,6 +71,7 @@ class MetricFit:
     field: TensorField
     loss: float
     misfit: float
+    truncation_misfit: float
     history: tuple[Step, ...]
     result: str
     values: Values

@@ -91,13 +91,6 @@ def _strongly_typed(state: Any) -> Any:
     return jax.tree.map(lambda x: x.astype(x.dtype) if eqx.is_array(x) else x, state)
 
 
-@eqx.filter_jit
-def loss_of(problem: Problem, values: Values) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the loss and the misfit."""
-    told = _residuals(values, problem)[1]
-    return told.loss, told.misfit
-
-
 def optimise(
     problem: Problem,
     values: Values,

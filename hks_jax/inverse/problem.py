@@ -54,10 +54,15 @@ class Problem(eqx.Module):
 
     def residuals(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"]]:
         """Return the residuals of the data and those of the penalties: half the sum of squares is the loss."""
+        return self.residuals_and_pairs(values)[:2]
+
+    def residuals_and_pairs(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Eigenpairs]:
+        """Return the residuals, and the eigenpairs from which they were computed."""
         field = self.unknowns.field(values)
-        data = self.observation.residuals(self._pairs_of(field))
+        pairs = self._pairs_of(field)
+        data = self.observation.residuals(pairs)
         penalties = [each.residuals(self.unknowns, values, field) for each in self.regularisers]
-        return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties])
+        return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties]), pairs
 
 
 def pairs_below(eigenvalue: float, pencil: Pencil | MirrorPencil, field: TensorField) -> int:

@@ -1,8 +1,10 @@
-"""What the eigenpairs beyond k would have added to a fit's residuals."""
+"""What a fit has come to, and what the eigenpairs beyond k would have added to its residuals."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,23 +21,41 @@ _NEAR = 0.1
 """A misfit is near to what truncation leaves where that is more than this part of it: a third of the residuals."""
 
 
-def truncation_misfit(problem: Problem, values: Values) -> Float[Array, ""]:
+class Outcome(NamedTuple):
+    """What a fit has come to.
+
+    Attributes:
+        loss: half the weighted mean square of the residuals, plus the penalties.
+        misfit: the part of the data.
+        truncation: see `truncation_misfit`.
+        pairs: the eigenpairs.
+    """
+
+    loss: Float[Array, ""]
+    misfit: Float[Array, ""]
+    truncation: Float[Array, ""]
+    pairs: Eigenpairs
+
+
+@eqx.filter_jit
+def outcome_of(problem: Problem, values: Values) -> Outcome:
+    """Return what a fit has come to with these unknowns."""
+    data, penalties, pairs = problem.residuals_and_pairs(values)
+    misfit = jnp.sum(data**2) / 2
+    return Outcome(misfit + jnp.sum(penalties**2) / 2, misfit, truncation_misfit(problem.observation, pairs), pairs)
+
+
+def truncation_misfit(observation: Observation, pairs: Eigenpairs) -> Float[Array, ""]:
     """Estimate the misfit that the metric itself would have to a target of all pairs, as k are computed.
 
     Half the weighted sum of squares of the changes of the residuals that the missing pairs make, by `truncation_map`
     (heat traces: `truncation`). Zero for other signatures, whose residuals are defined by k pairs.
     """
-    observation = problem.observation
     if observation.signature not in ("hks", "heat-trace"):
         return jnp.zeros(())
-    pairs = problem.pairs(values)
-    return _misfit_beyond(observation, pairs, observation.predict(pairs))
-
-
-@eqx.filter_jit
-def _misfit_beyond(observation: Observation, pairs: Eigenpairs, predicted: Array) -> Float[Array, ""]:
     assert observation.times is not None
-    nodal = observation.signature == "hks"
+    pairs = jax.lax.stop_gradient(pairs)
+    predicted, nodal = observation.predict(pairs), observation.signature == "hks"
     share = truncation_map(pairs, observation.times) if nodal else truncation(pairs, observation.times).tail
     change = observation.compare(predicted / (1 - share)) - observation.compare(predicted)
     return jnp.sum(change**2) / 2
