@@ -201,7 +201,7 @@ def fit_metric(
     log.stage = len(problems)
     # k was chosen for the volume of the start: the fit may have come to more of it.
     while True:
-        *numbers, pairs = outcome_of(problem, log.best)
+        *numbers, final_pairs = outcome_of(problem, log.best)
         final, misfit, left = map(float, numbers)
         shows = truncation_shows(misfit, left)
         wanted = more_pairs(problem, log.best) if shows and k is None else problem.k
@@ -211,7 +211,7 @@ def fit_metric(
         problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
         method = choose_optimiser(optimiser, problem, tolerance, noise, inner_product)
         log.best, best_result = optimise(problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock)
-    for message in pairs.messages():
+    for message in final_pairs.messages():
         warn_of_accuracy(message)
     if shows:
         warn_of_accuracy(
