@@ -29,7 +29,7 @@ from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisat
 from hks_jax.inverse.problem import Problem, most_pairs, pairs_below, pairs_for, unknowns_of
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.smoothing import InnerProduct
-from hks_jax.inverse.truncated import more_pairs, observed_times, outcome_of, truncation_shows
+from hks_jax.inverse.truncated import Outcome, more_pairs, observed_times, outcome_of, truncation_shows
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
 
 
@@ -172,6 +172,7 @@ def fit_metric(
         log.history, log.losses, log.best = list(resumed.history), list(resumed.losses), jnp.asarray(resumed.best)
         clock -= log.history[-1].seconds
     result = best_result = "interrupted"
+    outcome: Outcome | None = None  # of the best unknowns, as far as it is known
     # The last stage may be followed by one with more eigenpairs, in which no start is open any more.
     extended = resumed is not None and resumed.stage == len(problems)
     first_start = resumed.start if resumed else 0
@@ -189,9 +190,10 @@ def fit_metric(
             step_size = 1.0
             if result in ("interrupted", "not finite"):
                 break
-        reached = float(outcome_of(problems[-1], values).loss)
+        of_start = outcome_of(problems[-1], values)
+        reached = float(of_start.loss)
         if not log.losses or not reached >= min(log.losses):
-            log.best, best_result = values, result
+            log.best, best_result, outcome = values, result, of_start
         log.losses.append(reached)
         if result == "interrupted":
             break
@@ -201,7 +203,7 @@ def fit_metric(
     log.stage = len(problems)
     # k was chosen for the volume of the start: the fit may have come to more of it.
     while True:
-        *numbers, final_pairs = outcome_of(problem, log.best)
+        *numbers, final_pairs = outcome or outcome_of(problem, log.best)
         final, misfit, left = map(float, numbers)
         shows = truncation_shows(misfit, left)
         wanted = more_pairs(problem, log.best) if shows and k is None else problem.k
@@ -211,6 +213,7 @@ def fit_metric(
         problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
         method = choose_optimiser(optimiser, problem, tolerance, noise, inner_product)
         log.best, best_result = optimise(problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock)
+        outcome = None
     for message in final_pairs.messages():
         warn_of_accuracy(message)
     if shows:

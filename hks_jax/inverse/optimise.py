@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.metric_fit import Step
-from hks_jax.inverse.problem import Problem
+from hks_jax.inverse.problem import Problem, losses_of
 from hks_jax.inverse.unknowns import Values
 
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -43,10 +43,10 @@ def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
     They are scaled by the number of nodes, so that a step's curvature is of order one whatever the grid.
     """
     data, penalties = problem.residuals(values)
-    misfit = jnp.sum(data**2) / 2
+    loss, misfit = losses_of(data, penalties)
     everything = jnp.sqrt(len(values)) * jnp.concatenate([data, penalties])
     unknown = jnp.full((), jnp.nan, misfit.dtype)
-    return everything, _Told(values, misfit + jnp.sum(penalties**2) / 2, misfit, unknown)
+    return everything, _Told(values, loss, misfit, unknown)
 
 
 def _half_squares(values: Values, problem: Problem) -> tuple[Float[Array, ""], _Told]:

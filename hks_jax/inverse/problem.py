@@ -65,6 +65,12 @@ class Problem(eqx.Module):
         return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties]), pairs
 
 
+def losses_of(data: Float[Array, " m"], penalties: Float[Array, " r"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the loss, and the misfit, which is the part of the data."""
+    misfit = jnp.sum(data**2) / 2
+    return misfit + jnp.sum(penalties**2) / 2, misfit
+
+
 def pairs_below(eigenvalue: float, pencil: Pencil | MirrorPencil, field: TensorField) -> int:
     """Return about how many eigenvalues lie below one, by Weyl's law, and some more."""
     return math.ceil(1.1 * float(weyl_count(pencil, [eigenvalue], field)[0])) + 4

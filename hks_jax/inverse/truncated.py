@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.inverse.observation import Observation
-from hks_jax.inverse.problem import TAIL, Problem, pairs_below, unknowns_of
+from hks_jax.inverse.problem import TAIL, Problem, losses_of, pairs_below, unknowns_of
 from hks_jax.inverse.unknowns import Values
 from hks_jax.signatures.tail import resolving, truncation_map
 from hks_jax.signatures.truncation import truncation
@@ -41,8 +41,7 @@ class Outcome(NamedTuple):
 def outcome_of(problem: Problem, values: Values) -> Outcome:
     """Return what a fit has come to with these unknowns."""
     data, penalties, pairs = problem.residuals_and_pairs(values)
-    misfit = jnp.sum(data**2) / 2
-    return Outcome(misfit + jnp.sum(penalties**2) / 2, misfit, truncation_misfit(problem.observation, pairs), pairs)
+    return Outcome(*losses_of(data, penalties), truncation_misfit(problem.observation, pairs), pairs)
 
 
 def truncation_misfit(observation: Observation, pairs: Eigenpairs) -> Float[Array, ""]:

@@ -236,7 +236,7 @@ def _pivoted_cholesky(
 
     def eliminate(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         a, left, factor, inverse = state
-        diagonal = jnp.sum(jnp.where(index[:, None] == index[None, :], a, 0), axis=1)
+        diagonal = jnp.sum(jnp.where(_identity(len(a)), a, 0), axis=1)
         chosen = index == jax.lax.argmax(jnp.where(left > 0, diagonal, -jnp.inf), 0, jnp.int32)
         root = jnp.sqrt(jnp.maximum(jnp.sum(jnp.where(chosen, diagonal, 0), axis=0), floor))
         column = jnp.sum(jnp.where(chosen[None, :], a, 0), axis=1) / root
