@@ -25,8 +25,14 @@ def ill_conditioned(rng, n):
 
 def solve(matrix, scale, rhs, tolerance, most=1000):
     """Solve with a diagonal preconditioner."""
-    products = (lambda x: matrix @ x), (lambda r: scale * r)
-    return orthogonal_conjugate_gradients(*products, rhs, jnp.asarray(tolerance), jnp.asarray(most))
+
+    def product(x, first):
+        return jnp.where(first, rhs, matrix @ x)
+
+    limits = jnp.asarray(tolerance), jnp.asarray(most)
+    solution = orthogonal_conjugate_gradients(product, lambda r: scale * r, jnp.zeros_like(rhs), *limits)
+    np.testing.assert_array_equal(solution.rhs, rhs)
+    return solution.x, solution.steps
 
 
 def test_rounding_costs_no_steps(rng):

@@ -18,7 +18,7 @@ from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, products
+from hks_jax.linear.products import combine, inner_products
 from hks_jax.traced import is_traced
 
 Telling = Literal["nothing", "warning", "error"]
@@ -139,9 +139,9 @@ def tangents_of(
     apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
     inverse = jnp.where(apart, 1 / jnp.where(apart, gap, 1), 0)
     # Apart from the guards: reverse mode of the frame needs the product with these alone.
-    into = products(force, functions)
-    within = jnp.where(apart[:, :k], inverse[:, :k] * into, -products(moved, functions) / 2)
-    frame = combine(inverse[:, k:] * products(force, guards), guards)
+    into = inner_products(functions, force)
+    within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
+    frame = combine(inverse[:, k:] * inner_products(guards, force), guards)
     if _solves(pencil, k, len(values)):
         frame = frame + _outside(adjoint, telling, prepared, pencil, values, vectors, -force)
     d_vectors = combine(within, functions) + frame

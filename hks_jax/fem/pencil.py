@@ -10,7 +10,7 @@ from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import products
+from hks_jax.linear.products import inner_products
 
 
 class Pencil(SymmetricPencil):
@@ -63,7 +63,7 @@ class Pencil(SymmetricPencil):
         part: Int[Array, " k"],
     ) -> Float[Array, "b k"]:
         """Return the products of images under K, M or their derivatives (rows) with vectors (columns)."""
-        return products(images, vectors)
+        return inner_products(vectors, images)
 
 
 class MirrorPencil(eqx.Module):
@@ -111,7 +111,7 @@ class MirrorPencil(eqx.Module):
         part: Int[Array, " k"],
     ) -> Float[Array, "b k"]:
         """Return the products of images, of such parts, with vectors on the doubled domain: parts do not mix."""
-        return jnp.where(of[:, None] == part, len(self.parts) * products(images, vectors), 0)
+        return jnp.where(of[:, None] == part, len(self.parts) * inner_products(vectors, images), 0)
 
     def _apply(self, operator: Callable[[Pencil], Operator], x: Array, part: Array) -> Array:
         total = jnp.zeros_like(x)

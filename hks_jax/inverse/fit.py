@@ -178,23 +178,25 @@ def fit_metric(
     first_start = resumed.start if resumed else 0
     for log.start in range(starts if extended else first_start, starts):
         values, step_size, from_stage = _moved(first, inner_product, spread, seed, log.start), 1.0, 0
+        reached: Outcome | None = None
         if resumed and log.start == resumed.start:
             values, step_size, from_stage = jnp.asarray(resumed.values), resumed.step_size, resumed.stage
         for log.stage in range(from_stage, len(problems)):
             # Early stages need no last digits.
             enough = tolerance if log.stage == len(problems) - 1 else 100 * tolerance
             method = choose_optimiser(optimiser, problems[log.stage], enough, noise, inner_product, step_size)
-            values, result = optimise(
+            values, reached, result = optimise(
                 problems[log.stage], values, method, noise, max_steps, log, log.stage, log.start, clock
             )
             step_size = 1.0
             if result in ("interrupted", "not finite"):
                 break
-        of_start = outcome_of(problems[-1], values)
-        reached = float(of_start.loss)
-        if not log.losses or not reached >= min(log.losses):
-            log.best, best_result, outcome = values, result, of_start
-        log.losses.append(reached)
+        if reached is None or log.stage < len(problems) - 1:
+            reached = outcome_of(problems[-1], values)
+        loss_reached = float(reached.loss)
+        if not log.losses or not loss_reached >= min(log.losses):
+            log.best, best_result, outcome = values, result, reached
+        log.losses.append(loss_reached)
         if result == "interrupted":
             break
     problem = problems[-1]
@@ -212,8 +214,9 @@ def fit_metric(
         chosen = choose_for_fit(pencil, wanted) if solver == "auto" else solver
         problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
         method = choose_optimiser(optimiser, problem, tolerance, noise, inner_product)
-        log.best, best_result = optimise(problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock)
-        outcome = None
+        log.best, outcome, best_result = optimise(
+            problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock
+        )
     for message in final_pairs.messages():
         warn_of_accuracy(message)
     if shows:

@@ -17,6 +17,8 @@ from hks_jax.linear.orthogonal_residuals import orthogonal_conjugate_gradients
 
 _TIGHTER, _LONGER = 30, 3
 """By what the linear systems are solved more exactly before a fit counts as converged."""
+_ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
+"""What part of the promised reduction a step must keep to be taken, and to let damping fall; what a worse one costs."""
 _FREE = 0.01
 """What part of a step's curvature may be damping if the step is to tell how far the solution is."""
 
@@ -33,24 +35,24 @@ class _State(eqx.Module):
 
     Attributes:
         values: the unknowns.
-        f_info: the linearisation there.
         gradient: the gradient.
-        change: the size of the last step, in tolerances.
+        promised: by how much the last step from there changes half the sum of squares, by the linearisation.
+        change: the size of the step that led there, in tolerances.
         damped: B in the direction of that step over the curvature that it saw: times μ, the part of damping.
         tight: whether the linear systems are solved more exactly.
         done: whether no step is needed any more.
     """
 
     values: Values
-    f_info: Any
     gradient: Values
+    promised: Float[Array, ""]
     change: Float[Array, ""]
     damped: Float[Array, ""]
     tight: Bool[Array, ""]
     done: Bool[Array, ""]
 
 
-class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
+class DampedDescent(eqx.Module):
     """Solves (JᵀJ + μB) δ = −Jᵀr, with B an inner product of the unknowns and μ = damping / step size.
 
     The conjugate gradients stop early: far from the solution more digits would be lost on the linearisation. Their
@@ -72,13 +74,13 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
     inner_steps: Int[Array, ""]
     preconditioner: Preconditioner
 
-    def init(self, y: Values, f_info_struct: Any) -> _State:
-        """Return a state of the right shape."""
+    def init(self, y: Values) -> _State:
+        """Return the state before any unknowns were accepted."""
         far, no = jnp.asarray(jnp.inf, y.dtype), jnp.zeros((), bool)
-        return _State(y, _empty(f_info_struct), jnp.zeros_like(y), far, far, no, no)
+        return _State(y, jnp.zeros_like(y), jnp.zeros((), y.dtype), far, far, no, no)
 
-    def query(self, y: Values, f_info: Any, state: _State) -> _State:
-        """Return the gradient Jᵀr with the linearisation, and what the step that led here tells."""
+    def accepted(self, y: Values, state: _State) -> _State:
+        """Return what the step that led to the new unknowns tells; their own gradient comes with the next step."""
         step = y - state.values
         change = optx.rms_norm(step / (self.tolerance * (1 + jnp.abs(y))))
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
@@ -86,34 +88,37 @@ class DampedDescent(optx.AbstractDescent[Values, Any, _State]):
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
         settled = moved & (remaining_change(change, state.change) < 1)
         change = jnp.where(moved, change, jnp.inf)
-        return _State(y, f_info, f_info.compute_grad(), change, damped, state.tight | settled, state.tight & settled)
+        tight, done = state.tight | settled, state.tight & settled
+        return _State(y, state.gradient, state.promised, change, damped, tight, done)
 
     def done(self, step_size: Array, state: _State) -> Bool[Array, ""]:
         """Tell whether the unknowns have converged, and not only been held by damping."""
         return state.done & (self.damping / step_size * state.damped < _FREE)
 
-    def step(self, step_size: Array, state: _State) -> tuple[Values, optx.RESULTS]:
-        """Return the step δ."""
-        done = self.done(step_size, state)
-        step = jax.lax.cond(done, lambda: jnp.zeros_like(state.gradient), lambda: self._solve(step_size, state))
-        fine = jnp.all(jnp.isfinite(step))
-        return step, optx.RESULTS.where(fine, optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence)
-
-    def _solve(self, step_size: Array, state: _State) -> Values:
-        jacobian, gradient = state.f_info.jac, state.gradient
+    # With g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
+    #
+    #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
+    def step(self, step_size: Array, linearised: Any, state: _State) -> tuple[Values, _State]:
+        """Return the step δ, zero if none is needed, and the state with the gradient and what the step promises."""
+        jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape
         adjoint, damping = jacobian.transpose(), self.damping / step_size
 
-        def normal(x: Array) -> Array:
-            x = x.reshape(gradient.shape)
-            return jnp.ravel(adjoint.mv(jacobian.mv(x)) + damping * self.inner_product.apply(x))
+        # J and Jᵀ stand in the program once: they are most of what there is to compile.
+        def normal(x: Array, first: Bool[Array, ""]) -> Array:
+            x = x.reshape(shape)
+            image = adjoint.mv(jax.lax.cond(first, lambda: residual, lambda: jacobian.mv(x)))
+            return jnp.ravel(image + damping * self.inner_product.apply(x))  # x = 0 at first
 
         def precondition(r: Array) -> Array:
-            return jnp.ravel(self.preconditioner.precondition(r.reshape(gradient.shape), damping))
+            return jnp.ravel(self.preconditioner.precondition(r.reshape(shape), damping))
 
         tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
-        steps = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
-        solution, _ = orthogonal_conjugate_gradients(normal, precondition, jnp.ravel(gradient), tolerance, steps)
-        return -solution.reshape(gradient.shape)
+        most = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
+        most = jnp.where(self.done(step_size, state), 0, most)
+        solution = orthogonal_conjugate_gradients(normal, precondition, jnp.ravel(state.values), tolerance, most)
+        x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
+        promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
+        return -x, eqx.tree_at(lambda s: (s.gradient, s.promised), state, (gradient, promised))
 
 
 class _Progress(eqx.Module):
@@ -123,21 +128,19 @@ class _Progress(eqx.Module):
         first: whether no step was taken yet.
         trial: the unknowns to be looked at next.
         step_size: 1/μ, relative to the first.
-        search: what the search keeps, which is its own affair.
         linearised: residuals and Jacobian at the last accepted unknowns.
         aux: what the residuals tell beside, there.
         descent: what the descent knows, there.
-        result: whether all is finite.
+        finite: whether the last step is.
     """
 
     first: Bool[Array, ""]
     trial: Values
     step_size: Float[Array, ""]
-    search: Any
     linearised: Any
     aux: Any
     descent: _State
-    result: optx.RESULTS
+    finite: Bool[Array, ""]
 
 
 def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:
@@ -170,8 +173,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     rtol: Float[Array, ""]  # type: ignore[assignment]
     atol: Float[Array, ""]  # type: ignore[assignment]
     norm: Callable[[Any], Array]
+    growth: Float[Array, ""]
     descent: DampedDescent
-    search: optx.ClassicalTrustRegion
 
     def __init__(
         self,
@@ -189,7 +192,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         require_number("inner_tolerance", inner_tolerance, 1)
         require_count("inner_steps", inner_steps)
         self.rtol = self.atol = jnp.asarray(tolerance)
-        self.norm = optx.rms_norm
+        self.norm, self.growth = optx.rms_norm, jnp.asarray(growth)
         inner_product = inner_product or Euclidean()
         self.descent = DampedDescent(
             self.rtol,
@@ -199,7 +202,6 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
             jnp.asarray(inner_steps),
             preconditioner or inner_product,
         )
-        self.search = optx.ClassicalTrustRegion(high_cutoff=0.5, high_constant=jnp.asarray(growth))
 
     def init(
         self,
@@ -213,16 +215,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     ) -> _Progress:
         """Return the state before the first step, in which ``y`` is looked at."""
         structure, _ = eqx.filter_eval_shape(_linearise, fn, y, args)
-        return _Progress(
-            jnp.asarray(True),
-            y,
-            jnp.ones((), y.dtype),
-            self.search.init(y, structure),
-            _empty(structure),
-            _empty(aux_struct),
-            self.descent.init(y, structure),
-            optx.RESULTS.successful,  # type: ignore[arg-type]
-        )
+        yes, one = jnp.asarray(True), jnp.ones((), y.dtype)
+        return _Progress(yes, y, one, _empty(structure), _empty(aux_struct), self.descent.init(y), yes)
 
     def step(
         self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
@@ -233,26 +227,28 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         linearised = eqx.combine(
             eqx.filter(linearised, eqx.is_array), eqx.filter(state.linearised, eqx.is_array, inverse=True)
         )
-        step_size, accept, search_result, search = self.search.step(
-            state.first, y, state.trial, state.linearised, linearised, state.search
-        )
+        promised = state.descent.promised
+        change = linearised.as_min() - state.linearised.as_min()
+        accept = state.first | (change <= _ACCEPTED * promised)
+        good = ~state.first & (change < _GOOD * promised) & (promised < 0)
+        step_size = state.step_size * jnp.where(good, self.growth, jnp.where(accept, 1, _SHRINKING))
+
         before, static = eqx.partition((y, state.linearised, state.aux, state.descent), eqx.is_array)
-
-        def taken() -> Any:
-            descent = self.descent.query(state.trial, linearised, state.descent)
-            return eqx.filter((state.trial, linearised, aux, descent), eqx.is_array)
-
-        values, linearised, aux, descent = eqx.combine(jax.lax.cond(accept, taken, lambda: before), static)
-        step, result = self.descent.step(step_size, descent)
-        result = optx.RESULTS.where(search_result == optx.RESULTS.successful, result, search_result)
-        no = jnp.asarray(False)
-        return values, _Progress(no, values + step, step_size, search, linearised, aux, descent, result), aux
+        taken = state.trial, linearised, aux, self.descent.accepted(state.trial, state.descent)
+        now = jax.lax.cond(accept, lambda: eqx.filter(taken, eqx.is_array), lambda: before)
+        values, linearised, aux, descent = eqx.combine(now, static)
+        step, descent = self.descent.step(step_size, linearised, descent)
+        no, finite = jnp.asarray(False), jnp.all(jnp.isfinite(step))
+        return values, _Progress(no, values + step, step_size, linearised, aux, descent, finite), aux
 
     def terminate(
         self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Tell whether the unknowns have converged."""
-        return self.descent.done(state.step_size, state.descent), state.result
+        successful, not_finite = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
+        return self.descent.done(state.step_size, state.descent), optx.RESULTS.where(
+            state.finite, successful, not_finite
+        )
 
     def postprocess(
         self,

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.metric_fit import Step
-from hks_jax.inverse.problem import Problem, losses_of
+from hks_jax.inverse.problem import Problem
+from hks_jax.inverse.truncated import Outcome, residuals_and_outcome
 from hks_jax.inverse.unknowns import Values
 
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -26,14 +27,12 @@ class _Told(eqx.Module):
 
     Attributes:
         values: the unknowns.
-        loss: half the weighted mean square, plus the penalties.
-        misfit: the part of the data.
+        outcome: what a fit has come to with them.
         gradient: the norm of the objective's gradient; NaN where it was not computed.
     """
 
     values: Values
-    loss: Float[Array, ""]
-    misfit: Float[Array, ""]
+    outcome: Outcome
     gradient: Float[Array, ""]
 
 
@@ -42,11 +41,9 @@ def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
 
     They are scaled by the number of nodes, so that a step's curvature is of order one whatever the grid.
     """
-    data, penalties = problem.residuals(values)
-    loss, misfit = losses_of(data, penalties)
+    data, penalties, outcome = residuals_and_outcome(problem, values)
     everything = jnp.sqrt(len(values)) * jnp.concatenate([data, penalties])
-    unknown = jnp.full((), jnp.nan, misfit.dtype)
-    return everything, _Told(values, loss, misfit, unknown)
+    return everything, _Told(values, outcome, jnp.full((), jnp.nan, data.dtype))
 
 
 def _half_squares(values: Values, problem: Problem) -> tuple[Float[Array, ""], _Told]:
@@ -62,8 +59,9 @@ def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
     """Compute the gradient with the value, so that it can be told: whoever differentiates needs it anyway."""
     (values, problem), (direction, _) = primals, tangents
     (value, told), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
-    told = _Told(told.values, told.loss, told.misfit, jnp.linalg.norm(jnp.ravel(gradient)))
-    return (value, told), (jnp.sum(gradient * direction), jax.tree.map(jnp.zeros_like, told))
+    told = _Told(told.values, told.outcome, jnp.linalg.norm(jnp.ravel(gradient)))
+    constant = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, told)
+    return (value, told), (jnp.sum(gradient * direction), constant)
 
 
 # A solver's state holds the residuals' trace, and the same one, out of this function's cache, for every fit of the same
@@ -81,7 +79,7 @@ def _advance(optimiser: Optimiser, fn: Callable, values: Values, problem: Proble
     done, result = optimiser.terminate(fn, values, problem, {}, state, frozenset())
     step_size = jnp.ones(())
     if isinstance(optimiser, GaussNewton):
-        told = _Told(told.values, told.loss, told.misfit, jnp.linalg.norm(jnp.ravel(state.descent.gradient)))
+        told = _Told(told.values, told.outcome, jnp.linalg.norm(jnp.ravel(state.descent.gradient)))
         step_size = state.step_size
     return values, _strongly_typed(state), told, done, result == optx.RESULTS.successful, step_size
 
@@ -101,7 +99,7 @@ def optimise(
     stage: int,
     start: int,
     clock: float,
-) -> tuple[Values, str]:
+) -> tuple[Values, Outcome | None, str]:
     """Run until the solver, the noise level or the number of steps says stop.
 
     Args:
@@ -116,10 +114,12 @@ def optimise(
         clock: when the fit began.
 
     Returns:
-        The best unknowns seen, and one of the keys of `metric_fit.RESULTS`.
+        The best unknowns seen, their outcome (None where none was computed), and one of the keys of
+        `metric_fit.RESULTS`.
     """
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
     best, least, seen = values, np.inf, None
+    outcome: Outcome | None = None
     rejected, number, end = 0, 0, ""
     try:
         state = _begin(optimiser, fn, values, problem)
@@ -131,21 +131,21 @@ def optimise(
             rejected = 0 if accepted else rejected + 1
             new = seen is None or bool(jnp.any(told.values != seen))
             if new or isinstance(optimiser, GaussNewton):
-                seen, loss, misfit = told.values, float(told.loss), float(told.misfit)
+                seen, loss, misfit = told.values, float(told.outcome.loss), float(told.outcome.misfit)
                 gradient = float(told.gradient) / np.sqrt(len(values))
                 record = Step(number, loss, misfit, gradient, new, time.perf_counter() - clock, stage, start)
                 if not np.isfinite(loss):
-                    return best, "not finite"
+                    return best, outcome, "not finite"
                 if loss <= least:
-                    best, least = seen, loss
+                    best, least, outcome = seen, loss, told.outcome
                 report(record, seen, float(size))
                 number += 1
                 if noise is not None and misfit <= noise**2 / 2:
-                    return best, "noise level reached"
+                    return best, outcome, "noise level reached"
             if end:
-                return best, end
+                return best, outcome, end
             if not bool(fine):
-                return best, "not finite"
+                return best, outcome, "not finite"
             if bool(done):
                 end = "converged"
             elif rejected >= _REJECTIONS:
@@ -153,7 +153,7 @@ def optimise(
             elif count == max_steps:
                 end = "steps exhausted"
             if end and not bool(jnp.any(values != seen)):
-                return best, end
+                return best, outcome, end
     except KeyboardInterrupt:
-        return best, "interrupted"
-    return best, end
+        return best, outcome, "interrupted"
+    return best, outcome, end

@@ -28,7 +28,7 @@ class Outcome(NamedTuple):
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the part of the data.
         truncation: see `truncation_misfit`.
-        pairs: the eigenpairs.
+        pairs: the eigenpairs, without their arrays at nodes and without their pencil.
     """
 
     loss: Float[Array, ""]
@@ -37,11 +37,20 @@ class Outcome(NamedTuple):
     pairs: Eigenpairs
 
 
+def residuals_and_outcome(
+    problem: Problem, values: Values
+) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
+    """Return the residuals of the data and those of the penalties, and what a fit has come to with these unknowns."""
+    data, penalties, pairs = problem.residuals_and_pairs(values)
+    left = truncation_misfit(problem.observation, pairs)
+    pairs = eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), pairs, (None, None, None))
+    return data, penalties, jax.lax.stop_gradient(Outcome(*losses_of(data, penalties), left, pairs))
+
+
 @eqx.filter_jit
 def outcome_of(problem: Problem, values: Values) -> Outcome:
     """Return what a fit has come to with these unknowns."""
-    data, penalties, pairs = problem.residuals_and_pairs(values)
-    return Outcome(*losses_of(data, penalties), truncation_misfit(problem.observation, pairs), pairs)
+    return residuals_and_outcome(problem, values)[2]
 
 
 def truncation_misfit(observation: Observation, pairs: Eigenpairs) -> Float[Array, ""]:

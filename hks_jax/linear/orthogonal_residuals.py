@@ -11,26 +11,44 @@ _MOST, _MEMORY = 400, 4e8
 """Residuals that are kept at most, and bytes that they may take."""
 
 
+class Solution(NamedTuple):
+    """What conjugate gradients have come to.
+
+    Attributes:
+        x: the solution; NaN where a product is.
+        rhs: the right-hand side.
+        steps: how many there were.
+    """
+
+    x: Float[Array, " n"]
+    rhs: Float[Array, " n"]
+    steps: Int[Array, ""]
+
+
 class _Iteration(NamedTuple):
     """The state after some steps.
 
     Attributes:
         x: the solution so far.
+        rhs: the right-hand side.
         r: its residual.
         z: Pr.
         p: the next direction.
         size: rᵀPr.
+        enough: what it may be at the end.
         residuals: the residuals of all steps, divided by √(rᵀPr); zero where there is none yet.
         preconditioned: P times them.
-        steps: how many.
+        steps: how many; −1 before the right-hand side is known.
         going: whether there is a next one.
     """
 
     x: Float[Array, " n"]
+    rhs: Float[Array, " n"]
     r: Float[Array, " n"]
     z: Float[Array, " n"]
     p: Float[Array, " n"]
     size: Float[Array, ""]
+    enough: Float[Array, ""]
     residuals: Float[Array, "m n"]
     preconditioned: Float[Array, "m n"]
     steps: Int[Array, ""]
@@ -41,49 +59,49 @@ class _Iteration(NamedTuple):
 # conjugate gradients then look for it again and again: where eigenvalues fall off over eight decades, that doubles the
 # number of steps. The products with A being dear and n small, it is cheaper to restore it (Paige 1971; Simon 1984).
 def orthogonal_conjugate_gradients(
-    product: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+    product: Callable[[Float[Array, " n"], Bool[Array, ""]], Float[Array, " n"]],
     precondition: Callable[[Float[Array, " n"]], Float[Array, " n"]],
-    rhs: Float[Array, " n"],
+    like: Float[Array, " n"],
     tolerance: Float[Array, ""],
     most: Int[Array, ""],
-) -> tuple[Float[Array, " n"], Int[Array, ""]]:
-    """Solve Ax = rhs until the residual r = rhs − Ax has √(rᵀPr) below a tolerance, or for so many steps.
+) -> Solution:
+    """Solve Ax = b until the residual r = b − Ax has √(rᵀPr) below a tolerance, or for so many steps.
 
     Where P resembles A⁻¹ up to a factor, that norm of the residual is the energy norm √(eᵀAe) of the error, relative to
     that of x. Each step takes one product with A.
 
     Args:
-        product: x ↦ Ax, A symmetric and positive definite.
+        product: (x, first) ↦ b where ``first``, else Ax, A symmetric and positive definite. What the two have in
+            common is compiled once.
         precondition: r ↦ Pr, an approximation of A⁻¹r up to a factor, symmetric and positive definite.
-        rhs: the right-hand side.
-        tolerance: relative to √(bᵀPb), b the right-hand side.
-        most: steps after which to stop all the same.
-
-    Returns:
-        x, and the number of steps. x is NaN where a product is.
+        like: an array of the shape and dtype of b.
+        tolerance: relative to √(bᵀPb).
+        most: steps after which to stop all the same; with none of them x is zero.
     """
-    (n,), dtype = rhs.shape, rhs.dtype
+    (n,), dtype = like.shape, like.dtype
     kept = max(min(n, _MOST, int(_MEMORY / (2 * n * dtype.itemsize))), 1)
-    z = precondition(rhs)
-    size = jnp.vdot(rhs, z)
-    enough = tolerance**2 * size
 
     def step(state: _Iteration) -> _Iteration:
-        x, r, z, p, before, residuals, preconditioned, steps, _ = state
-        image = product(p)
-        length = before / jnp.vdot(p, image)
+        x, rhs, r, z, p, before, enough, residuals, preconditioned, steps, _ = state
+        first = steps < 0
+        image = product(p, first)
+        rhs = jnp.where(first, image, rhs)
+        length = jnp.where(first, -1, before / jnp.where(first, 1, jnp.vdot(p, image)))
         # When all places are taken the last one is used again: what is lost first was known first.
-        at, root = jnp.minimum(steps, kept - 1), jnp.sqrt(before)
+        at, root = jnp.clip(steps, 0, kept - 1), jnp.sqrt(before)
         residuals, preconditioned = residuals.at[at].set(r / root), preconditioned.at[at].set(z / root)
         r = r - length * image
         r = r - jnp.matmul(jnp.matmul(preconditioned, r, precision="highest"), residuals, precision="highest")
         z = precondition(r)
         size = jnp.vdot(r, z)
-        going = (size > enough) & (steps + 1 < most)
-        p_next = z + size / before * p
-        return _Iteration(x + length * p, r, z, p_next, size, residuals, preconditioned, steps + 1, going)
+        enough = jnp.where(first, tolerance**2 * size, enough)
+        further = z + jnp.where(first, 0, size / before) * p
+        steps, going = steps + 1, (size > enough) & (steps + 1 < most)
+        return _Iteration(x + length * p, rhs, r, z, further, size, enough, residuals, preconditioned, steps, going)
 
-    none = jnp.zeros((kept, n), dtype)
-    start = _Iteration(jnp.zeros_like(rhs), rhs, z, z, size, none, none, jnp.zeros((), int), ~(size <= 0))
+    # From r = p = 0, the first turn makes r the right-hand side.
+    zero, none, one = jnp.zeros_like(like), jnp.zeros((kept, n), dtype), jnp.ones((), dtype)
+    start = _Iteration(zero, zero, zero, zero, zero, one, one, none, none, jnp.full((), -1), jnp.ones((), bool))
     end = jax.lax.while_loop(lambda state: state.going, step, start)
-    return end.x, end.steps
+    failed = jnp.isnan(end.size) & (most > 0)
+    return Solution(jnp.where(failed, jnp.nan, end.x), end.rhs, end.steps)

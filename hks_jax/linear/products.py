@@ -20,11 +20,6 @@ def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Fl
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
 
 
-def products(rows: Float[Array, "q n"], others: Float[Array, "m n"]) -> Float[Array, "q m"]:
-    """Return the inner products of rows with others."""
-    return jnp.matmul(rows, others.T, precision="highest")
-
-
 def combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array, "q n"]:
     """Return linear combinations of the basis."""
     return jnp.matmul(mix, basis, precision="highest")

@@ -192,8 +192,8 @@ def _matters(f: Float[Array, " k"], slope: Float[Array, " k"], values: Float[Arr
     """Return where f or λf' is not negligible beside what they are elsewhere, the constants apart."""
     size = jnp.maximum(jnp.abs(f), jnp.abs(values * slope))
     largest = jnp.max(jnp.where(values > 0, size, 0))
-    # Between two that are not, [f] is a quotient by their gap: relative to λ it may be as small as √ε.
-    return ~(size <= jnp.finfo(f.dtype).eps ** 1.5 * largest)  # NaN matters
+    # Between two that are not, [f] is at most f' at one of them, or, if f is not monotone, ε over their relative gap.
+    return ~(size <= jnp.finfo(f.dtype).eps * largest)  # NaN matters
 
 
 def _is_zero(leaf: Any) -> bool:

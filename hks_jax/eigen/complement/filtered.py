@@ -101,5 +101,5 @@ def _solve(
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
-    of_rows = amplification(values, k), values[:k], quotients[:k]
-    return solve_in_blocks(one_block, block, pencil, vectors, rhs, tolerance, *of_rows)
+    own = values[:k], quotients[:k]
+    return solve_in_blocks(one_block, block, pencil, vectors, rhs, tolerance, amplification(values, k), True, *own)

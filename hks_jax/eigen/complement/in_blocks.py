@@ -24,18 +24,20 @@ def solve_in_blocks(
     rhs: Float[Array, "k n_dof"],
     tolerance: float,
     amplified: Float[Array, " k"],
+    clean: bool,
     *of_rows: Float[Array, " k"],
 ) -> Float[Array, "k n_dof"]:
     """Solve for blocks of rows, one after another, on the complement of the eigenvectors Φ.
 
     Args:
-        solve: returns x for (number, Q rhs, wanted, *of_rows) of one block, Q = I − MΦΦᵀ; what x has of Φ is taken out.
+        solve: returns x for (number, Q rhs, wanted, *of_rows) of one block, Q = I − MΦΦᵀ.
         size: rows of a block.
         pencil: K and M.
         vectors: Φ, as rows.
         rhs: the right-hand sides.
         tolerance: the accuracy of the largest row.
         amplified: how much larger the solution of a row becomes than that of another as large.
+        clean: whether x has nothing of Φ that counts; else it is taken out.
         of_rows: what else there is of each row.
     """
     k, lumped = len(rhs), pencil.mass.diagonal()
@@ -52,7 +54,7 @@ def solve_in_blocks(
         wanted = jnp.where(at < k, wanted, jnp.inf)
         own = [rows.reshape(blocks, size, *rows.shape[1:]) for rows in (left, wanted, *own)]
         x = jax.lax.map(lambda block: solve(*block), (number, *own)).reshape(b.shape)
-        return x - combine(inner_products(vectors, pencil.mass.apply(x)), vectors)
+        return x if clean else x - combine(inner_products(vectors, pencil.mass.apply(x)), vectors)
 
     # The last part is filled up with rows that have nothing to solve.
     number = np.minimum(np.arange(parts * blocks), count - 1).reshape(parts, blocks)

@@ -116,7 +116,7 @@ def _solve(
 
         return conjugate_gradients(product, without_near, factor.solve_columns(b.T), wanted, inner).T
 
-    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, amplified, values[:k])
+    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, amplified, False, values[:k])
 
 
 def _left(pencil: LocatedPencil, values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
