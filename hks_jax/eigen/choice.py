@@ -67,7 +67,7 @@ def choose_for_fit(pencil: Pencil | MirrorPencil, k: int) -> Eigensolver:
 
     Factorisations serve them all, which the filter does not have; and as fits are traced, none runs on the host.
     """
-    n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-7, solves=20))
+    n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()
 
 

@@ -37,9 +37,7 @@ class Outcome(NamedTuple):
     pairs: Eigenpairs
 
 
-def residuals_and_outcome(
-    problem: Problem, values: Values
-) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
+def residuals_and_outcome(problem: Problem, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
     """Return the residuals of the data and those of the penalties, and what a fit has come to with these unknowns."""
     data, penalties, pairs = problem.residuals_and_pairs(values)
     left = truncation_misfit(problem.observation, pairs)
