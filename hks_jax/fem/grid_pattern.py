@@ -46,23 +46,34 @@ def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where in the coefficients each entry lies, its row and its column, for the couplings of free nodes."""
     shape, d = space.node_shape, space.dimension
     number = space.degrees_of_freedom.reshape(shape).astype(np.int32)
+    place = np.arange(number.size, dtype=np.int32).reshape(shape)
     for axis, wraps in enumerate(space.periodic):
-        widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
-        number = np.pad(number, widths, mode="wrap") if wraps else np.pad(number, widths, constant_values=-1)
-    centre = number[(slice(1, -1),) * d].ravel()
+        if wraps:
+            number = np.pad(number, [(1, 1) if a == axis else (0, 0) for a in range(d)], mode="wrap")
+    centre = number[tuple(slice(int(wraps), n + int(wraps)) for n, wraps in zip(shape, space.periodic, strict=True))]
     where, rows, cols = [], [], []
-    for o, start in enumerate(product((0, 1, 2), repeat=d)):
-        neighbour = number[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))].ravel()
-        both = np.flatnonzero((centre >= 0) & (neighbour >= 0))
-        where.append(o * centre.size + both)
-        rows.append(centre[both])
-        cols.append(neighbour[both])
+    for o, offset in enumerate(product((-1, 0, 1), repeat=d)):
+        # Both ends of all couplings, without those across a side.
+        ends = [_ends(n, k, wraps) for n, k, wraps in zip(shape, offset, space.periodic, strict=True)]
+        own, others = (tuple(slices) for slices in zip(*ends, strict=True))
+        row, col = centre[own].ravel(), number[others].ravel()
+        both = np.flatnonzero((row >= 0) & (col >= 0))
+        where.append(o * place.size + place[own].ravel()[both].astype(int))
+        rows.append(row[both])
+        cols.append(col[both])
     return np.concatenate(where), np.concatenate(rows), np.concatenate(cols)
+
+
+def _ends(n: int, offset: int, wraps: bool) -> tuple[slice, slice]:
+    """Return which nodes of an axis have a neighbour at an offset, and where these are; with a rim if it wraps."""
+    if wraps:
+        return slice(0, n), slice(1 + offset, 1 + offset + n)
+    return slice(max(-offset, 0), n - max(offset, 0)), slice(max(offset, 0), n - max(-offset, 0))
 
 
 def _bisect(space: GridSpace) -> Parts:
     """Cut across lines of nodes or two (planes in 3D), at the median of the longest side."""
-    x = np.stack(np.nonzero(space.free))
+    x = np.stack(np.nonzero(space.free)).astype(np.int32)
     d, n = x.shape
     level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
     depth = 0
@@ -73,23 +84,28 @@ def _bisect(space: GridSpace) -> Parts:
             level[left], part[left] = depth, q
             return Parts(level, part, depth + 1)
         # Cut every part across its longest side, at the median.
-        low, high = np.full((parts, d), np.iinfo(int).max), np.full((parts, d), -1)
+        low, high = np.full((d, parts), np.iinfo(np.int32).max, np.int32), np.full((d, parts), -1, np.int32)
         for axis in range(d):
-            np.minimum.at(low[:, axis], q, x[axis])
-            np.maximum.at(high[:, axis], q, x[axis])
-        longest = np.argmax(high - low, axis=1)
-        along = x[longest[q], np.arange(left.size)]
-        lowest, extent = low[np.arange(parts), longest], int(np.max(high - low)) + 1
-        sizes = np.bincount(q * extent + along - lowest[q], minlength=parts * extent).reshape(parts, extent)
-        cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1)
-        separates = along == cut[q]
+            np.minimum.at(low[axis], q, x[axis])
+            np.maximum.at(high[axis], q, x[axis])
+        longest = np.argmax(high - low, axis=0)
+        lowest, highest = (ends[longest, np.arange(parts)] for ends in (low, high))
+        across, along = longest.astype(np.int8)[q], x[0]
+        for axis in range(1, d):
+            along = np.where(across == axis, x[axis], along)
+        extent = int(np.max(highest - lowest)) + 1
+        first = np.arange(parts) * extent - lowest
+        sizes = np.bincount(first[q] + along, minlength=parts * extent).reshape(parts, extent)
+        cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1).astype(np.int32)
+        beyond = along - cut[q]
+        separates = beyond == 0
         if d == 2:  # two lines of an even number leave equal halves, and batches without padding
-            even = (high - low)[np.arange(parts), longest] % 2 == 1
-            separates |= even[q] & (along == cut[q] - 1)
+            even = (highest - lowest) % 2 == 1
+            separates |= (beyond == -1) & even[q]
         if depth == 0:  # what is cut once more here is no longer periodic
             separates |= np.any(x[list(space.periodic)] == 0, axis=0)
-        level[left[separates]], part[left[separates]] = depth, q[separates]
-        stays = ~separates
-        q = (2 * q + (along > cut[q]))[stays]
-        left, x = left[stays], x[:, stays]
+        cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
+        level[left[cutting]], part[left[cutting]] = depth, q[cutting]
+        q = 2 * q[stays] + (beyond[stays] > 0)
+        left, x = left[stays], np.take(x, stays, axis=1)
         depth += 1

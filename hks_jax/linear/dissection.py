@@ -56,7 +56,10 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     n = pattern.size
     level, front, depth = pattern.bisect()
     own, slot = _own_nodes(level, front, depth)
-    boundaries = _boundaries(level, front, depth, rows, cols)
+    # For each entry, whether its row is eliminated before its column, with it, or after.
+    order_of_ends = level[rows] - level[cols]
+    above = np.flatnonzero(order_of_ends > 0)
+    boundaries = _boundaries(level, front, depth, rows[above], cols[above])
     ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
     # One at least, of nothing but padding where no front is coupled to another: the first level has no parent.
     width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
@@ -88,17 +91,16 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     start = np.append(0, np.cumsum(np.prod(shapes, axis=0)))
     if start[-1] > np.iinfo(np.int32).max:
         raise ValueError(f"matrix: got {n} rows, whose factors have {start[-1]} entries; expected fewer than 2^31")
-    mine = np.flatnonzero(level[rows] <= level[cols])
-    rows, cols = rows[mine], cols[mine]
+    mine = np.flatnonzero(order_of_ends <= 0)
+    rows, cols, eliminated = rows[mine], cols[mine], level[cols[mine]]
     place = slot[rows]
-    outside = np.flatnonzero(level[rows] < level[cols])
-    eliminated = level[cols[outside]]
+    outside = np.flatnonzero(order_of_ends[mine] < 0)
     for number in range(1, depth):
-        above = outside[eliminated == number]
+        above = outside[eliminated[outside] == number]
         key = front[cols[above]] * n + rows[above]
         place[above] = stride[number] + ranks[number][np.searchsorted(boundaries[number], key)]
     column = (start[level] + front * (height * stride)[level] + slot).astype(np.int32)
-    places = column[cols] + stride.astype(np.int32)[level[cols]] * place
+    places = column[cols] + stride.astype(np.int32)[eliminated] * place
     padding = [
         first + q * h * s + j * (s + 1)
         for first, h, s, nodes in zip(start[:-1], height, stride, own, strict=True)
@@ -127,15 +129,14 @@ def _boundaries(
 ) -> list[np.ndarray]:
     """Return for each level the boundary nodes of its fronts as sorted keys front·n + node.
 
-    They are what the front's own nodes are coupled to above it, and what it inherits from its children's boundaries.
+    They are what the front's own nodes are coupled to above it, as rows and columns say, and what it inherits from its
+    children's boundaries.
     """
     n, keys, boundaries = level.size, np.empty(0, int), []
-    above = level[cols] < level[rows]
-    rows, cols = rows[above], cols[above]
+    eliminated, keys_of = level[rows], front[rows] * n + cols
     for number in reversed(range(depth)):
         inherited = keys // n // 2 * n + keys % n
-        own = level[rows] == number
-        keys = np.sort(np.concatenate([inherited[level[keys % n] < number], front[rows[own]] * n + cols[own]]))
+        keys = np.sort(np.concatenate([inherited[level[keys % n] < number], keys_of[eliminated == number]]))
         keys = keys[np.append(True, keys[1:] > keys[:-1])[: keys.size]]  # np.unique hashes, which takes far longer
         boundaries.append(keys)
     return boundaries[::-1]
