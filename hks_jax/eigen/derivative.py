@@ -16,6 +16,7 @@ from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.in_turn import in_turn
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
+from hks_jax.fem.masks import mask_for
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products
@@ -213,7 +214,8 @@ def _exact_null_modes(
     assert isinstance(pencil, Pencil)
     n_null = min(pencil.n_null, values.size)
     # The barrier keeps XLA from computing with long constants while it compiles.
-    constants = jax.lax.optimization_barrier(jnp.asarray(pencil.space.null_labels == np.arange(n_null)[:, None], dtype))
+    labelled = mask_for(vectors, pencil.space.null_labels == np.arange(n_null)[:, None])
+    constants = jax.lax.optimization_barrier(jnp.asarray(labelled).astype(dtype))
     constants /= jnp.sqrt(jnp.sum(constants * mass.apply(constants), axis=1, keepdims=True))
     share = jnp.matmul(vectors, mass.apply(constants).T, precision="highest")
     vectors = vectors - jnp.matmul(share, constants, precision="highest")

@@ -16,6 +16,7 @@ from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.fem.elements import Element, at_quadrature, element_matrices, simplex_element, tensor_product_element
+from hks_jax.fem.masks import couplings_for, mask_for
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.resolution import grid_resolution, mesh_resolution
@@ -97,11 +98,12 @@ def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Penc
     tensors, spacing = field.tensors, field.grid.spacing
     element = tensor_product_element(space.dimension).stretched(spacing)
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
-    arrays = tensors, space.domain, space.elements, free_couplings(space), gradients, weights
+    domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
+    arrays = tensors, domain, elements, couplings_for(tensors, space), gradients, weights
     stiffness, consistent, lumped, volume = _grid_integrals(*arrays, space.periodic, field.interpolation)
     # Constant to derivatives before it is computed, it is not compiled again for them.
     fixed = jax.lax.stop_gradient(tensors)
-    resolution = grid_resolution(fixed, space.domain, space.periodic, steps, field.interpolation, mass == "lumped")
+    resolution = grid_resolution(fixed, domain, space.periodic, steps, field.interpolation, mass == "lumped")
     chosen = _chosen_mass(mass, space, StencilOperator(coefficients=consistent, space=space), lumped)
     stiffness = StencilOperator(coefficients=stiffness, space=space)
     return Pencil(stiffness, chosen, resolution.mapped(space.restrict), volume, space)
@@ -118,7 +120,7 @@ def _grid_integrals(
     tensors: Float[Array, "*shape d d"],
     domain: Bool[Array, "*shape"],
     elements: Bool[Array, "*elements"],
-    couplings: Bool[Array, "offsets *shape"],
+    couplings: Bool[Array, "offsets *shape"] | None,
     gradients: Float[np.ndarray | Array, "q n d"],
     weights: Float[np.ndarray | Array, " q"],
     periodic: tuple[bool, ...],
@@ -143,6 +145,8 @@ def _grid_integrals(
     stiffness, mass = stencil(stiffness), stencil(mass)
     # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
     lumped = jnp.sum(mass, axis=0)
+    if couplings is None:
+        return stiffness, mass, lumped, jnp.sum(lumped)
     return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, jnp.sum(lumped)
 
 
@@ -172,20 +176,6 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
             last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
     return total
-
-
-@lru_cache(maxsize=16)
-def free_couplings(space: GridSpace) -> np.ndarray:
-    """Tell for which offsets and nodes both ends are free, bool (3^d, *shape)."""
-    free, d = space.free, space.dimension
-    for axis, wraps in enumerate(space.periodic):
-        widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
-        free = np.pad(free, widths, mode="wrap" if wraps else "constant")
-    starts = product((0, 1, 2), repeat=d)
-    shape = space.node_shape
-    return np.stack(
-        [space.free & free[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))] for start in starts]
-    )
 
 
 @partial(jax.jit, static_argnames=("space", "mass"))

@@ -20,7 +20,7 @@ class GridPattern(Pattern):
     """The couplings of a grid's free nodes with their 3^d neighbours, as places in stencil coefficients."""
 
     def __init__(self, space: GridSpace) -> None:
-        self.space, self.size = space, space.n_dof
+        self.space, self.size, self.n_entries = space, space.n_dof, 3**space.dimension * space.free.size
 
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for each place its index into the flat coefficients, its row, and its column."""

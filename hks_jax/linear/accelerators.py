@@ -33,6 +33,11 @@ def kernels_compile() -> bool:
     return capability.replace(".", "").isdigit() and float(capability) >= _CAPABILITY
 
 
+def padded_size(n: int, least: int) -> int:
+    """Return a power of two, as Triton's arrays need it, that is not below n, nor below the least, a power of two."""
+    return max(least, 1 << (n - 1).bit_length())
+
+
 def row_by_row(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return an array; on accelerators one that lies in memory in the order of its axes.
 

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.linear.accelerators import padded_size
+
 LARGEST = 32
 """Columns of the widest blocks."""
 
@@ -35,7 +37,7 @@ def parts_of_products(
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    (n, b), size = x.shape, _padded(x.shape[1])
+    (n, b), size = x.shape, padded_size(x.shape[1], _SMALLEST)
     tile = max(_NUMBERS // size**2, 1)
     parts, rows = _divided(n, tile)
 
@@ -143,7 +145,7 @@ def _combined(
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    (n, b), size, dtype = columns[0].shape, _padded(columns[0].shape[1]), parts.dtype
+    (n, b), size, dtype = columns[0].shape, padded_size(columns[0].shape[1], _SMALLEST), parts.dtype
     tile, several = max(_NUMBERS // size**2, 1), max(_NUMBERS // size**2 // 8, 1)
     programs, rows = _divided(n, tile)
 
@@ -195,11 +197,6 @@ def _combined(
         name=name,
     )(parts, *matrices, *columns)
     return tuple(results), matrix
-
-
-def _padded(b: int) -> int:
-    """Return a power of two, as Triton's arrays need it, that is not below b."""
-    return max(_SMALLEST, 1 << (b - 1).bit_length())
 
 
 def _divided(n: int, tile: int) -> tuple[int, int]:

@@ -26,16 +26,17 @@ class Dissection(NamedTuple):
     Attributes:
         levels: from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1.
         order: (n_dof,) the place of each degree of freedom among the levels' own nodes, concatenated.
-        entries: (m,) the matrix entries, as indices into the array of entries.
+        entries: (m,) the matrix entries, as indices into the array of entries; None: all of them, in order.
         places: (m,) their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column,
-            unless its row is eliminated before.
+            unless its row is eliminated before. Out of range, where all are listed, for those that are not needed:
+            of two that are equal by symmetry one is enough.
         padding: (p,) the places of the diagonal entries that belong to no node.
         merged: what solves go along on accelerators; None where it is the tree itself.
     """
 
     levels: tuple[Level, ...]
     order: Int[np.ndarray, " n_dof"]
-    entries: Int[np.ndarray, " m"]
+    entries: Int[np.ndarray, " m"] | None
     places: Int[np.ndarray, " m"]
     padding: Int[np.ndarray, " p"]
     merged: Merged | None
@@ -106,9 +107,24 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
         for first, h, s, nodes in zip(start[:-1], height, stride, own, strict=True)
         for q, j in [np.nonzero(nodes == n)]
     ]
-    order, entries, places = (field.astype(np.int32) for field in (order[:n], entries[mine], places))
+    listed, places = _listed(entries[mine], places, pattern.n_entries, int(start[-1]))
     several = merged(tuple(levels), n) if merge else None
-    return Dissection(tuple(levels), order, entries, places, np.concatenate(padding).astype(np.int32), several)
+    return Dissection(
+        tuple(levels), order[:n].astype(np.int32), listed, places, np.concatenate(padding).astype(np.int32), several
+    )
+
+
+def _listed(
+    entries: Int[np.ndarray, " m"], places: Int[np.ndarray, " m"], number: int, end: int
+) -> tuple[Int[np.ndarray, " m"] | None, Int[np.ndarray, " m_or_number"]]:
+    """Return entries and their places, or the places of all: whichever takes less memory; ``end`` is out of range."""
+    others = number - entries.size
+    if others > entries.size or end + others > np.iinfo(np.int32).max:
+        return entries.astype(np.int32), places.astype(np.int32)
+    of_all, without = np.empty(number, np.int32), np.ones(number, bool)
+    of_all[entries], without[entries] = places, False
+    of_all[without] = np.arange(end, end + others)  # no two are equal, as scattering was told
+    return None, of_all
 
 
 def _own_nodes(level: np.ndarray, front: np.ndarray, depth: int) -> tuple[list[np.ndarray], np.ndarray]:

@@ -182,7 +182,8 @@ def eliminate(
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
     entries = jnp.zeros(start[-1], matrix.dtype)
-    entries = _put(entries, dissection.places, taken(matrix, dissection.entries))
+    needed = matrix if dissection.entries is None else taken(matrix, dissection.entries)
+    entries = _put(entries, dissection.places, needed)
     padded = _put(entries, dissection.padding, jnp.ones((), entries.dtype))
     eliminated = []
     schur: Array | None = None

@@ -17,9 +17,11 @@ class Pattern:
 
     Attributes:
         size: the number of rows.
+        n_entries: the size of the array of entries.
     """
 
     size: int
+    n_entries: int
 
     @abstractmethod
     def places(self) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
@@ -63,7 +65,7 @@ class SparsePattern(Pattern):
     """Any symmetric pattern with a full diagonal, its entries in the order of rows, and of columns within a row."""
 
     def __init__(self, size: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> None:
-        self.size = size
+        self.size, self.n_entries = size, len(rows)
         self._rows, self._cols = StaticArray(rows, np.int32), StaticArray(cols, np.int32)
 
     @property

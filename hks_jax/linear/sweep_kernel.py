@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from hks_jax.linear.accelerators import padded_size
+
 LARGEST = 64
 """Rows of the largest matrix: 4 warps, 32 numbers in each thread."""
 
@@ -37,7 +39,7 @@ def invert_in_registers(
     rows = n if rows is None else rows
     at = jnp.zeros((), jnp.int32) if at is None else at
     # Triton's arrays have powers of two for sizes: what is beyond the block is the identity.
-    size = max(_SMALLEST, 1 << (rows - 1).bit_length())
+    size = padded_size(rows, _SMALLEST)
 
     def kernel(first, matrix, least, inverse, pivots) -> None:  # type: ignore[no-untyped-def]  # references of Pallas'
         index = jax.lax.broadcasted_iota(jnp.int32, (size,), 0)

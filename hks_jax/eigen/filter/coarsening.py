@@ -3,9 +3,10 @@
 The eigenfunctions of the coarse problem, interpolated, are where an iteration on the fine grid starts.
 """
 
+import math
+from collections.abc import Sequence
 from functools import partial
-from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.colouring import axis_colours
 from hks_jax.fem.columns import stencil_product, to_columns, to_rows
+from hks_jax.fem.masks import mask_for
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.operators import DiagonalOperator
+from hks_jax.traced import is_traced
 
 _COLUMNS = 16
 """Columns in one product."""
@@ -56,8 +59,9 @@ def finest_level(pencil: Pencil) -> GridLevel:
     else:
         assert isinstance(mass, StencilOperator)
         coefficients = mass.coefficients
-    # Under `jit` they are constants, and without the barrier the compiler would compute with them, node by node.
-    free, domain = jax.lax.optimization_barrier((jnp.asarray(space.free), jnp.asarray(space.domain)))
+    # Under `jit` they are known, and without the barrier the compiler would compute with them, node by node.
+    masks = (jnp.asarray(mask_for(pencil, mask)) for mask in (space.free, space.domain))
+    free, domain = jax.lax.optimization_barrier(tuple(masks))
     return _level(stiffness.coefficients, coefficients, free, domain)
 
 
@@ -66,10 +70,12 @@ def coarsen(level: GridLevel, periodic: tuple[bool, ...]) -> GridLevel:
     every_second = (slice(None, None, 2),) * len(periodic)
     free, domain = level.free[every_second], level.domain[every_second]
     shape = free.shape
-    colours, of_neighbour = _colouring(shape, periodic)
-    count = int(colours.max()) + 1
-    padded = -(-count // _COLUMNS) * _COLUMNS
-    indicators = (colours.ravel() == np.arange(padded)[:, None]).reshape(-1, _COLUMNS, colours.size)
+    axes = [_axis_colours(n, wraps) for n, wraps in zip(shape, periodic, strict=True)]
+    padded = -(-math.prod(int(own.max()) + 1 for _, own, _ in axes) // _COLUMNS) * _COLUMNS
+    # Where the level is traced, what is along axes is all that the program has for constants.
+    known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes]) if is_traced(level) else axes
+    colours, of_neighbour = _colouring(known, [int(own.max()) + 1 for _, own, _ in axes])
+    indicators = (colours.ravel() == np.arange(padded, dtype=np.int32)[:, None]).reshape(-1, _COLUMNS, colours.size)
     indicators, of_neighbour = jax.lax.optimization_barrier((jnp.asarray(indicators), jnp.asarray(of_neighbour)))
 
     def galerkin(coefficients: Array) -> Array:
@@ -121,20 +127,27 @@ def _level(stiffness: Array, mass: Array, free: Array, domain: Array) -> GridLev
     return GridLevel(stiffness, mass, jnp.where(free, jnp.sum(mass, axis=0), 1), free, domain)
 
 
+def _axis_colours(n: int, wraps: bool) -> Int[np.ndarray, "3 n"]:
+    """Return the colours along an axis of the node before, a node itself and the one after; −1 if there is none."""
+    own = axis_colours(n, 3, wraps)
+    rimmed = np.pad(own, 1, mode="wrap") if wraps else np.pad(own, 1, constant_values=-1)
+    return np.stack([rimmed[:-2], own, rimmed[2:]]).astype(np.int32)
+
+
 def _colouring(
-    shape: tuple[int, ...], periodic: tuple[bool, ...]
-) -> tuple[Int[np.ndarray, "*shape"], Int[np.ndarray, "offsets *shape"]]:
-    """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none."""
-    axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, periodic, strict=True)]
-    number = np.zeros(shape, int)
-    for axis, colours in enumerate(axes):
-        number = number * (colours.max() + 1) + colours.reshape([-1 if a == axis else 1 for a in range(len(shape))])
-    padded = number
-    for axis, wraps in enumerate(periodic):
-        widths = [(1, 1) if a == axis else (0, 0) for a in range(len(shape))]
-        padded = np.pad(padded, widths, mode="wrap") if wraps else np.pad(padded, widths, constant_values=-1)
-    neighbours = [
-        padded[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))]
-        for start in product((0, 1, 2), repeat=len(shape))
-    ]
-    return number, np.stack(neighbours)
+    axes: Sequence[Int[np.ndarray | Array, "3 _n"]], counts: Sequence[int]
+) -> tuple[Int[np.ndarray | Array, "*shape"], Int[np.ndarray | Array, "offsets *shape"]]:
+    """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none.
+
+    Computed with what arrays the axes are: those of the host, or of a program.
+    """
+    d = len(axes)
+    number: Any = np.zeros((1,) * (2 * d), np.int32)
+    exists: Any = np.ones((1,) * (2 * d), bool)
+    for axis, (colours, count) in enumerate(zip(axes, counts, strict=True)):
+        is_own = [i == axis for i in range(d)]
+        along = colours.reshape([3 if own else 1 for own in is_own] + [-1 if own else 1 for own in is_own])
+        number, exists = number * count + along, exists & (along >= 0)
+    number = (number + 1) * exists.astype(np.int32) - 1
+    number = number.reshape(3**d, *number.shape[d:])
+    return number[3**d // 2], number
