@@ -17,16 +17,16 @@ _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "
 """XLA's older code generator for fused loops takes half as long, for code as fast as far as measured here."""
 
 
-def jit_quickly(**settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Return a decorator like `jax.jit` with these settings, for functions of which many are compiled.
+def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Return a decorator like `jax.jit`, or `equinox.filter_jit`, for functions that take long to compile.
 
     XLA compiles a computation as a whole: within another one these functions are as that is. Where the environment
     variable XLA_FLAGS sets one of the options, they are left as it says.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        usual = jax.jit(function, **settings)
-        quick = jax.jit(function, compiler_options=_OPTIONS, **settings)
+        usual = jit(function, **settings)
+        quick = jit(function, compiler_options=_OPTIONS, **settings)
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number
+from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.metric_fit import MetricFit
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
@@ -136,7 +137,7 @@ def _information(problem: Problem, values: Values) -> Any:
     return lambda batch: jax.lax.map(lambda x: transposed(product(x))[0], batch)
 
 
-@eqx.filter_jit
+@jit_quickly(eqx.filter_jit)
 def _strongest(problem: Problem, values: Values, start: Array, iterations: int) -> tuple[Array, Array]:
     product = _information(problem, values)
     shape = start.shape
@@ -148,7 +149,7 @@ def _strongest(problem: Problem, values: Values, start: Array, iterations: int) 
     return _ritz(block, product(block), largest=True)
 
 
-@eqx.filter_jit
+@jit_quickly(eqx.filter_jit)
 def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, ""], degree: int) -> tuple[Array, Array]:
     product = _information(problem, values)
     shape = start.shape

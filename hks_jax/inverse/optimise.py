@@ -11,6 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.inverse.problem import Problem
@@ -66,14 +67,14 @@ def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 # A solver's state holds the residuals' trace, and the same one, out of this function's cache, for every fit of the same
 # shapes: `_advance` tells traces apart.
-@eqx.filter_jit
+@jit_quickly(eqx.filter_jit)
 def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem) -> Any:
     """Return the solver's state before the first step."""
     struct, aux_struct = eqx.filter_eval_shape(fn, values, problem)
     return _strongly_typed(optimiser.init(fn, values, problem, {}, struct, aux_struct, frozenset()))
 
 
-@eqx.filter_jit
+@jit_quickly(eqx.filter_jit)
 def _advance(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem, state: Any) -> tuple:
     values, state, told = optimiser.step(fn, values, problem, {}, state, frozenset())
     done, result = optimiser.terminate(fn, values, problem, {}, state, frozenset())

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.inverse.observation import Observation
@@ -45,7 +46,7 @@ def residuals_and_outcome(problem: Problem, values: Values) -> tuple[Float[Array
     return data, penalties, jax.lax.stop_gradient(Outcome(*losses_of(data, penalties), left, pairs))
 
 
-@eqx.filter_jit
+@jit_quickly(eqx.filter_jit)
 def outcome_of(problem: Problem, values: Values) -> Outcome:
     """Return what a fit has come to with these unknowns."""
     return residuals_and_outcome(problem, values)[2]
