@@ -23,6 +23,8 @@ def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"
     matrix is not finite. On CPUs by LAPACK's eigenvalues, elsewhere by elimination, which takes far fewer of the
     operations that are slow there.
     """
+    if not accelerators.at_hand():
+        return by_eigenvalues(matrices, least)  # to trace what is not used takes longer
     ways = {"cpu": by_eigenvalues} | ({"cuda": by_kernels} if accelerators.kernels_compile() else {})
     return jax.lax.platform_dependent(matrices, least, **ways, default=by_elimination)
 
