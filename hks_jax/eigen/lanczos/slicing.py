@@ -46,7 +46,8 @@ def _consider(
     missing = below - known
     complete = trial.sound & (missing == 0)
     finished = complete & ((known >= plan.wanted) | (negative == problem.pencil.size))  # all, or there are no more
-    too_many = trial.sound & (missing > plan.slice_size)
+    # Where a nearer shift leaves as many, they are copies of one eigenvalue: that is searched, as often as it takes.
+    too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, tolerance, lowest))
     # Another shift costs a factorisation, refined solves more: they are for where it is no better.
@@ -172,6 +173,10 @@ def _accept(
     bottom = (state.reached <= 0) & (problem.negative == 0)
     again = jnp.where(stuck & bottom, -jnp.abs(shift) / jnp.maximum(state.below, 1).astype(dtype), again)
     leftover = jnp.argsort(jnp.where(above & ~accepted, near, jnp.inf))[: plan.block]
+    # Where all below the shift are known, and nothing converged above it, as above a multiplet far from all others, go
+    # to where others seem to be.
+    beyond = jnp.sort(jnp.where(above, near, jnp.inf))[min(plan.slice_size // 4, plan.ritz - 1)]
+    onward = jnp.where((count == 0) & jnp.isfinite(beyond), shift + 1.1 * (beyond - shift), -jnp.inf)
     noise = 0.01 * jnp.std(vectors) * jnp.roll(state.noise, state.slices, axis=0)
     state = state._replace(
         values=all_values,
@@ -185,7 +190,8 @@ def _accept(
         passes=jnp.where(complete | stuck, 1, 2),
         stuck=stuck,
     )
-    return order, state._replace(shift=jnp.where(complete, _next_shift(problem, plan, state), again))
+    following = jnp.maximum(_next_shift(problem, plan, state), onward)
+    return order, state._replace(shift=jnp.where(complete, following, again))
 
 
 def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Float[Array, ""]:
