@@ -176,3 +176,34 @@ def test_what_is_refused():
 def test_a_cut_multiple_eigenvalue_is_told():
     with pytest.warns(hj.AccuracyWarning, match=r"k = 3 cuts a multiple eigenvalue: its last 2"):
         hj.eigsh(lattice(12), k=3)
+
+
+def twelve_graphs() -> sp.csc_matrix:
+    """The Laplacian of twelve equal graphs: all eigenvalues have twelve copies, and zero lies far below the others."""
+    edges = sp.random(150, 150, 0.08, random_state=0).tocsr()
+    edges = edges + edges.T + sp.diags([np.ones(149), np.ones(149)], [1, -1])
+    edges.setdiag(0)
+    return sp.kron(sp.eye(12), sp.diags(np.asarray(edges.sum(axis=1)).ravel()) - edges).tocsc()
+
+
+@pytest.mark.slow
+def test_more_copies_than_a_block_has_columns():
+    K = twelve_graphs()
+    exact, held = np.linalg.eigvalsh(K.toarray())[:36], hj.sparse_pencil(K)
+    for solve in (hj.eigsh, eqx.filter_jit(hj.eigsh)):
+        pairs = solve(held, k=36, solver=hj.BlockLanczos())
+        check(pairs, K, None, exact)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("low", "high"), [(0.5, 0.7), (7.0, 7.2)])
+def test_an_interval_in_float32(low, high):
+    """Moved to the interval, the matrix has a negative diagonal where the interval lies high."""
+    line = sp.diags([2 * np.ones(33), -np.ones(32), -np.ones(32)], [0, 1, -1]).tocsr()
+    K = sp.kronsum(line, line[:31, :31]).tocsc().astype(np.float32)
+    exact = np.linalg.eigvalsh(K.toarray().astype(float))
+    exact = exact[(exact >= low) & (exact < high)]
+    pairs = hj.eigsh(K, interval=(low, high), solver=hj.BlockLanczos())
+    assert pairs.eigenvalues.dtype == jnp.float32
+    assert pairs.converged.all()
+    np.testing.assert_allclose(pairs.eigenvalues, exact, atol=1e-5)

@@ -87,7 +87,7 @@ def eigsh(
 
     Who knows `scipy.sparse.linalg.eigsh`: this computes what ``eigsh(K, k, M, sigma=…, which="LM")`` does with a shift
     below the spectrum, and needs no shift. K may be singular, with any null space, or indefinite. Eigenvectors are the
-    *rows* of ``.vectors``. Multiple eigenvalues are found with all their copies (where these are more than some ten,
+    *rows* of ``.vectors``. Multiple eigenvalues are found with all their copies (where these are more than some forty,
     pairs may be missing, which is told), and k that cuts one is said. There is no ``which``: for the largest
     eigenvalues negate K, for those in the middle give the interval. There is no ``LinearOperator`` either: K and M are
     factorised, by nested dissection.

@@ -52,7 +52,7 @@ def quality(
     return defects / scale, defects <= allowed_defects(scale, rounding, tolerance), rounding / scale
 
 
-def allowed_defects(scale: Float[Array, " m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, " m"]:
+def allowed_defects(scale: Float[Array, "*m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, "*m"]:
     """Return the defects ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
 
     Args:
@@ -67,6 +67,6 @@ def allowed_defects(scale: Float[Array, " m"], rounding: Float[Array, ""], toler
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
     """Return the distance below which rounding in K alone makes two eigenvalues one: 4 ε λ_max.
 
-    4·max(Kᵢᵢ/Mᵢᵢ) is λ_max on a uniform grid in 2D and 3D.
+    4·max|Kᵢᵢ/Mᵢᵢ| is λ_max on a uniform grid in 2D and 3D.
     """
-    return 4 * jnp.finfo(dtype).eps * 4 * jnp.max(pencil.stiffness.diagonal() / pencil.mass.diagonal())
+    return 4 * jnp.finfo(dtype).eps * 4 * jnp.max(jnp.abs(pencil.stiffness.diagonal()) / pencil.mass.diagonal())

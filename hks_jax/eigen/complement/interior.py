@@ -91,7 +91,7 @@ def _solve(
     rhs: Float[Array, "k n_dof"],
     tolerance: float,
 ) -> Float[Array, "k n_dof"]:
-    k, tolerance = rhs.shape[0], attainable(tolerance, rhs.dtype)
+    k = rhs.shape[0]
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     low, high = _left(pencil, values)
     amplified = (high - low) / 2 / jnp.minimum(high - values[:k], values[:k] - low)
@@ -116,7 +116,8 @@ def _solve(
 
         return conjugate_gradients(product, without_near, factor.solve_columns(b.T), wanted, inner).T
 
-    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, amplified, False, values[:k])
+    accuracy = attainable(tolerance, rhs.dtype)
+    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, accuracy, amplified, False, values[:k])
 
 
 def _left(pencil: LocatedPencil, values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -72,9 +72,12 @@ def _consider(
     return ~(finished | too_many | moves), state
 
 
-def _needed(problem: Problem, tolerance: float, lowest: Float[Array, ""]) -> Float[Array, ""]:
+def _needed(
+    problem: Problem, tolerance: float, lowest: Float[Array, ""], excuse: Float[Array, ""] | float = 1.0
+) -> Float[Array, ""]:
     """Return how small residuals ‖Kφ − λMφ‖/‖Mφ‖ must be if the lowest eigenvalue not known yet is to converge."""
-    return jnp.maximum(tolerance * jnp.maximum(lowest, problem.unit), indistinct(problem.pencil, lowest.dtype))
+    rounding = excuse * indistinct(problem.pencil, lowest.dtype)
+    return allowed_defects(jnp.maximum(lowest, problem.unit), rounding, tolerance)
 
 
 def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float, state: SlicingState) -> SlicingState:
@@ -152,9 +155,8 @@ def _accept(
     complete = state.below == jnp.sum(state.values < shift) + jnp.sum(accepted & (values < shift))
     # What is known is kept out of later searches. If it has parts in the missing eigenvectors, which may be of much
     # smaller eigenvalues, these do not converge any more: then only what is accurate enough for them is taken.
-    accepted &= complete | (
-        residuals <= excuse * _needed(problem, tolerance, jnp.maximum(state.reached, first_nonzero))
-    )
+    needed = _needed(problem, tolerance, jnp.maximum(state.reached, first_nonzero), excuse)
+    accepted &= complete | (residuals <= needed)
 
     order = jnp.argsort(jnp.where(accepted, values, jnp.inf))
     count = jnp.sum(accepted)
