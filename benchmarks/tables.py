@@ -47,6 +47,8 @@ HEADINGS = {
     "fields_per_second": "fields a second",
     "t_in_h2": "t/h²",
     "relative_error": "relative error",
+    "seconds_before": "before",
+    "processor_ratio": "ratio, of all processors",
     "launches_before": "before",
     "waits": "waits of the host",
     "waits_before": "before",

@@ -17,7 +17,7 @@ from hks_jax.eigen.quality import allowed_defects, indistinct, values_and_defect
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
 
-_ERROR = 0.03
+_ERROR = 0.1
 """How far the error of solves may reach towards the tolerance of the lowest eigenvalue sought."""
 
 _EXCUSE = 30
