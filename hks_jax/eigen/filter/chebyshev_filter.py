@@ -156,7 +156,7 @@ def _converge(
     report: Report,
 ) -> FilterState:
     """Return the state after rounds on the finest grid, each told, and of large problems the blocks of each."""
-    in_steps = plan.mesh is None and state.vectors.size >= _LARGE
+    in_steps = report is not silent and plan.mesh is None and state.vectors.size >= _LARGE
     pace = Pace(float(excess(plan, rounding, state)))
     while (left := int(unconverged(plan, rounding, state))) and state.rounds < max_rounds:
         text = f"{plan.wanted - left} of {plan.wanted} pairs, round {int(state.rounds) + 1}"
