@@ -36,10 +36,10 @@ def bytes_of_constants(function, shape):
     return sum({id(constant): np.asarray(constant).nbytes for constant in constants(program)}.values())
 
 
-def pairs_by(solver, boundary="neumann"):
+def pairs_by(solver):
     def compute(tensors):
         field = hj.TensorField(hj.Grid(tensors.shape[:-2]), tensors)
-        pairs = hj.eigenpairs(field, 4, boundary, solver=solver)
+        pairs = hj.eigenpairs(field, 4, solver=solver)
         return pairs.eigenvalues, pairs.vectors
 
     return compute

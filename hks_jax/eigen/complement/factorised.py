@@ -139,8 +139,8 @@ def _solve(
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
 
-    of_rows = amplification(values, k), bool(_GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance), values[:k]
-    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, *of_rows)
+    clean, amplified = bool(_GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance), amplification(values, k)
+    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, amplified, clean, values[:k])
 
 
 def _group(dissection: Dissection, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint) -> Groups:
