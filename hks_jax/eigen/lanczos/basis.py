@@ -122,5 +122,8 @@ def _put(
     rows: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], place: Int[Array, ""], inside: Bool[Array, ""]
 ) -> Float[Array, "rows n_dof"]:
     """Return rows with the block put in place, or, where it does not belong to them, as they are."""
-    old = jax.lax.dynamic_slice_in_dim(rows, place, len(block))
-    return jax.lax.dynamic_update_slice_in_dim(rows, jnp.where(inside, block.astype(rows.dtype), old), place, axis=0)
+    block = block.astype(rows.dtype)
+    # A loop of one turn or none writes in place: to choose between old and new rows would read and write them all.
+    return jax.lax.fori_loop(
+        0, inside.astype(int), lambda _, rows: jax.lax.dynamic_update_slice_in_dim(rows, block, place, axis=0), rows
+    )
