@@ -35,6 +35,7 @@ PROBLEMS = {
     "256²": (partial(field, 256), 500, "block-lanczos"),
     "32³": (partial(field, 32, 3), 200, "chebyshev-filter"),
     "surface": (partial(hj.examples.bumpy_torus_mesh, 256), 100, "block-lanczos"),
+    "smaller surface": (partial(hj.examples.bumpy_torus_mesh, 203), 100, "block-lanczos"),
 }
 """A domain, which is differentiated by its tensors or vertices, the number of pairs, and the solver."""
 N_TIMES = 8
