@@ -33,6 +33,8 @@ HEADINGS = {
     "step_s": "a step, s",
     "processor_s": "of all processors, s",
     "compilation_s": "compilation, s",
+    "first_call_s_ratio": "ratio",
+    "seconds_ratio": "ratio",
     "peak_GB": "peak memory, GB",
     "dense_s": "dense, s",
     "shift_invert_s": "shift-invert, s",
@@ -148,6 +150,8 @@ def text(value: Any, power: int = 1) -> str:
     """Return a number as one reads it: three digits, and powers as powers."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "—" if value is None else "NaN"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         if value and abs(value) < 1e-2:
             return re.sub(r"e-0?", "e-", f"{value:.2g}" if abs(value) > 1e-3 else f"{value:.1e}").replace(".0e", "e")

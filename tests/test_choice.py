@@ -88,8 +88,19 @@ def test_what_auto_chooses_where_values_are_known():
     assert [choose_solver("auto", volume, k).name for k in (20, 190)] == ["shift-invert"] * 2
     assert choose_solver("auto", hj.assemble(flat((20, 20, 20), (1.0, 1.0, 1.0))), 100).name == "chebyshev-filter"
     assert [choose_solver("auto", surface, k).name for k in (300, 450)] == ["shift-invert", "block-lanczos"]
-    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == np.float64 else x, surface)
-    assert choose_solver("auto", single, 450).name == "shift-invert"
+    large = hj.assemble(flat((130, 130), (1.0, 1.0)))
+    assert [choose_solver("auto", large, k).name for k in (40, 50)] == ["shift-invert", "block-lanczos"]
+
+
+@pytest.mark.slow
+def test_what_auto_chooses_in_single_precision():
+    def single(domain):
+        return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == np.float64 else x, hj.assemble(domain))
+
+    surface, plane = single(hj.examples.bumpy_torus_mesh(50)), single(flat((130, 130), (1.0, 1.0)))
+    assert choose_solver("auto", surface, 450).name == "shift-invert"
+    assert [choose_solver("auto", plane, k).name for k in (290, 300)] == ["shift-invert", "chebyshev-filter"]
+    assert choose_solver("auto", single(flat((20, 20, 20), (1.0, 1.0, 1.0))), 100).name == "chebyshev-filter"
 
 
 def test_on_accelerators_nothing_runs_on_the_host(monkeypatch):

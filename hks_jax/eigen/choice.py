@@ -22,24 +22,25 @@ SOLVERS: dict[str, Callable[[], Eigensolver]] = {
 _SMALL = 1500
 """Unknowns up to which all pairs at once are affordable: n³ whatever k is, and nothing can be missed."""
 
-# Seconds of the processor for the first call in a process, compilation included, and for those that follow; float64,
-# random anisotropic tensors, two cores that did other work too (which leaves ratios right to some 30 %):
+# Seconds of the first call in a process, compilation included, and of those that follow, on two cores
+# (benchmarks/automatic.py); ours is block Lanczos, in 3D and in single precision on grids the Chebyshev filter:
 #
-#   nodes/pairs   n·k     shift-invert    ours, compiled
-#   64²/50        0.2 M   3.5    0.7      13     0.4    block Lanczos
-#   64²/100       0.4 M   7.3    1.8      12     0.8
-#   128²/50       0.8 M   10     7        15     1.0
-#   96²/100       0.9 M   12     2.7      15     3
-#   128²/100      1.6 M   20     5        16     2.3
-#   96²/200       1.8 M   17     7.7      17     1.9
-#   surface/100   0.6 M   9      4.3      17     2.7    (6400 vertices)
-#   16³/50        0.2 M   5.5    1.5      17     1.9    Chebyshev filter
-#   20³/100       0.8 M   20     13       23     6.4
+#                            float64                         float32
+#   nodes/pairs   n·k        shift-invert   ours             shift-invert   ours
+#   64²/50        0.2 M      2.1    0.2      5.7    0.1      2.2    0.2      6.7    0.1
+#   64²/200       0.8 M      3.0    0.9      6.3    0.3      2.9    0.8      6.9    0.4
+#   128²/100      1.6 M      4.4    2.0      7.1    0.6      3.7    1.9      12     1.3
+#   256²/100      6.6 M      13     9.2      8.4    2.4      13     9.1      16     3.9
+#   16³/50        0.2 M      4.1    0.6      11     0.5      4.3    0.6      8.8    0.2
+#   24³/100       1.4 M      9.8    5.4      10     2.1      8.7    5.7      9.5    0.7
+#   surface/50    0.2 M      1.8    0.2      6.7    0.2      1.7    0.2      6.1    0.3    (4096 vertices)
+#   surface/100   1.6 M      3.5    1.9      7.1    0.7      3.1    1.7      9.5    2.0    (16 384 vertices)
 #
-# In float32 block Lanczos factorises in float32, which costs it several searches: at 128²/100 it needs 13 s. The filter
-# needs 4 s (the first time 24).
-_LARGE, _LARGE_IN_3D = 1_000_000, 800_000
-"""Unknowns times pairs from which on JAX's solvers win, or nearly, even if they have to be compiled first."""
+# Compilation takes some five seconds, whatever the size. So up to some five million no solver is the fastest both the
+# first time and later: what is chosen loses the smaller factor of the two. Block Lanczos in float32 factorises in
+# float32, which costs it several searches, and pairs that do not converge.
+_LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
+"""Unknowns times pairs from which on JAX's solvers are chosen; the latter for 2D grids in single precision."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
@@ -84,6 +85,6 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     if is_traced(jax.lax.stop_gradient(pencil)) or jax.default_backend() != "cpu":
         return ours
     # The host's solver has float64 for float32 matrices too.
-    if volume:
-        return ours if isinstance(ours, ChebyshevFilter) and n * k >= _LARGE_IN_3D else ShiftInvert()
-    return ours if exact and isinstance(ours, BlockLanczos) and n * k >= _LARGE else ShiftInvert()
+    suited = ChebyshevFilter if volume or not exact else BlockLanczos
+    large = _LARGE if exact or volume else _LARGE_IN_SINGLE
+    return ours if isinstance(ours, suited) and n * k >= large else ShiftInvert()
