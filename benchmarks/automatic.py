@@ -16,9 +16,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 from machine import RESULTS, field, timed_from_cold, write
+from versions import parsed
 
 import hks_jax as hj
-from hks_jax.eigen.choice import SOLVERS, choose_solver
+from hks_jax.eigen.choice import choose_solver
 
 CASES = ["64²/50", "64²/200", "128²/100", "256²/100", "16³/50", "24³/100", "mesh4096/50", "mesh16384/100"]
 PRECISIONS = ["float64", "float32"]
@@ -26,12 +27,13 @@ PRECISIONS = ["float64", "float32"]
 
 def domain(case: str, precision: str) -> tuple[hj.TensorField | hj.SurfaceMesh, int]:
     """Return the domain of a case, and the number of pairs."""
-    name, k = case.split("/")
-    if name.startswith("mesh"):
-        torus = hj.examples.bumpy_torus_mesh(round(int(name.removeprefix("mesh")) ** 0.5))
-        return hj.SurfaceMesh(jnp.asarray(torus.vertices, precision), torus.faces), int(k)
-    tensors = field(int(name[:-1]), 2 + name.endswith("³"))
-    return hj.TensorField(tensors.grid, jnp.asarray(tensors.tensors, precision)), int(k)
+    if case.startswith("mesh"):
+        vertices, k = map(int, case.removeprefix("mesh").split("/"))
+        torus = hj.examples.bumpy_torus_mesh(round(vertices**0.5))
+        return hj.SurfaceMesh(jnp.asarray(torus.vertices, precision), torus.faces), k
+    n, d, k = parsed(case)
+    tensors = field(n, d)
+    return hj.TensorField(tensors.grid, jnp.asarray(tensors.tensors, precision)), k
 
 
 def measure(case: str, precision: str, solver: str) -> dict:
@@ -54,8 +56,7 @@ def measure(case: str, precision: str, solver: str) -> dict:
 
 def candidates(case: str) -> list[str]:
     """Return the solvers to try: the dense one, for fewer unknowns than these, is measured in solvers.py."""
-    of_grids = set() if case.startswith("mesh") else {"chebyshev-filter"}
-    return [solver for solver in SOLVERS if solver in {"shift-invert", "block-lanczos"} | of_grids]
+    return ["shift-invert", "block-lanczos"] + ([] if case.startswith("mesh") else ["chebyshev-filter"])
 
 
 def main() -> None:

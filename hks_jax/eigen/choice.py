@@ -37,8 +37,8 @@ _SMALL = 1500
 #   surface/100   1.6 M      3.5    1.9      7.1    0.7      3.1    1.7      9.5    2.0    (16 384 vertices)
 #
 # Compilation takes some five seconds, whatever the size. So up to some five million no solver is the fastest both the
-# first time and later: what is chosen loses the smaller factor of the two. Block Lanczos in float32 factorises in
-# float32, which costs it several searches, and pairs that do not converge.
+# first time and later: what is chosen loses the smaller factor of the two, but for small volumes in float32. Block
+# Lanczos in float32 factorises in float32, which costs it several searches, and pairs that do not converge.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 """Unknowns times pairs from which on JAX's solvers are chosen; the latter for 2D grids in single precision."""
 

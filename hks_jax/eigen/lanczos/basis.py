@@ -123,7 +123,8 @@ def _put(
 ) -> Float[Array, "rows n_dof"]:
     """Return rows with the block put in place, or, where it does not belong to them, as they are."""
     block = block.astype(rows.dtype)
-    # A loop of one turn or none writes in place: to choose between old and new rows would read and write them all.
+    # A loop of one turn or none writes where the block belongs: chosen by a mask, as many rows of every piece would be
+    # read and written.
     return jax.lax.fori_loop(
         0, inside.astype(int), lambda _, rows: jax.lax.dynamic_update_slice_in_dim(rows, block, place, axis=0), rows
     )
