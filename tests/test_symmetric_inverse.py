@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hks_jax.linear.symmetric_inverse import by_eigenvalues, by_elimination, by_kernels
+from hks_jax.linear.symmetric_inverse import (
+    by_cholesky_factors,
+    by_eigenvalues,
+    by_elimination,
+    by_kernels,
+)
 
 WAYS = {"cpu": by_eigenvalues, "cuda": partial(by_kernels, interpret=True), "default": by_elimination}
 
@@ -40,6 +45,16 @@ def test_inertia_of_nearly_singular_matrices(rng, way, n):
     inverted, pivots = jax.jit(WAYS[way])(jnp.asarray(a), jnp.zeros(8))
     np.testing.assert_array_equal((pivots < 0).sum(axis=1), (values < 0).sum(axis=1))
     np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-5)
+
+
+@pytest.mark.parametrize("negative", [0, 3])
+def test_definite_matrices_and_a_batch_of_which_one_is_not(rng, negative):
+    values = rng.uniform(0.5, 2, (5, 24))
+    values[2, :negative] *= -1
+    a = of_spectrum(rng, values)
+    inverted, pivots = jax.jit(by_cholesky_factors)(jnp.asarray(a))
+    np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(24), a.shape), atol=1e-13)
+    np.testing.assert_array_equal((pivots < 0).sum(axis=1), [0, 0, negative, 0, 0])
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -140,7 +140,7 @@ def _eliminate(
     pivots = []
 
     def inverted(blocks: Array, sizes: Array) -> Array:
-        inverses, some = symmetric_inverses(blocks, jnp.zeros_like(sizes) if least is None else least * sizes)
+        inverses, some = symmetric_inverses(blocks, None if least is None else least * sizes)
         pivots.append(some.ravel())
         return inverses
 

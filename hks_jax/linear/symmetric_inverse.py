@@ -14,19 +14,44 @@ Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
 
 _BLOCK = 32
 _SMALL, _LARGE = 32, 256
+_MANY = 128
+"""Fronts of a level from which on all of them are definite as a rule: the shift is below their eigenvalues."""
 
 
-def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"] | None = None) -> Inverses:
     """Return the inverses, and for each matrix numbers of which as many are negative as eigenvalues.
 
-    Pivots smaller than ``least`` are replaced by it, with their sign; where it is zero, the inverse of a singular
-    matrix is not finite. On CPUs by LAPACK's eigenvalues, elsewhere by elimination, which takes far fewer of the
-    operations that are slow there.
+    Pivots smaller than ``least`` are replaced by it, with their sign; without it the inverse of a singular matrix is
+    not finite. On CPUs by LAPACK, of many definite matrices by their Cholesky factors and of others by their
+    eigenvalues; elsewhere by elimination, which takes far fewer of the operations that are slow there.
     """
-    if not accelerators.at_hand():
-        return by_eigenvalues(matrices, least)  # to trace what is not used takes longer
+    none = jnp.zeros(len(matrices), matrices.dtype) if least is None else least
+    if not accelerators.at_hand():  # to trace what is not used takes longer
+        if least is None and len(matrices) >= _MANY:
+            return by_cholesky_factors(matrices)
+        return by_eigenvalues(matrices, none)
     ways = {"cpu": by_eigenvalues} | ({"cuda": by_kernels} if accelerators.kernels_compile() else {})
-    return jax.lax.platform_dependent(matrices, least, **ways, default=by_elimination)
+    return jax.lax.platform_dependent(matrices, none, **ways, default=by_elimination)
+
+
+def by_cholesky_factors(matrices: Float[Array, "m n n"]) -> Inverses:
+    """Invert the Cholesky factors L, whose pivots are positive; by eigenvalues where not all matrices are definite.
+
+    That takes a third of the time.
+    """
+
+    def inverted(matrices: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
+        factors = jax.lax.linalg.cholesky(matrices, symmetrize_input=False)
+        identity = jnp.broadcast_to(jnp.eye(matrices.shape[-1], dtype=matrices.dtype), matrices.shape)
+        return jax.lax.linalg.triangular_solve(factors, identity, left_side=True, lower=True)
+
+    inverses = at_once_or_in_turn(inverted, matrices)
+    pivots = jnp.diagonal(inverses, axis1=1, axis2=2)
+    return jax.lax.cond(
+        jnp.all(pivots > 0),  # they are NaN where a matrix is not definite
+        lambda: (batched(transposed(inverses), inverses), pivots),
+        lambda: by_eigenvalues(matrices, jnp.zeros(len(matrices), matrices.dtype)),
+    )
 
 
 def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
