@@ -25,7 +25,7 @@ from hks_jax.eigen.complement.common import (
     group_numbers,
     shifts_between,
 )
-from hks_jax.eigen.complement.in_blocks import solve_in_blocks
+from hks_jax.eigen.complement.in_blocks import solve_in_blocks, without_known
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
@@ -132,12 +132,13 @@ def _solve(
         near_images = pencil.mass.apply(near)
 
         # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
-        # next to σ alone, which is why no others are taken out before the end.
+        # next to σ above all, which is why no others are taken out before the end, or before that makes it start again.
         def precondition(r: Array) -> Array:
             z = factor.solve_columns(r)
             return z - combine(products_with_columns(near_images, z).T, near).T
 
-        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
+        product = definite_product(pencil, shifts, beyond)
+        return conjugate_gradients(product, precondition, b.T, wanted, clean=without_known(pencil, vectors)).T
 
     clean, amplified = bool(_GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance), amplification(values, k)
     return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, amplified, clean, values[:k])

@@ -9,10 +9,22 @@ from jaxtyping import Array, Float
 
 from hks_jax.eigen.complement.common import norms, wanted_errors
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, inner_products
+from hks_jax.linear.products import combine, inner_products, products_with_columns
 
 _ROWS = 128
 """Rows that the known eigenvectors are taken out of at once: fewer read them more often from memory."""
+
+
+def without_known(
+    pencil: SymmetricPencil, vectors: Float[Array, "p n_dof"]
+) -> Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]:
+    """Return x ↦ x − ΦΦᵀMx, of columns."""
+    mass = pencil.mass.of_columns()
+
+    def without(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+        return x - combine(products_with_columns(vectors, mass(x)).T, vectors).T
+
+    return without
 
 
 # No array but the right-hand sides and the solution is as large as the eigenvectors.

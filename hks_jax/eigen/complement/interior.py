@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import SINGULAR, attainable, middles_of_gaps
 from hks_jax.eigen.complement.factorised import BLOCK, WINDOW, Factors, Groups, factorise_each, group_blocks, of_group
-from hks_jax.eigen.complement.in_blocks import solve_in_blocks
+from hks_jax.eigen.complement.in_blocks import solve_in_blocks, without_known
 from hks_jax.eigen.located import LocatedPencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
@@ -114,7 +114,8 @@ def _solve(
         def without_near(x: Float[Array, "n b"]) -> Float[Array, "n b"]:
             return x - combine(products_with_columns(near_images, x).T, near).T
 
-        return conjugate_gradients(product, without_near, factor.solve_columns(b.T), wanted, inner).T
+        clean = without_known(pencil, vectors)
+        return conjugate_gradients(product, without_near, factor.solve_columns(b.T), wanted, inner, clean).T
 
     accuracy = attainable(tolerance, rhs.dtype)
     return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, accuracy, amplified, False, values[:k])
