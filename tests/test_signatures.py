@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 import hks_jax as hj
 from hks_jax.signatures.tail import beyond_by_weyl
+from hks_jax.signatures.truncation import median_of_shares
 
 
 @pytest.fixture(scope="module")
@@ -185,6 +186,14 @@ def test_truncation_map_finds_the_worst_node(rng, shape, boundary, spread):
     assert (np.quantile(inner, [0.25, 0.75]) > 0.5).all()
     assert (np.quantile(inner, [0.25, 0.75]) < 2).all()
     assert (np.nan_to_num(hj.truncation_map(every, times)) == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_medians_by_bisection_are_those_of_sorting(rng, dtype):
+    shares = np.concatenate([rng.uniform(0, 1, (3, 41)), np.zeros((1, 41)), np.ones((1, 41))]).astype(dtype)
+    np.testing.assert_allclose(median_of_shares(jnp.asarray(shares)), np.median(shares, axis=1), rtol=3e-7, atol=1e-12)
+    shares[1, 5] = np.nan
+    np.testing.assert_array_equal(np.isnan(median_of_shares(jnp.asarray(shares))), np.arange(5) == 1)
 
 
 def test_resolution_bias_bounds_the_discretisation_error():

@@ -113,8 +113,7 @@ def _truncation(
     bias, lasting = _resolution_bias(resolution, at, 1 - (1 - slope) * (1 - tail))
     coarse = jnp.mean(bias > BIAS_LIMIT, axis=1)
     smallest = jnp.where(complete, 0, resolving(TAIL_LIMIT, dimension) / following)
-    bias, lasting = jnp.median(jnp.stack([bias, lasting]), axis=2)
-    return Truncation(at, tail, bias, lasting, coarse, smallest)
+    return Truncation(at, tail, median_of_shares(bias), median_of_shares(lasting), coarse, smallest)
 
 
 # Eigenvalues larger by the factor 1 + δ make the heat trace Z(t) that of the time (1 + δ)t: an error proportional to
@@ -129,6 +128,23 @@ def _resolution_bias(
     both = jnp.hypot(resolution.dispersion / times[:, None], lasting)
     # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
+
+
+def median_of_shares(x: Float[Array, "n m"]) -> Float[Array, " n"]:
+    """Return the median of each row of numbers between 0 and 1, to 1e-12. Bisection: sorting takes ten times as long.
+
+    NaN where there is one.
+    """
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) / 2
+        enough = 2 * jnp.sum(x <= middle[:, None], axis=1) >= x.shape[1]
+        return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
+
+    low = jnp.zeros(len(x), x.dtype)
+    _, median = jax.lax.fori_loop(0, 40, halve, (low, low + 1))
+    return jnp.where(jnp.any(jnp.isnan(x), axis=1), jnp.nan, median)
 
 
 def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
