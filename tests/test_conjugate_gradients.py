@@ -13,9 +13,12 @@ from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 
 def definite_beyond_the_first(n, columns):
-    """Return eigenvalues, of which the first is negative and the others are not, and a product that has them."""
-    values = jnp.asarray(np.append(-8.0, np.linspace(1, 3, n - 1))[:, None] * np.linspace(1, 1.2, columns))
-    return values, lambda x: (values * x, 1e-8 * jnp.sum(x * x, axis=0))
+    """Return the eigenvalues for each column, of which the first alone is negative."""
+    return jnp.asarray(np.append(-8.0, np.linspace(1, 3, n - 1))[:, None] * np.linspace(1, 1.2, columns))
+
+
+def product_of(values):
+    return lambda x: (values * x, 1e-8 * jnp.sum(x * x, axis=0))
 
 
 def without_the_first(x):
@@ -24,7 +27,8 @@ def without_the_first(x):
 
 def test_rounding_in_a_negative_direction_is_taken_out(rng):
     """A preconditioner that errs there as by rounding: what the product makes of it grows from step to step."""
-    values, product = definite_beyond_the_first(20, 3)
+    values = definite_beyond_the_first(20, 3)
+    product = product_of(values)
     rhs = without_the_first(jnp.asarray(rng.standard_normal((20, 3))))
 
     def precondition(r):
@@ -37,14 +41,9 @@ def test_rounding_in_a_negative_direction_is_taken_out(rng):
 
 
 def test_a_singular_matrix_is_told_however_often_it_begins_again(rng):
-    values, _ = definite_beyond_the_first(20, 3)
-    values = values.at[5].set(0)
+    values = definite_beyond_the_first(20, 3).at[5].set(0)
     rhs = without_the_first(jnp.asarray(rng.standard_normal((20, 3))))
-
-    def product(x):
-        return values * x, 1e-8 * jnp.sum(x * x, axis=0)
-
-    x = conjugate_gradients(product, lambda r: r, rhs, jnp.full(3, 1e-8), clean=without_the_first)
+    x = conjugate_gradients(product_of(values), lambda r: r, rhs, jnp.full(3, 1e-8), clean=without_the_first)
     assert np.isnan(x).all()
 
 

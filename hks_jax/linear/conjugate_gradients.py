@@ -54,6 +54,11 @@ def conjugate_gradients(
     def going_on(state: _Iteration) -> Bool[Array, ""]:
         return jnp.any(state.going) & (state.steps < MAX_ITERATIONS)
 
+    def restarted(x: Float[Array, "n_dof b"]) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"]]:
+        assert clean is not None
+        x = clean(x)
+        return x, rhs - product(x)[0]
+
     # The residual, preconditioned, tells the error before a step. That the step reduces it as the one before did saves
     # the preconditioner, which costs the most, once more than it takes steps.
     def step(state: _Iteration) -> _Iteration:
@@ -74,14 +79,9 @@ def conjugate_gradients(
         again = jnp.asarray(False)
         if clean is not None:
             again = jnp.any(going & ~regular) & ~fresh & (starts < _RESTARTS)
-            x, r = jax.lax.cond(again, restarted, lambda x, r: (x, r), x, r)
+            x, r = jax.lax.cond(again, lambda: restarted(x), lambda: (x, r))
         going = going & (regular | again) & (error > 1)
         return _Iteration(x, r, p, first, energy, errors, going, again, starts + again.astype(int), steps + 1)
-
-    def restarted(x: Float[Array, "n_dof b"], _: Array) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"]]:
-        assert clean is not None
-        x = clean(x)
-        return x, rhs - product(x)[0]
 
     asked, none, zero = jnp.isfinite(wanted), jnp.ones_like(wanted), jnp.zeros((), int)
     errors = jnp.where(asked, jnp.inf, 0)
