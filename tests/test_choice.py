@@ -11,6 +11,11 @@ from hks_jax.eigen import choice
 from hks_jax.eigen.choice import choose_for_fit, choose_solver
 
 
+def single(pencil):
+    """Return a pencil in single precision."""
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == np.float64 else x, pencil)
+
+
 def primitives(jaxpr):
     """Return the names of all primitives in a jaxpr, inner ones included."""
     for equation in jaxpr.eqns:
@@ -94,13 +99,11 @@ def test_what_auto_chooses_where_values_are_known():
 
 @pytest.mark.slow
 def test_what_auto_chooses_in_single_precision():
-    def single(domain):
-        return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == np.float64 else x, hj.assemble(domain))
-
-    surface, plane = single(hj.examples.bumpy_torus_mesh(50)), single(flat((130, 130), (1.0, 1.0)))
+    surface = single(hj.assemble(hj.examples.bumpy_torus_mesh(50)))
+    plane, volume = (single(hj.assemble(flat(shape, (1.0,) * len(shape)))) for shape in ((130, 130), (20, 20, 20)))
     assert choose_solver("auto", surface, 450).name == "shift-invert"
     assert [choose_solver("auto", plane, k).name for k in (290, 300)] == ["shift-invert", "chebyshev-filter"]
-    assert choose_solver("auto", single(flat((20, 20, 20), (1.0, 1.0, 1.0))), 100).name == "chebyshev-filter"
+    assert choose_solver("auto", volume, 100).name == "chebyshev-filter"
 
 
 def test_on_accelerators_nothing_runs_on_the_host(monkeypatch):
@@ -108,7 +111,7 @@ def test_on_accelerators_nothing_runs_on_the_host(monkeypatch):
     plane = hj.assemble(flat((42, 41), (1.0, 1.0)))
     assert choose_solver("auto", plane, 20).name == "block-lanczos"
     # Factors in single precision lose too many digits.
-    assert choose_solver("auto", jax.tree.map(lambda x: x.astype(jnp.float32), plane), 20).name == "chebyshev-filter"
+    assert choose_solver("auto", single(plane), 20).name == "chebyshev-filter"
     assert choose_solver("auto", hj.assemble(flat((12, 12, 13), (1.0, 1.0, 1.0))), 20).name == "chebyshev-filter"
 
 
