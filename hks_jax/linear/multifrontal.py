@@ -20,7 +20,7 @@ from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.level import Level
 from hks_jax.linear.merging import Merged
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import batched, gram, transposed
+from hks_jax.linear.products import batched_with_columns, gram, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
@@ -237,7 +237,7 @@ def _substituted(
             padded = jnp.pad(passed.reshape(-1, width), ((0, 1), (0, 0)))
             total = sum((taken(padded, places) for places in level.children), jnp.zeros((), rhs.dtype))
             force, onward = force + total[:, :s], total[:, s:]
-        product = batched(matrix, force)
+        product = batched_with_columns(matrix, force)
         own.append(product[:, :s])
         passed = onward - product[:, s:]
     assert passed is not None
@@ -245,7 +245,7 @@ def _substituted(
     for level, matrix in zip(levels[1:], upward[1:], strict=True):
         above = jnp.concatenate([solutions[-1], boundary], axis=1).reshape(-1, width)
         boundary = taken(above, level.boundary)
-        solutions.append(own.pop() - batched(matrix, boundary))
+        solutions.append(own.pop() - batched_with_columns(matrix, boundary))
     return jnp.concatenate([x.reshape(-1, width) for x in solutions]), passed
 
 

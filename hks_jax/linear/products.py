@@ -1,9 +1,17 @@
 """Products of blocks of vectors, as XLA computes them fastest."""
 
+from functools import reduce
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
+
+from hks_jax.linear import accelerators
+
+_MANY, _TERMS = 512, 64
+"""For how many matrices, of how many columns at most, products on a CPU are written out: others take longer to compile
+than they gain."""
 
 
 def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
@@ -28,6 +36,29 @@ def combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array
 def batched(x: Inexact[Array, "m i j"], y: Inexact[Array, "m j k"]) -> Inexact[Array, "m i k"]:
     """Return the products of two batches of matrices."""
     return jnp.matmul(x, y, precision="highest")
+
+
+def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
+    """Return the products of a batch of matrices with a few columns each.
+
+    XLA's CPU kernels compute all products of small matrices in one thread: those of many are a loop over sums that are
+    written out term by term, which is dealt out to all threads.
+    """
+    if accelerators.at_hand() or len(matrices) < _MANY or matrices.shape[2] > _TERMS:
+        return batched(matrices, columns)
+    # Computed as part of the loop, the columns would be computed anew for each row. A condition XLA computes apart from
+    # what comes before it; both ways are right.
+    return jax.lax.cond(jnp.isfinite(columns[0, 0, 0]), _written_out, batched, matrices, columns)
+
+
+def _written_out(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
+    shape = *matrices.shape[:2], columns.shape[2]
+
+    def term(j: int) -> Array:
+        factors = jax.lax.slice_in_dim(matrices, j, j + 1, axis=2), jax.lax.slice_in_dim(columns, j, j + 1, axis=1)
+        return jax.lax.mul(*(jax.lax.broadcast_in_dim(x, shape, (0, 1, 2)) for x in factors))
+
+    return reduce(jax.lax.add, map(term, range(matrices.shape[2])))
 
 
 def transposed(x: Inexact[Array, "m i j"]) -> Inexact[Array, "m j i"]:
