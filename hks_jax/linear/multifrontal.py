@@ -20,7 +20,7 @@ from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.level import Level
 from hks_jax.linear.merging import Merged
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import batched_with_columns, gram, transposed
+from hks_jax.linear.products import batched, batched_with_columns, gram, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
@@ -205,8 +205,8 @@ def eliminate(
             added = first + second
             blocks, beyond = blocks + added[:, :, :s], added[:, s:, s:]
         inverse = invert(blocks[:, :s], sizes)
-        coupling = jnp.matmul(blocks[:, s:], inverse, precision="highest")
-        schur = beyond - jnp.matmul(coupling, jnp.swapaxes(blocks[:, s:], 1, 2), precision="highest")
+        coupling = batched(blocks[:, s:], inverse)
+        schur = beyond - batched(coupling, transposed(blocks[:, s:]))
         eliminated.append((inverse, coupling))
     return eliminated[::-1]
 

@@ -1,6 +1,7 @@
 """Products of blocks of vectors, as XLA computes them fastest."""
 
 from functools import reduce
+from operator import add
 
 import jax
 import jax.numpy as jnp
@@ -52,13 +53,7 @@ def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, 
 
 
 def _written_out(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
-    shape = *matrices.shape[:2], columns.shape[2]
-
-    def term(j: int) -> Array:
-        factors = jax.lax.slice_in_dim(matrices, j, j + 1, axis=2), jax.lax.slice_in_dim(columns, j, j + 1, axis=1)
-        return jax.lax.mul(*(jax.lax.broadcast_in_dim(x, shape, (0, 1, 2)) for x in factors))
-
-    return reduce(jax.lax.add, map(term, range(matrices.shape[2])))
+    return reduce(add, (matrices[:, :, j : j + 1] * columns[:, j : j + 1] for j in range(matrices.shape[2])))
 
 
 def transposed(x: Inexact[Array, "m i j"]) -> Inexact[Array, "m j i"]:
