@@ -1,10 +1,11 @@
 """Products of blocks of vectors."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hks_jax.linear.products import batched_with_columns
+from hks_jax.linear.products import batched_with_columns, of_each_row
 
 
 @pytest.mark.parametrize("count", [3, 600])
@@ -22,3 +23,18 @@ def test_what_is_not_finite_stays_in_its_column(rng):
     np.testing.assert_allclose(
         products[..., 1], np.einsum("mij,mj->mi", matrices, columns[..., 1]), rtol=1e-13, atol=1e-13
     )
+
+
+@pytest.mark.parametrize("count", [1, 8, 11])
+@pytest.mark.parametrize("length", [100, 40_000])
+def test_functions_of_each_row_and_what_belongs_to_them_in_derivatives(rng, count, length):
+    rows, images, factors = (rng.standard_normal(shape) for shape in ((count, length), (count, length), length))
+
+    def product(factors, rows):
+        return of_each_row(lambda row: factors * jnp.roll(row, 1), rows)
+
+    y, back = jax.vjp(jax.jit(product), factors, rows)
+    np.testing.assert_array_equal(y, factors * np.roll(rows, 1, axis=1))
+    of_factors, of_rows = back(jnp.asarray(images))
+    np.testing.assert_allclose(of_factors, np.sum(images * np.roll(rows, 1, axis=1), axis=0), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(of_rows, np.roll(factors * images, -1, axis=1), rtol=1e-14)

@@ -1,8 +1,10 @@
 """Matrices on grids: stencils."""
 
+from functools import reduce
+from operator import add
+
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -10,10 +12,7 @@ from hks_jax.fem.columns import neighbours, stencil, with_rim
 from hks_jax.fem.grid_pattern import GridPattern
 from hks_jax.fem.space import GridSpace, taken
 from hks_jax.linear.operators import OfColumns, PatternedOperator, Places
-
-_ROWS, _LARGE = 8, 1 << 18
-"""Large arrays are multiplied in blocks of so many rows, written out one by one: the transpose, which sums over the
-rows, is then a fused sum and not a reduction, which XLA does many times slower on CPUs."""
+from hks_jax.linear.products import of_each_row
 
 
 class StencilOperator(PatternedOperator):
@@ -38,25 +37,15 @@ class StencilOperator(PatternedOperator):
 
     def apply_nodal(self, x: Float[Array, "*leading_and_shape"]) -> Float[Array, "*leading_and_shape"]:
         """Apply the operator to nodal arrays; rows and columns of nodes that are not free are zero."""
-        shape = self.space.node_shape
-        rows, coefficients = x.reshape(-1, *shape), list(self.coefficients)
+        shape, coefficients = self.space.node_shape, list(self.coefficients)
 
-        # The shifted copies are made again in the transpose: kept, they would be 3^d arrays of the size of x.
-        @jax.checkpoint
-        def product_with(some: Float[Array, "*rows_and_shape"]) -> Float[Array, "*rows_and_shape"]:
+        def product_with(row: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
             # Behind the barrier the neighbours are slices of an array, and not what decides of each node where it is.
-            first, y = some.ndim - len(shape), jnp.zeros((), x.dtype)
-            rimmed = jax.lax.optimization_barrier(with_rim(some, self.space.periodic, first))
-            for c, shifted in zip(coefficients, neighbours(rimmed, first, len(shape)), strict=True):
-                y = y + c * shifted
-            return y
+            rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic, 0))
+            terms = zip(coefficients, neighbours(rimmed, 0, len(shape)), strict=True)
+            return reduce(add, (c * shifted for c, shifted in terms))
 
-        whole = rows.shape[0] - rows.shape[0] % _ROWS
-        if rows.size < _LARGE or whole == 0:
-            return product_with(rows).reshape(x.shape)
-        blocks = rows[:whole].reshape(-1, _ROWS, *shape)
-        done = jax.lax.map(lambda block: jnp.stack([product_with(row) for row in block]), blocks)
-        return jnp.concatenate([done.reshape(whole, *shape), product_with(rows[whole:])]).reshape(x.shape)
+        return of_each_row(product_with, x.reshape(-1, *shape)).reshape(x.shape)
 
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""

@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix, csc_matrix
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear.pattern import Ellpack, Pattern, SparsePattern
+from hks_jax.linear.products import of_each_row
 
 Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
@@ -132,20 +133,19 @@ class SparseOperator(PatternedOperator):
 
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""
-        columns = jnp.moveaxis(x, -1, 0).reshape(self.size, -1)
-        return jnp.moveaxis(self.of_columns()(columns).reshape(self.size, *x.shape[:-1]), 0, -1)
+        return of_each_row(self.of_columns(), x.reshape(-1, self.size)).reshape(x.shape)
 
     def of_columns(self) -> OfColumns:
-        """Return the product with a block of columns."""
+        """Return the product with a block of columns, or with one vector."""
         table = self._places
-        ordered = self.entries.at[table.entries].get(mode="fill", fill_value=0, wrap_negative_indices=False)
+        ordered = list(self.entries.at[table.entries].get(mode="fill", fill_value=0, wrap_negative_indices=False))
 
-        def product(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
-            y = jnp.zeros((), x.dtype)
+        def product(x: Float[Array, "n_dof *b"]) -> Float[Array, "n_dof *b"]:
+            y, one_each = jnp.zeros((), x.dtype), (-1, *[1] * (x.ndim - 1))
             for entries, cols in zip(ordered, table.cols, strict=True):
-                y = y + entries[:, None] * x.at[cols].get(mode="promise_in_bounds")
+                y = y + entries.reshape(one_each) * x.at[cols].get(mode="promise_in_bounds")
             if len(table.others):
-                terms = self.entries[table.others, None] * x[table.other_cols]
+                terms = self.entries[table.others].reshape(one_each) * x[table.other_cols]
                 y = y + jax.ops.segment_sum(terms, table.other_rows, self.size, indices_are_sorted=True)
             return y
 

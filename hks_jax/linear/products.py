@@ -1,5 +1,6 @@
 """Products of blocks of vectors, as XLA computes them fastest."""
 
+from collections.abc import Callable
 from functools import reduce
 from operator import add
 
@@ -13,6 +14,10 @@ from hks_jax.linear import accelerators
 _MANY, _TERMS = 512, 64
 """For how many matrices, of how many columns at most, products on a CPU are written out: others take longer to compile
 than they gain."""
+
+_ROWS, _LARGE = (4, 5, 3, 7, 2), 1 << 18
+"""How many rows of an array of so many numbers are multiplied at a time, which stay in the cache: the first of these by
+which their number can be divided, as what were left over would have to be copied."""
 
 
 def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
@@ -59,6 +64,26 @@ def _written_out(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]
 def transposed(x: Inexact[Array, "m i j"]) -> Inexact[Array, "m j i"]:
     """Return the transposes of a batch of matrices."""
     return jnp.swapaxes(x, 1, 2)
+
+
+# Written out row by row, the derivative by what the function depends on, which sums over the rows, is a fused sum and
+# not a reduction, which XLA does many times slower on CPUs. What the function makes of a row is made again in it: kept,
+# it would be several arrays of the size of all rows.
+def of_each_row(
+    function: Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]], rows: Float[Array, "b *shape"]
+) -> Float[Array, "b *shape"]:
+    """Return a linear function of each row."""
+
+    @jax.checkpoint
+    def of_some(some: Float[Array, "c *shape"]) -> Float[Array, "c *shape"]:
+        return jnp.stack([function(row) for row in some])
+
+    (count, *shape), size = rows.shape, next((size for size in _ROWS if len(rows) % size == 0), _ROWS[0])
+    if rows.size < _LARGE or count < size:
+        return jax.checkpoint(jax.vmap(function))(rows)
+    rest = count % size
+    done = jax.lax.map(of_some, rows[: count - rest].reshape(-1, size, *shape)).reshape(-1, *shape)
+    return jnp.concatenate([done, of_some(rows[count - rest :])]) if rest else done
 
 
 def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
