@@ -80,7 +80,7 @@ def product_with_rim(together: Float[Array, " entries"], x: Float[Array, "*rimme
     """Return the product with columns whose neighbours beyond all sides are there; coefficients `side_by_side`."""
     coefficients = together.reshape(*(n - 2 for n in x.shape[:-1]), -1)
     y = jnp.zeros((), x.dtype)
-    for o, shifted in enumerate(neighbours(x, 0, x.ndim - 1)):
+    for o, shifted in enumerate(neighbours(x, x.ndim - 1)):
         y = y + coefficients[..., o, None] * shifted
     return y
 
@@ -90,15 +90,15 @@ def stencil_outer(
 ) -> Float[Array, "offsets *shape"]:
     """Return Σ_b p[i, b] x[i + o, b] for every offset: the derivative of Σ_b pᵀCx by the coefficients of C."""
     rimmed = with_rim(x, periodic)
-    return jnp.stack([jnp.sum(p * shifted, axis=-1) for shifted in neighbours(rimmed, 0, len(periodic))])
+    return jnp.stack([jnp.sum(p * shifted, axis=-1) for shifted in neighbours(rimmed, len(periodic))])
 
 
-def neighbours(x: Float[Array, "*rimmed"], first: int, dimension: int) -> Iterator[Float[Array, "*shape"]]:
-    """Go through x shifted by each offset along so many axes from the ``first`` on, which are given with their rim."""
-    before, after = (0,) * first, (0,) * (x.ndim - first - dimension)
-    shape = [n - 2 if first <= axis < first + dimension else n for axis, n in enumerate(x.shape)]
+def neighbours(x: Float[Array, "*rimmed"], dimension: int) -> Iterator[Float[Array, "*shape"]]:
+    """Go through x shifted by each offset along its first axes, so many, which are given with their rim."""
+    after = (0,) * (x.ndim - dimension)
+    shape = [n - 2 if axis < dimension else n for axis, n in enumerate(x.shape)]
     for start in product((0, 1, 2), repeat=dimension):
-        start = (*before, *start, *after)
+        start = (*start, *after)
         yield jax.lax.slice(x, start, [s + n for s, n in zip(start, shape, strict=True)])
 
 

@@ -41,8 +41,8 @@ class StencilOperator(PatternedOperator):
 
         def product_with(row: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
             # Behind the barrier the neighbours are slices of an array, and not what decides of each node where it is.
-            rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic, 0))
-            terms = zip(coefficients, neighbours(rimmed, 0, len(shape)), strict=True)
+            rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic))
+            terms = zip(coefficients, neighbours(rimmed, len(shape)), strict=True)
             return reduce(add, (c * shifted for c, shifted in terms))
 
         return of_each_row(product_with, x.reshape(-1, *shape)).reshape(x.shape)

@@ -78,7 +78,8 @@ def of_each_row(
     def of_some(some: Float[Array, "c *shape"]) -> Float[Array, "c *shape"]:
         return jnp.stack([function(row) for row in some])
 
-    (count, *shape), size = rows.shape, next((size for size in _ROWS if len(rows) % size == 0), _ROWS[0])
+    count, *shape = rows.shape
+    size = next((size for size in _ROWS if count % size == 0), _ROWS[0])
     if rows.size < _LARGE or count < size:
         return jax.checkpoint(jax.vmap(function))(rows)
     rest = count % size
