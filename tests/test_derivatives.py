@@ -538,6 +538,6 @@ def test_in_float32_rows_are_grouped_for_the_accuracy_that_there_is():
         return group_blocks(dissection, lambda row: 201 - row, np.dtype(np.float32), 200, tolerance)
 
     asked, reached = groups(1e-8), groups(attainable(1e-8, np.float32))
-    np.testing.assert_array_equal(asked.of_block, reached.of_block)
+    np.testing.assert_array_equal(asked.first, reached.first)
     many = group_blocks(dissection, lambda row: 201 - row, np.dtype(np.float32), 200, 1e-8, solves=100)
     assert len(many.first) > len(asked.first)

@@ -18,6 +18,7 @@ from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.masks import mask_for
 from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.linear_map import with_transpose
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products
 from hks_jax.traced import is_traced
@@ -85,10 +86,10 @@ def _lowest_jvp(
     quiet = is_traced(primals) or solver.adjoint.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
     prepared = prepare(solver.adjoint, k, pencil, values)
-    tangents = tangents_of(solver.adjoint, k, telling, prepared, pencil, change, values, vectors)
-    values, vectors, following = _cut(values, vectors, k)
+    eigenvalues, functions, following = _cut(values, vectors, k)
+    tangents = tangents_of(solver.adjoint, telling, prepared, pencil, change, values, vectors, functions)
     constants = following, complete_below
-    return (values, vectors, vectors, *constants), (*tangents, *map(jnp.zeros_like, constants))
+    return (eigenvalues, functions, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
 def _solve_pencil(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: Report) -> RawPairs:
@@ -116,23 +117,25 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
 
 
 # What else were kept for the transpose would be copies of the eigenvectors.
-@partial(jax.jit, static_argnames=("adjoint", "k", "telling"))
-@partial(jax.checkpoint, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnames=("adjoint", "telling"))
+@partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(
     adjoint: Adjoint,
-    k: int,
     telling: Telling,
     prepared: Any,
     pencil: SymmetricPencil,
     change: SymmetricPencil,
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
+    functions: Float[Array, "k n_dof"],
 ) -> Lowest:
     """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs.
 
-    The pairs come in the order that the adjoint expects, for which it is prepared.
+    The pairs come in the order that the adjoint expects, for which it is prepared; the eigenvectors of the first k come
+    alone as well, so that they need not be copied.
     """
-    eigenvalues, functions, guards = values[:k], vectors[:k], vectors[k:]
+    k = len(functions)
+    eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     gap = eigenvalues[:, None] - values
@@ -142,11 +145,23 @@ def tangents_of(
     # Apart from the guards: reverse mode of the frame needs the product with these alone.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
-    frame = combine(inverse[:, k:] * inner_products(guards, force), guards)
+    frame = _onto(guards, inverse[:, k:], force)
     if _solves(pencil, k, len(values)):
         frame = frame + _outside(adjoint, telling, prepared, pencil, values, vectors, -force)
     d_vectors = combine(within, functions) + frame
     return jnp.diagonal(into), d_vectors, frame
+
+
+# Symmetric, it is its own transpose; the one that JAX makes is several times as slow.
+def _onto(
+    guards: Float[Array, "g n_dof"], factors: Float[Array, "k g"], force: Float[Array, "k n_dof"]
+) -> Float[Array, "k n_dof"]:
+    """Return Σⱼ cᵢⱼ (gⱼ·fᵢ) gⱼ."""
+
+    def onto(force: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        return combine(factors * inner_products(guards, force), guards)
+
+    return with_transpose(onto, onto, force)
 
 
 def _outside(
@@ -169,8 +184,10 @@ def _outside(
 
     # No force acts on the constants: they stay in the kernel of the stiffness. In reverse mode, where their rows are
     # cotangents, it is their solutions that do not count.
-    x = jax.lax.custom_linear_solve(matvec, rhs.at[:n_null].set(0), solve, symmetric=True)
-    return x.at[:n_null].set(0)
+    def without_constants(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        return jnp.where(np.arange(len(x))[:, None] < n_null, 0, x)
+
+    return without_constants(jax.lax.custom_linear_solve(matvec, without_constants(rhs), solve, symmetric=True))
 
 
 # What `in_turn` calls are functions of the module, not methods, so that they are the same objects in every call.

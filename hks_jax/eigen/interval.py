@@ -47,9 +47,9 @@ def _in_interval_jvp(
     telling: Telling = "error" if throw else "nothing" if is_traced(primals) else "warning"
     adjoint = InteriorAdjoint(solver.adjoint.tolerance)
     prepared = prepare(adjoint, k, pencil, values)
-    tangents = tangents_of(adjoint, k, telling, prepared, pencil, change, values, vectors)
-    values, vectors = values[:k], vectors[:k]
-    return (values, vectors, vectors, bound), (*tangents, jnp.zeros_like(bound))
+    functions = vectors[:k]
+    tangents = tangents_of(adjoint, telling, prepared, pencil, change, values, vectors, functions)
+    return (values[:k], functions, functions, bound), (*tangents, jnp.zeros_like(bound))
 
 
 def _solve(solver: BlockLanczos | Dense, k: int, guards: int, report: Report, pencil: LocatedPencil) -> RawPairs:

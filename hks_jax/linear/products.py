@@ -31,6 +31,8 @@ def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c
 
 def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
     """Return the inner products with rows, as what comes after takes them fastest: the small factor on the left."""
+    if len(basis) < len(block):
+        return products_with_columns(block, basis.T)
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
 
 

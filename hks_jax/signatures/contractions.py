@@ -6,16 +6,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.products import products_with_columns, row_blocks
+from hks_jax.linear.quadratic_forms import quadratic_forms
 from hks_jax.static_array import StaticArray
-
-_ROWS = 64
-"""Functions whose products with all others are computed together, or left out."""
 
 
 class Contraction(eqx.Module):
@@ -27,9 +22,9 @@ class Contraction(eqx.Module):
 
     @abstractmethod
     def mixed(
-        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
-    ) -> Float[Array, "*s n"]:
-        """Return the reading for one symmetric C, zero between functions that do not matter."""
+        self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
+    ) -> Float[Array, "m *s n"]:
+        """Return the reading for each symmetric C, negligible between functions that do not matter."""
 
 
 class Diagonal(Contraction):
@@ -39,36 +34,11 @@ class Diagonal(Contraction):
         """Return Σᵢ cᵢ φᵢ(x)²."""
         return _matmul(weights, jnp.square(vectors))
 
-    # At large times only the first few functions matter. Of C the rows up to the last of them are enough, with twice
-    # the entries in columns that do not matter. The transpose has its large factor on the left, where XLA is fastest.
     def mixed(
-        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
-    ) -> Float[Array, " n"]:
+        self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
+    ) -> Float[Array, "m n"]:
         """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x)."""
-        (k, n), size = vectors.shape, min(_ROWS, len(vectors))
-        starts, _ = row_blocks(k, size)
-        rows = starts[:, None] + np.arange(size)
-        used = matters[rows] & (rows >= size * np.arange(len(starts))[:, None])  # each row once
-        blocks = jnp.where(used[..., None], jnp.where(matters, matrix, 2 * matrix)[rows], 0)
-        count = jnp.max(jnp.where(jnp.any(used, axis=1), np.arange(1, len(starts) + 1), 0))
-
-        def own(number: Array) -> Float[Array, "size n"]:
-            return jax.lax.dynamic_slice_in_dim(vectors, jnp.asarray(starts)[number], size)
-
-        def forward(blocks: Float[Array, "blocks size k"]) -> Float[Array, " n"]:
-            def add(number: Array, total: Array) -> Array:
-                return total + jnp.sum(own(number) * _matmul(blocks[number], vectors), axis=0)
-
-            return jax.lax.fori_loop(0, count, add, jnp.zeros(n, vectors.dtype))
-
-        def backward(weights: Float[Array, " n"]) -> Float[Array, "blocks size k"]:
-            def put(number: Array, blocks: Array) -> Array:
-                columns = jax.lax.optimization_barrier((own(number) * weights).T)
-                return blocks.at[number].set(products_with_columns(vectors, columns).T)
-
-            return jax.lax.fori_loop(0, count, put, jnp.zeros((*rows.shape, k), vectors.dtype))
-
-        return with_transpose(forward, backward, blocks)
+        return quadratic_forms(matrices, vectors, matters)
 
 
 class _FromSources(Contraction):
@@ -89,10 +59,10 @@ class Columns(_FromSources):
         return _matmul(weights[:, None, :] * self.at_sources(vectors).T, vectors)
 
     def mixed(
-        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
-    ) -> Float[Array, "s n"]:
+        self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
+    ) -> Float[Array, "m s n"]:
         """Return Σᵢⱼ Cᵢⱼ φᵢ(x_s) φⱼ(x)."""
-        return _matmul(_matmul(self.at_sources(vectors).T, matrix), vectors)
+        return _matmul(_matmul(self.at_sources(vectors).T, matrices), vectors)
 
 
 class SquaredDistances(_FromSources):
@@ -103,17 +73,22 @@ class SquaredDistances(_FromSources):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s nodes"]:
         """Return Σᵢ cᵢ (φᵢ(x) − φᵢ(x_s))²."""
-        return jnp.moveaxis(self._map(vectors, lambda apart: _matmul(weights, jnp.square(apart))), 0, 1)
+        return self._map(vectors, lambda apart: _matmul(weights, jnp.square(apart)))
 
     def mixed(
-        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
-    ) -> Float[Array, "s nodes"]:
+        self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
+    ) -> Float[Array, "m s nodes"]:
         """Return Σᵢⱼ Cᵢⱼ (φᵢ(x) − φᵢ(x_s)) (φⱼ(x) − φⱼ(x_s))."""
-        return self._map(vectors, lambda apart: jnp.sum(apart * _matmul(matrix, apart), axis=0))
 
-    def _map(self, vectors: Float[Array, "k n"], reading: Callable[[Array], Array]) -> Array:
+        def reading(apart: Float[Array, "k nodes"]) -> Float[Array, "m nodes"]:
+            return jax.lax.map(lambda matrix: jnp.sum(apart * _matmul(matrix, apart), axis=0), matrices)
+
+        return self._map(vectors, reading)
+
+    def _map(self, vectors: Float[Array, "k n"], reading: Callable[[Array], Array]) -> Float[Array, "m s nodes"]:
         nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], -1)
-        return jax.lax.map(lambda source: reading(nodal - source[:, None]), self.at_sources(vectors).T)
+        readings = jax.lax.map(lambda source: reading(nodal - source[:, None]), self.at_sources(vectors).T)
+        return jnp.moveaxis(readings, 0, 1)
 
 
 class Applied(Contraction):
@@ -132,10 +107,10 @@ class Applied(Contraction):
         return _matmul(weights[:, None, :] * self._coefficients(vectors), vectors)
 
     def mixed(
-        self, matrix: Float[Array, "k k"], vectors: Float[Array, "k n"], matters: Bool[Array, " k"]
-    ) -> Float[Array, "s n"]:
+        self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
+    ) -> Float[Array, "m s n"]:
         """Return Σᵢⱼ Cᵢⱼ (φᵢ·w) φⱼ(x)."""
-        return _matmul(_matmul(self._coefficients(vectors), matrix), vectors)
+        return _matmul(_matmul(self._coefficients(vectors), matrices), vectors)
 
     def along(self, tangent: "Contraction") -> "Applied":
         """Return the reading's derivative along a tangent of itself: it is linear in the functionals."""

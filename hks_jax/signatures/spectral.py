@@ -20,6 +20,8 @@ from hks_jax.static_array import StaticArray
 
 _ROWS = 128
 """Eigenvectors whose products with all others are computed together: what is computed from them takes memory."""
+_FILTERS = 8
+"""Filters whose matrices (k, k) are computed together, and read the eigenvectors together."""
 
 
 def spectral_diagonal(
@@ -144,12 +146,18 @@ def _tangent(
     weights = _all_weights(filters, values, kept)
     _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (vectors,), (d_frame,))
 
-    def inner(one: Filter) -> Array:
+    def mixing(one: Filter) -> tuple[Float[Array, "k k"], Bool[Array, " k"]]:
         of_f, of_lambda_f = _divided_differences(one, values, kept)
         matters = _matters(_weights(one, values, kept), jnp.diagonal(of_f), values)
-        return contraction.mixed(of_f * stiffness - of_lambda_f * mass, vectors, matters)
+        return of_f * stiffness - of_lambda_f * mass, matters
 
-    return outer + jax.lax.map(inner, filters)
+    def inner(some: Filter) -> Array:
+        matrices, matters = jax.lax.map(mixing, some)
+        return contraction.mixed(matrices, vectors, matters)
+
+    starts, place = row_blocks(len(weights), min(_FILTERS, len(weights)))
+    some = starts[:, None] + np.arange(min(_FILTERS, len(weights)))
+    return outer + jax.lax.map(inner, jax.tree.map(lambda leaf: leaf[some], filters))[place]
 
 
 def _weights(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:

@@ -25,12 +25,12 @@ from hks_jax.eigen.complement.common import (
     group_numbers,
     shifts_between,
 )
-from hks_jax.eigen.complement.in_blocks import solve_in_blocks, without_known
+from hks_jax.eigen.complement.in_blocks import cleaned, projected, solve_in_blocks, without_known
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, products_with_columns
+from hks_jax.linear.products import products_with_columns, times
 
 BLOCK = 16
 """Rows solved at once."""
@@ -49,12 +49,10 @@ class Groups(NamedTuple):
     """How rows are grouped; static.
 
     Attributes:
-        of_block: (blocks,) the group of each block of rows.
         first: (groups,) the first row of each group.
         last: (groups,) its last row.
     """
 
-    of_block: Int[np.ndarray, " blocks"]
     first: Int[np.ndarray, " groups"]
     last: Int[np.ndarray, " groups"]
 
@@ -106,7 +104,7 @@ def factorise_each(dissection: Dissection, pencil: SymmetricPencil, shifts: Floa
     return factors.downward, factors.upward, factors.negative
 
 
-def of_group(factors: Factorisation, group: Int[Array, ""]) -> Factorisation:
+def one_of(factors: Factorisation, group: Int[Array, ""]) -> Factorisation:
     """Return one of the stacked factorisations."""
     matrices = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.negative))
     return Factorisation(factors.dissection, *matrices)
@@ -123,25 +121,29 @@ def _solve(
 ) -> Float[Array, "k n_dof"]:
     k, beyond, window = rhs.shape[0], first_beyond(values), min(WINDOW, values.size)
     tolerance = attainable(adjoint.tolerance, rhs.dtype)
-    of_block = jnp.asarray(_group(factors.dissection, values, k, adjoint).of_block)
+    clean = without_known(pencil, vectors)
 
-    def solve_block(number: Array, b: Array, wanted: Array, shifts: Array) -> Array:
-        factor = of_group(factors, of_block[number])
+    def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
+        factor = one_of(factors, group)
         nearest = jnp.clip(factor.negative - window // 2, 0, values.size - window)
         near = jax.lax.dynamic_slice_in_dim(vectors, nearest, window)
-        near_images = pencil.mass.apply(near)
+        return factor, near.T, pencil.mass.apply(near)
+
+    def solve_block(group: tuple[Factorisation, Array, Array], b: Array, wanted: Array, shifts: Array) -> Array:
+        factor, near, near_images = group
 
         # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
         # next to σ above all, which is why no others are taken out before the end, or before that makes it start again.
         def precondition(r: Array) -> Array:
             z = factor.solve_columns(r)
-            return z - combine(products_with_columns(near_images, z).T, near).T
+            return z - times(near, products_with_columns(near_images, z))
 
-        product = definite_product(pencil, shifts, beyond)
-        return conjugate_gradients(product, precondition, b.T, wanted, clean=without_known(pencil, vectors)).T
+        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted, clean=clean)
 
-    clean, amplified = bool(_GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance), amplification(values, k)
-    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, tolerance, amplified, clean, values[:k])
+    left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
+    first = _group(factors.dissection, values, k, adjoint).first
+    x = solve_in_blocks(of_group, solve_block, BLOCK, first, left, wanted, values[:k])
+    return x if _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance else cleaned(pencil, vectors, x)
 
 
 def _group(dissection: Dissection, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint) -> Groups:
@@ -168,5 +170,5 @@ def group_blocks(
     entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
     room = max(int(_MEMORY / (entries * dtype.itemsize)), 1)
     number = group_numbers(distance, k * solves, attainable(tolerance, dtype), room)
-    _, first, of_block = np.unique(number, return_index=True, return_inverse=True)
-    return Groups(of_block, start[first], np.append(start[first[1:]], k) - 1)
+    _, first = np.unique(number, return_index=True)
+    return Groups(start[first], np.append(start[first[1:]], k) - 1)

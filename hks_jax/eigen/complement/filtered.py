@@ -10,12 +10,13 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import amplification, attainable, definite_product, first_beyond
-from hks_jax.eigen.complement.in_blocks import solve_in_blocks
+from hks_jax.eigen.complement.in_blocks import projected, solve_in_blocks
 from hks_jax.eigen.filter.coarsening import finest_level
 from hks_jax.eigen.filter.damping import Band, correction, degree_for, upper_end
 from hks_jax.fem.columns import to_columns, to_rows
@@ -91,7 +92,7 @@ def _solve(
     def without_known(x: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
         return x - combine(inner_products(images, x), vectors)
 
-    def one_block(number: Array, b: Array, wanted: Array, shifts: Array, references: Array) -> Float[Array, "b n_dof"]:
+    def one_block(_: None, b: Array, wanted: Array, shifts: Array, references: Array) -> Float[Array, "n_dof b"]:
         degree = jnp.ceil(jnp.clip(degree_for(band, jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
         def precondition(r: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
@@ -99,7 +100,8 @@ def _solve(
             z = correction(level, periodic, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
             return without_known(-space.restrict(to_rows(z).reshape(-1, *level.shape))).T
 
-        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b.T, wanted).T
+        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
 
-    own = values[:k], quotients[:k]
-    return solve_in_blocks(one_block, block, pencil, vectors, rhs, tolerance, amplification(values, k), True, *own)
+    left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
+    one_group = np.zeros(1, int)
+    return solve_in_blocks(lambda _: None, one_block, block, one_group, left, wanted, values[:k], quotients[:k])

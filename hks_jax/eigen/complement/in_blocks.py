@@ -1,15 +1,16 @@
 """Right-hand sides of solves on the complement of known eigenvectors, a few at a time; in JAX."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.complement.common import norms, wanted_errors
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, inner_products, products_with_columns
+from hks_jax.linear.products import combine, inner_products, products_with_columns, row_blocks
 
 _ROWS = 128
 """Rows that the known eigenvectors are taken out of at once: fewer read them more often from memory."""
@@ -27,50 +28,93 @@ def without_known(
     return without
 
 
-# No array but the right-hand sides and the solution is as large as the eigenvectors.
-def solve_in_blocks(
-    solve: Callable[..., Float[Array, "b n_dof"]],
-    size: int,
+# All that is as large as the eigenvectors is computed in place: to fill a new array of that size, whose memory the
+# system has to provide, takes as long as products with it.
+def projected(
     pencil: SymmetricPencil,
     vectors: Float[Array, "p n_dof"],
     rhs: Float[Array, "k n_dof"],
     tolerance: float,
     amplified: Float[Array, " k"],
-    clean: bool,
-    *of_rows: Float[Array, " k"],
-) -> Float[Array, "k n_dof"]:
-    """Solve for blocks of rows, one after another, on the complement of the eigenvectors Φ.
+) -> tuple[Float[Array, "k n_dof"], Float[Array, " k"]]:
+    """Return Q rhs, Q = I − MΦΦᵀ, and the `wanted_errors` of its rows.
 
     Args:
-        solve: returns x for (number, Q rhs, wanted, *of_rows) of one block, Q = I − MΦΦᵀ.
-        size: rows of a block.
         pencil: K and M.
         vectors: Φ, as rows.
         rhs: the right-hand sides.
         tolerance: the accuracy of the largest row.
         amplified: how much larger the solution of a row becomes than that of another as large.
-        clean: whether x has nothing of Φ that counts; else it is taken out.
-        of_rows: what else there is of each row.
     """
-    k, lumped = len(rhs), pencil.mass.diagonal()
-    count, parts = -(-k // size), -(-k // _ROWS)
-    blocks = -(-count // parts)
-    before = norms(rhs, lumped)
-    largest = jnp.max(before)
 
-    def solve_part(part: tuple[Array, ...]) -> Float[Array, "rows n_dof"]:
-        number, at, before, amplified, *own = part
-        b = rhs.at[at].get(mode="clip")
+    lumped = pencil.mass.diagonal()
+
+    def project(b: Float[Array, "rows n_dof"], _: Array) -> tuple[Float[Array, "rows n_dof"], Float[Array, " rows"]]:
         left = b - pencil.mass.apply(combine(inner_products(vectors, b), vectors))
-        wanted = wanted_errors(before, norms(left, lumped), largest, amplified, tolerance, rhs.dtype)
-        wanted = jnp.where(at < k, wanted, jnp.inf)
-        own = [rows.reshape(blocks, size, *rows.shape[1:]) for rows in (left, wanted, *own)]
-        x = jax.lax.map(lambda block: solve(*block), (number, *own)).reshape(b.shape)
-        return x if clean else x - combine(inner_products(vectors, pencil.mass.apply(x)), vectors)
+        return left, norms(left, lumped)
 
-    # The last part is filled up with rows that have nothing to solve.
-    number = np.minimum(np.arange(parts * blocks), count - 1).reshape(parts, blocks)
-    at = np.arange(parts * blocks * size).reshape(parts, -1)
-    own = [rows[np.minimum(at, k - 1)] for rows in (before, amplified, *of_rows)]
-    x = jax.lax.map(solve_part, (jnp.asarray(number), jnp.asarray(at), *own))
-    return x.reshape(at.size, -1)[:k]
+    before = norms(rhs, lumped)
+    left, after = _in_parts(project, rhs, before)
+    return left, wanted_errors(before, after, jnp.max(before), amplified, tolerance, rhs.dtype)
+
+
+def cleaned(
+    pencil: SymmetricPencil, vectors: Float[Array, "p n_dof"], x: Float[Array, "k n_dof"]
+) -> Float[Array, "k n_dof"]:
+    """Return x − ΦΦᵀMx, of rows."""
+
+    def clean(x: Float[Array, "rows n_dof"]) -> tuple[Float[Array, "rows n_dof"]]:
+        return (x - combine(inner_products(vectors, pencil.mass.apply(x)), vectors),)
+
+    return _in_parts(clean, x)[0]
+
+
+def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[Array, ...]:
+    """Return the projections of rows, of some at a time: of a few of them twice, which changes nothing."""
+    size = min(_ROWS, len(rows[0]))
+    starts, _ = row_blocks(len(rows[0]), size)
+
+    def step(number: Array, rows: tuple[Array, ...]) -> tuple[Array, ...]:
+        start = jnp.asarray(starts)[number]
+        parts = project(*(jax.lax.dynamic_slice_in_dim(each, start, size) for each in rows))
+        whole = zip(rows, parts, strict=True)
+        return tuple(jax.lax.dynamic_update_slice_in_dim(each, part, start, axis=0) for each, part in whole)
+
+    return jax.lax.fori_loop(0, len(starts), step, rows)
+
+
+def solve_in_blocks(
+    of_group: Callable[[Int[Array, ""]], Any],
+    solve: Callable[..., Float[Array, "n_dof b"]],
+    size: int,
+    first: Int[np.ndarray, " groups"],
+    rhs: Float[Array, "k n_dof"],
+    *of_rows: Float[Array, " k"],
+) -> Float[Array, "k n_dof"]:
+    """Solve for blocks of rows, one after another.
+
+    Args:
+        of_group: returns what the blocks of a group share.
+        solve: returns x for (what the group shares, rhs, *of_rows) of one block; x and rhs are columns.
+        size: rows of a block.
+        first: the first row of each group of blocks.
+        rhs: the right-hand sides.
+        of_rows: what else there is of each row; the first of it is the error wanted.
+    """
+    k, n_groups = len(rhs), len(first)
+    starts, _ = row_blocks(k, min(size, k))
+    blocks = jnp.asarray(np.append(first // size, len(starts)))
+
+    def solve_group(group: Array, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        shared = of_group(group)
+
+        def solve_block(number: Array, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+            start = jnp.asarray(starts)[number]
+            b, wanted, *own = (jax.lax.dynamic_slice_in_dim(each, start, min(size, k)) for each in (x, *of_rows))
+            unsolved = start + np.arange(len(b)) >= number * size  # the last block may overlap the one before
+            solution = solve(shared, b.T, jnp.where(unsolved, wanted, jnp.inf), *own).T
+            return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
+
+        return jax.lax.fori_loop(blocks[group], blocks[group + 1], solve_block, x)
+
+    return jax.lax.fori_loop(0, n_groups, solve_group, rhs)

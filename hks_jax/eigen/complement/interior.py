@@ -21,17 +21,17 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import SINGULAR, attainable, middles_of_gaps
-from hks_jax.eigen.complement.factorised import BLOCK, WINDOW, Factors, Groups, factorise_each, group_blocks, of_group
-from hks_jax.eigen.complement.in_blocks import solve_in_blocks, without_known
+from hks_jax.eigen.complement.factorised import BLOCK, WINDOW, Factors, Groups, factorise_each, group_blocks, one_of
+from hks_jax.eigen.complement.in_blocks import cleaned, projected, solve_in_blocks, without_known
 from hks_jax.eigen.located import LocatedPencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation
-from hks_jax.linear.products import combine, products_with_columns
+from hks_jax.linear.products import products_with_columns, times
 
 Shifted = tuple[Factorisation, Float[Array, " groups"]]
 """Factorisations of K − σM, stacked, and their shifts."""
@@ -95,30 +95,30 @@ def _solve(
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     low, high = _left(pencil, values)
     amplified = (high - low) / 2 / jnp.minimum(high - values[:k], values[:k] - low)
-    of_block = jnp.asarray(_group(factors.dissection, values, k, tolerance).of_block)
+    clean = without_known(pencil, vectors)
 
     def inner(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
         return jnp.sum(x * mass(y), axis=0)
 
-    def solve_block(number: Array, b: Array, wanted: Array, eigenvalues: Array) -> Array:
-        group = of_block[number]
-        factor = of_group(factors, group)
-        nearest = jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]
-        near = vectors[nearest]
-        near_images = pencil.mass.apply(near)
+    def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
+        near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]]
+        return one_of(factors, group), near.T, pencil.mass.apply(near)
+
+    def solve_block(group: tuple[Factorisation, Array, Array], b: Array, wanted: Array, eigenvalues: Array) -> Array:
+        factor, near, near_images = group
 
         def product(x: Float[Array, "n b"]) -> tuple[Float[Array, "n b"], Float[Array, " b"]]:
             return factor.solve_columns(stiffness(x) - eigenvalues * mass(x)), SINGULAR * inner(x, x)
 
         # Of what rounding leaves of the known eigenvectors, A amplifies those next to σ alone.
         def without_near(x: Float[Array, "n b"]) -> Float[Array, "n b"]:
-            return x - combine(products_with_columns(near_images, x).T, near).T
+            return x - times(near, products_with_columns(near_images, x))
 
-        clean = without_known(pencil, vectors)
-        return conjugate_gradients(product, without_near, factor.solve_columns(b.T), wanted, inner, clean).T
+        return conjugate_gradients(product, without_near, factor.solve_columns(b), wanted, inner, clean)
 
-    accuracy = attainable(tolerance, rhs.dtype)
-    return solve_in_blocks(solve_block, BLOCK, pencil, vectors, rhs, accuracy, amplified, False, values[:k])
+    left, wanted = projected(pencil, vectors, rhs, attainable(tolerance, rhs.dtype), amplified)
+    first = _group(factors.dissection, values, k, tolerance).first
+    return cleaned(pencil, vectors, solve_in_blocks(of_group, solve_block, BLOCK, first, left, wanted, values[:k]))
 
 
 def _left(pencil: LocatedPencil, values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
