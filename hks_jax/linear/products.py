@@ -32,7 +32,7 @@ def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c
 def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
     """Return the inner products with rows, as what comes after takes them fastest: the small factor on the left."""
     if len(basis) < len(block):
-        return products_with_columns(block, basis.T)
+        return products_with_columns(block, basis.T)  # the larger factor on the left
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
 
 

@@ -46,7 +46,6 @@ def projected(
         tolerance: the accuracy of the largest row.
         amplified: how much larger the solution of a row becomes than that of another as large.
     """
-
     lumped = pencil.mass.diagonal()
 
     def project(b: Float[Array, "rows n_dof"], _: Array) -> tuple[Float[Array, "rows n_dof"], Float[Array, " rows"]]:
