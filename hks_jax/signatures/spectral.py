@@ -155,8 +155,9 @@ def _tangent(
         matrices, matters = jax.lax.map(mixing, some)
         return contraction.mixed(matrices, vectors, matters)
 
-    starts, place = row_blocks(len(weights), min(_FILTERS, len(weights)))
-    some = starts[:, None] + np.arange(min(_FILTERS, len(weights)))
+    together = min(_FILTERS, len(weights))
+    starts, place = row_blocks(len(weights), together)
+    some = starts[:, None] + np.arange(together)
     return outer + jax.lax.map(inner, jax.tree.map(lambda leaf: leaf[some], filters))[place]
 
 

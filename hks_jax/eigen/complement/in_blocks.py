@@ -88,20 +88,22 @@ def solve_in_blocks(
     size: int,
     first: Int[np.ndarray, " groups"],
     rhs: Float[Array, "k n_dof"],
+    wanted: Float[Array, " k"],
     *of_rows: Float[Array, " k"],
 ) -> Float[Array, "k n_dof"]:
     """Solve for blocks of rows, one after another.
 
     Args:
         of_group: returns what the blocks of a group share.
-        solve: returns x for (what the group shares, rhs, *of_rows) of one block; x and rhs are columns.
+        solve: returns x for (what the group shares, rhs, wanted, *of_rows) of one block; x and rhs are columns.
         size: rows of a block.
         first: the first row of each group of blocks.
         rhs: the right-hand sides.
-        of_rows: what else there is of each row; the first of it is the error wanted.
+        wanted: the error wanted of each; where it is infinite there is nothing to solve.
+        of_rows: what else there is of each row.
     """
-    k, n_groups = len(rhs), len(first)
-    starts, _ = row_blocks(k, min(size, k))
+    size = min(size, len(rhs))
+    starts, _ = row_blocks(len(rhs), size)
     blocks = jnp.asarray(np.append(first // size, len(starts)))
 
     def solve_group(group: Array, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
@@ -109,11 +111,11 @@ def solve_in_blocks(
 
         def solve_block(number: Array, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
             start = jnp.asarray(starts)[number]
-            b, wanted, *own = (jax.lax.dynamic_slice_in_dim(each, start, min(size, k)) for each in (x, *of_rows))
-            unsolved = start + np.arange(len(b)) >= number * size  # the last block may overlap the one before
-            solution = solve(shared, b.T, jnp.where(unsolved, wanted, jnp.inf), *own).T
+            b, error, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in (x, wanted, *of_rows))
+            unsolved = start + np.arange(size) >= number * size  # the last block may overlap the one before
+            solution = solve(shared, b.T, jnp.where(unsolved, error, jnp.inf), *own).T
             return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
 
         return jax.lax.fori_loop(blocks[group], blocks[group + 1], solve_block, x)
 
-    return jax.lax.fori_loop(0, n_groups, solve_group, rhs)
+    return jax.lax.fori_loop(0, len(first), solve_group, rhs)
