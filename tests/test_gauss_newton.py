@@ -1,5 +1,6 @@
 """The linear systems of Gauss–Newton steps: conjugate gradients and their preconditioners."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.inverse.conformal import conformal_information
+from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.method import choose_inner_product
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.inverse.unknowns import Nodal, nodes_of
@@ -63,6 +65,26 @@ def test_nothing_and_nan_are_told_apart():
     assert not x.any()
     x, _ = solve(jnp.eye(5), 1, jnp.full(5, jnp.nan), 1e-3)
     assert jnp.isnan(x).all()
+
+
+@pytest.mark.parametrize(("changes", "tight", "done"), [
+    ((50, 10), False, False),  # the next one may be 2
+    ((50, 6), True, False),
+    ((50, 6, 0.9), True, True),
+    ((50, 10, 0.9), True, False),  # solved as those before
+    ((0.5,), True, False),
+])  # fmt: skip
+def test_only_a_step_with_a_tight_linear_system_may_be_the_last(changes, tight, done):
+    """Steps are in tolerances; as soon as the next is expected to be below one, its system is solved to more digits."""
+    optimiser = GaussNewton(1e-3)
+    state, y = optimiser.descent.init(jnp.zeros(4)), jnp.zeros(4)
+    state = optimiser.descent.accepted(y, state)
+    for change in changes:
+        state = eqx.tree_at(lambda s: s.gradient, state, -jnp.ones(4))
+        scale = 1e-3 * change / (1 - 1e-3 * change)  # a step s from 0 is s / (1 + s), relative to what it leads to
+        state = optimiser.descent.accepted(y + scale, eqx.tree_at(lambda s: s.values, state, y))
+    np.testing.assert_allclose(state.change, changes[-1], rtol=1e-6)
+    assert (bool(state.tight), bool(state.done)) == (tight, done)
 
 
 def preconditioner(field, times):

@@ -1,9 +1,11 @@
 """A preconditioner for fits of conformal factors to heat kernel signatures."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.smoothing import InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Nodal, Values
 
@@ -53,6 +55,7 @@ class ConformalInformation(Preconditioner):
         return back([weight * slope for weight, slope in zip(self.weights, slopes, strict=True)])[0] / self.root
 
 
+@jit_quickly(eqx.filter_jit)
 def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Array, " n_times"]) -> ConformalInformation:
     """Return the preconditioner for signatures at these times.
 

@@ -95,9 +95,10 @@ def fit_metric(
             default a tenth of the domain, and 0 for ``"conformal"`` without noise.
         tolerance: what the unknowns u still change, relative to 1 + |u| (root mean square over all of them), when it
             has converged: both the last step and what is left by it and the one before, were they the beginning of a
-            geometric series, are below it; after this the linear systems are solved to 30 times more digits, with three
-            times as many products, and a step of that kind must meet it too. Directions that so many products do not
-            find are not in it: `identifiability` tells of them. (Solvers of optimistix: the last step alone.)
+            geometric series, are below it. As soon as the next step is likely to be, the linear systems are solved 30
+            times more exactly, with three times as many products: only a step of that kind may be the last. Directions
+            that so many products do not find are not in it: `identifiability` tells of them. (Solvers of optimistix:
+            the last step alone.)
         max_steps: steps per stage.
         continuation: stages: the first fits the largest times alone, the last all of them.
         starts: how often to start, the first time from ``init``, then from random smooth changes of it; the best wins.

@@ -16,7 +16,7 @@ from hks_jax.inverse.unknowns import Values
 from hks_jax.linear.orthogonal_residuals import orthogonal_conjugate_gradients
 
 _TIGHTER, _LONGER = 30, 3
-"""By what the linear systems are solved more exactly before a fit counts as converged."""
+"""By what the linear systems are solved more exactly in steps that may be the last."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
 """What part of the promised reduction a step must keep to be taken, and to let damping fall; what a worse one costs."""
 _FREE = 0.01
@@ -87,8 +87,10 @@ class DampedDescent(eqx.Module):
         damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
         settled = moved & (remaining_change(change, state.change) < 1)
+        # The next step may be the last: if steps go on to shrink like this, it is below the tolerance.
+        near = moved & jnp.isfinite(state.change) & (change**2 < state.change)
         change = jnp.where(moved, change, jnp.inf)
-        tight, done = state.tight | settled, state.tight & settled
+        tight, done = state.tight | near | settled, state.tight & settled
         return _State(y, state.gradient, state.promised, change, damped, tight, done)
 
     def done(self, step_size: Array, state: _State) -> Bool[Array, ""]:
@@ -165,8 +167,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         damping: μ of the first step, relative to the scale of the data.
         growth: by what μ is divided after a step that kept what the linearisation promised.
         inner_product: B, in which steps are small.
-        inner_tolerance: reduction of the linear residual in each step; the last steps go 30 times further.
-        inner_steps: at most so many products with JᵀJ in each step; in the last steps three times as many.
+        inner_tolerance: reduction of the linear residual in each step; steps that may be the last go 30 times further.
+        inner_steps: at most so many products with JᵀJ in each step; in steps that may be the last three times as many.
         preconditioner: of the conjugate gradients; B by default.
     """
 
