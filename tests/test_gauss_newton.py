@@ -87,6 +87,21 @@ def test_only_a_step_with_a_tight_linear_system_may_be_the_last(changes, tight, 
     assert (bool(state.tight), bool(state.done)) == (tight, done)
 
 
+def test_no_step_is_chosen_where_what_was_taken_will_do():
+    def residuals(y, args):
+        return y - 2, jnp.sum((y - 2) ** 2)
+
+    optimiser, y, none = GaussNewton(), jnp.zeros(3), frozenset()
+    structures = eqx.filter_eval_shape(residuals, y, None)
+    begun = optimiser.init(residuals, y, None, {}, *structures, none)
+    for sufficient, trial in ((11.0, 2), (12.0, 0)):
+        options = {"enough": lambda told, level=sufficient: told <= level}
+        taken, state, told = optimiser.step(residuals, y, None, options, begun, none)
+        np.testing.assert_allclose((taken, state.trial), (jnp.zeros(3), jnp.full(3, trial)), rtol=1e-3)
+        assert told == 12
+        assert state.descent.gradient[0] == -2  # known in any case
+
+
 def preconditioner(field, times):
     """Return the unknowns, the inner product and the inverse of the preconditioner as a function of damping."""
     unknowns = Nodal(PARAMETRISATIONS["conformal"](), field, nodes_of(hj.assemble(field).space.domain))

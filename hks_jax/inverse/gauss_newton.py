@@ -100,7 +100,9 @@ class DampedDescent(eqx.Module):
     # With g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
     #
     #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
-    def step(self, step_size: Array, linearised: Any, state: _State) -> tuple[Values, _State]:
+    def step(
+        self, step_size: Array, linearised: Any, state: _State, needed: bool | Array = True
+    ) -> tuple[Values, _State]:
         """Return the step δ, zero if none is needed, and the state with the gradient and what the step promises."""
         jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape
         adjoint, damping = jacobian.transpose(), self.damping / step_size
@@ -116,7 +118,7 @@ class DampedDescent(eqx.Module):
 
         tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
         most = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
-        most = jnp.where(self.done(step_size, state), 0, most)
+        most = jnp.where(needed & ~self.done(step_size, state), most, 0)
         solution = orthogonal_conjugate_gradients(normal, precondition, jnp.ravel(state.values), tolerance, most)
         x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
         promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
@@ -223,7 +225,11 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     def step(
         self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
     ) -> tuple[Values, _Progress, Any]:
-        """Look at the trial, take it or not, and choose the next; return the unknowns and what is told of them."""
+        """Look at the trial, take it or not, and choose the next; return the unknowns and what is told of them.
+
+        The next is not computed, which is most of the work, where the option ``"enough"``, a function of what the
+        residuals tell beside, says that what was taken will do.
+        """
         linearised, aux = _linearise(fn, state.trial, args)
         # Traces are compared by identity: the one of the state stands for all.
         linearised = eqx.combine(
@@ -239,7 +245,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         taken = state.trial, linearised, aux, self.descent.accepted(state.trial, state.descent)
         now = jax.lax.cond(accept, lambda: eqx.filter(taken, eqx.is_array), lambda: before)
         values, linearised, aux, descent = eqx.combine(now, static)
-        step, descent = self.descent.step(step_size, linearised, descent)
+        needed = ~options["enough"](aux) if "enough" in options else True
+        step, descent = self.descent.step(step_size, linearised, descent, needed)
         no, finite = jnp.asarray(False), jnp.all(jnp.isfinite(step))
         return values, _Progress(no, values + step, step_size, linearised, aux, descent, finite), aux
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.gauss_newton import GaussNewton
@@ -75,8 +75,16 @@ def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem)
 
 
 @jit_quickly(eqx.filter_jit)
-def _advance(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem, state: Any) -> tuple:
-    values, state, told = optimiser.step(fn, values, problem, {}, state, frozenset())
+def _advance(
+    optimiser: Optimiser, fn: Callable, values: Values, problem: Problem, state: Any, sufficient: Float[Array, ""]
+) -> tuple:
+    """Take a step; where the misfit is sufficient, Gauss–Newton does not choose the next one in it."""
+
+    def enough(told: _Told) -> Bool[Array, ""]:
+        return told.outcome.misfit <= sufficient
+
+    options = {"enough": enough} if isinstance(optimiser, GaussNewton) else {}
+    values, state, told = optimiser.step(fn, values, problem, options, state, frozenset())
     done, result = optimiser.terminate(fn, values, problem, {}, state, frozenset())
     step_size = jnp.ones(())
     if isinstance(optimiser, GaussNewton):
@@ -122,12 +130,14 @@ def optimise(
     best, least, seen = values, np.inf, None
     outcome: Outcome | None = None
     rejected, number, end = 0, 0, ""
+    explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # as rounded in `_advance`
     try:
         state = _begin(optimiser, fn, values, problem)
         # One step more than asked for: many solvers tell of their unknowns one step later.
         for count in range(max_steps + 2):
             before = values
-            values, state, told, done, fine, size = _advance(optimiser, fn, values, problem, state)
+            sufficient = jnp.asarray(jnp.inf if count >= max_steps else explained, values.dtype)
+            values, state, told, done, fine, size = _advance(optimiser, fn, values, problem, state, sufficient)
             accepted = count == 0 or bool(jnp.any(values != before))
             rejected = 0 if accepted else rejected + 1
             new = seen is None or bool(jnp.any(told.values != seen))
@@ -141,7 +151,7 @@ def optimise(
                     best, least, outcome = seen, loss, told.outcome
                 report(record, seen, float(size))
                 number += 1
-                if noise is not None and misfit <= noise**2 / 2:
+                if misfit <= explained:
                     return best, outcome, "noise level reached"
             if end:
                 return best, outcome, end
