@@ -1,10 +1,9 @@
 """Fit a metric to a signature."""
 
-import dataclasses
-import math
 import os
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,19 @@ from hks_jax.eigen.choice import choose_for_fit
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.inverse import checkpoint as files
-from hks_jax.inverse.method import choose_inner_product, choose_optimiser
+from hks_jax.inverse.log import Log
+from hks_jax.inverse.method import choose_inner_product
 from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Loss, Observation, Signature, observe
-from hks_jax.inverse.optimise import Optimiser, optimise
+from hks_jax.inverse.optimise import Optimiser
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
-from hks_jax.inverse.problem import Problem, most_pairs, pairs_below, pairs_for, unknowns_of
+from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.regulariser import Regulariser
+from hks_jax.inverse.search import Search
 from hks_jax.inverse.smoothing import InnerProduct
-from hks_jax.inverse.truncated import Outcome, more_pairs, observed_times, outcome_of, truncation_shows
+from hks_jax.inverse.stages import pairs_of_stage, stages_of
+from hks_jax.inverse.truncated import more_pairs, truncation_shows
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
 
 
@@ -129,30 +130,22 @@ def fit_metric(
     if smoothness is not None:
         require_number("smoothness", smoothness, inclusive=True)
     pencil = assemble(init, boundary)
-    space, dtype = pencil.space, init.domain_tensors.dtype
-    unknowns: Unknowns
-    if callable(parametrisation) and not isinstance(parametrisation, Parametrisation):
-        if parameters is None:
-            raise ValueError("parameters: got None; a parametrisation by a function needs parameters to start from")
-        require_real("parameters", parameters)
-        unknowns = Free(parametrisation, parameters, init)
-    else:
-        unknowns = Nodal(choose_parametrisation(parametrisation), init, nodes_of(space.domain))
+    space, dtype, shape = pencil.space, init.domain_tensors.dtype, np.shape(target)
+    unknowns = _unknowns(parametrisation, parameters, init, space.domain)
 
     def observation(weights: Any) -> Observation:
         return observe(target, times, weights, signature, loss, sigma, space, dtype)
 
-    whole = observation(weights)
-    stages = _stages(whole, weights, np.shape(target), continuation, observation)
-    problems = []
-    for each in stages:
-        pairs = _pairs(each, k, np.shape(target), pencil, init)
+    def problem_of(observed: Observation, pairs: int) -> Problem:
         chosen = choose_for_fit(pencil, pairs) if solver == "auto" else solver
-        problems.append(Problem(unknowns, each, tuple(regularisers), pairs, boundary, chosen))
+        return Problem(unknowns, observed, tuple(regularisers), pairs, boundary, chosen)
 
-    inner_product = choose_inner_product(unknowns, smoothness, noise)
-    first = unknowns.start()
-    settings = (
+    whole = observation(weights)
+    stages = stages_of(whole, weights, shape, continuation, observation)
+    problems = [problem_of(each, pairs_of_stage(each, k, shape, pencil, init)) for each in stages]
+    inner_product, first = choose_inner_product(unknowns, smoothness, noise), unknowns.start()
+
+    choices = (
         parametrisation,
         k,
         boundary,
@@ -165,137 +158,42 @@ def fit_metric(
         seed,
         noise,
     )
-    mark = files.fingerprint(whole, weights, init.domain_tensors, regularisers, repr(settings))
+    mark = files.fingerprint(whole, weights, init.domain_tensors, regularisers, repr(choices))
     resumed = files.load(checkpoint, mark) if checkpoint is not None and Path(checkpoint).exists() else None
-
-    log = _Log(progress, checkpoint, mark, first)
+    log = Log(progress, checkpoint, mark, first, clock)
     if resumed:
         log.history, log.losses, log.best = list(resumed.history), list(resumed.losses), jnp.asarray(resumed.best)
-        clock -= log.history[-1].seconds
-    result = best_result = "interrupted"
-    outcome: Outcome | None = None  # of the best unknowns, as far as it is known
-    # The last stage may be followed by one with more eigenpairs, in which no start is open any more.
-    extended = resumed is not None and resumed.stage == len(problems)
-    first_start = resumed.start if resumed else 0
-    for log.start in range(starts if extended else first_start, starts):
-        values, step_size, from_stage = _moved(first, inner_product, spread, seed, log.start), 1.0, 0
-        reached: Outcome | None = None
-        if resumed and log.start == resumed.start:
-            values, step_size, from_stage = jnp.asarray(resumed.values), resumed.step_size, resumed.stage
-        for log.stage in range(from_stage, len(problems)):
-            # Early stages need no last digits.
-            enough = tolerance if log.stage == len(problems) - 1 else 100 * tolerance
-            method = choose_optimiser(optimiser, problems[log.stage], enough, noise, inner_product, step_size)
-            values, reached, result = optimise(
-                problems[log.stage], values, method, noise, max_steps, log, log.stage, log.start, clock
-            )
-            step_size = 1.0
-            if result in ("interrupted", "not finite"):
-                break
-        if reached is None or log.stage < len(problems) - 1:
-            reached = outcome_of(problems[-1], values)
-        loss_reached = float(reached.loss)
-        if not log.losses or not loss_reached >= min(log.losses):
-            log.best, best_result, outcome = values, result, reached
-        log.losses.append(loss_reached)
-        if result == "interrupted":
-            break
-    problem = problems[-1]
-    if extended and resumed is not None:
-        log.best, best_result = jnp.asarray(resumed.values), "converged"
-    log.stage = len(problems)
-    # k was chosen for the volume of the start: the fit may have come to more of it.
-    while True:
-        *numbers, final_pairs = outcome or outcome_of(problem, log.best)
-        final, misfit, left = map(float, numbers)
-        shows = truncation_shows(misfit, left)
-        wanted = more_pairs(problem, log.best) if shows and k is None else problem.k
-        if wanted <= problem.k or best_result in ("interrupted", "not finite"):
-            break
-        chosen = choose_for_fit(pencil, wanted) if solver == "auto" else solver
-        problem = Problem(unknowns, whole, tuple(regularisers), wanted, boundary, chosen)
-        method = choose_optimiser(optimiser, problem, tolerance, noise, inner_product)
-        log.best, outcome, best_result = optimise(
-            problem, log.best, method, noise, max_steps, log, log.stage, log.start, clock
-        )
-    for message in final_pairs.messages():
+        log.clock -= log.history[-1].seconds
+
+    search = Search(optimiser, tolerance, noise, inner_product, max_steps, log)
+    reached = search.from_starts(
+        problems, lambda start: _moved(first, inner_product, spread, seed, start), starts, resumed
+    )
+    log.stage, log.best = len(problems), reached.values
+    renewed = partial(problem_of, whole) if k is None else None
+    values, outcome, result, problem = search.with_enough_pairs(reached, problems[-1], renewed)
+    for message in outcome.pairs.messages():
         warn_of_accuracy(message)
-    if shows:
+    misfit, left = float(outcome.misfit), float(outcome.truncation)
+    if truncation_shows(misfit, left):
         warn_of_accuracy(
             f"k: {problem.k} eigenpairs leave out what amounts to a misfit of about {left:.1e}, and the fit's is "
-            f"{misfit:.1e}: it has fitted its own truncation. Use k=None, or k={more_pairs(problem, log.best)} or "
+            f"{misfit:.1e}: it has fitted its own truncation. Use k=None, or k={more_pairs(problem, values)} or "
             f"more; only if the target was itself computed with {problem.k} pairs is nothing wrong"
         )
     history, losses = tuple(log.history), tuple(log.losses)
-    return MetricFit(unknowns.field(log.best), final, misfit, left, history, best_result, log.best, problem, losses)
+    field, reached_loss = unknowns.field(values), float(outcome.loss)
+    return MetricFit(field, reached_loss, misfit, left, history, result, values, problem, losses)
 
 
-@dataclasses.dataclass
-class _Log:
-    """What happened so far; called after each step, it tells and saves it."""
-
-    progress: Callable[[Step], None] | None
-    path: str | os.PathLike[str] | None
-    mark: str
-    best: Any
-    history: list[Step] = dataclasses.field(default_factory=list)
-    losses: list[float] = dataclasses.field(default_factory=list)
-    start: int = 0
-    stage: int = 0
-
-    def __call__(self, step: Step, values: Any, step_size: float) -> None:
-        self.history.append(step)
-        if self.progress is not None:
-            self.progress(step)
-        if self.path is not None:
-            now = files.Checkpoint(values, self.history, self.start, self.stage, step_size, self.best, self.losses)
-            files.save(self.path, self.mark, now)
-
-
-def _stages(
-    whole: Observation, weights: Any, shape: tuple[int, ...], count: int, build: Callable[[Any], Observation]
-) -> list[Observation]:
-    """Return the observation of each stage: the largest times first."""
-    if count == 1 or whole.signature not in ("hks", "heat-trace"):
-        return [whole]
-    assert whole.times is not None
-    order = np.argsort(-np.asarray(whole.times))
-    base = np.broadcast_to(np.ones(()) if weights is None else np.asarray(weights, float), shape)
-    stages = []
-    for stage in range(1, count):
-        used = np.zeros(shape[0], dtype=bool)
-        used[order[: math.ceil(shape[0] * stage / count)]] = True
-        stages.append(build(base * used.reshape(-1, *[1] * (len(shape) - 1))))
-    return [*stages, whole]
-
-
-def _pairs(
-    observation: Observation,
-    k: int | None,
-    shape: tuple[int, ...],
-    pencil: Pencil | MirrorPencil,
-    field: TensorField,
-) -> int:
-    """Return how many eigenpairs to compute."""
-    if observation.signature == "eigenvalues":
-        return shape[0]
-    if callable(observation.signature):
-        if k is None:
-            raise ValueError("k: got None; a signature of your own needs the number of eigenpairs")
-        return k
-    assert observation.times is not None
-    if observation.signature == "wks":
-        assert observation.sigma is not None
-        reach = float(jnp.max(observation.times) + 2 * observation.sigma)
-        wanted, unknowns = pairs_below(math.exp(reach), pencil, field), unknowns_of(pencil)
-        if k is None and wanted > most_pairs(unknowns):
-            raise ValueError(
-                f"times: got energies up to {float(jnp.max(observation.times)):.4g}, which take about {wanted} "
-                f"eigenpairs; with {unknowns} unknowns {most_pairs(unknowns)} can be fitted. Use lower energies"
-            )
-    else:
-        wanted = pairs_for(observed_times(observation), pencil, field)  # those of this stage
-    return wanted if k is None else k
+def _unknowns(parametrisation: Any, parameters: Any, init: TensorField, domain: np.ndarray) -> Unknowns:
+    """Return what varies."""
+    if callable(parametrisation) and not isinstance(parametrisation, Parametrisation):
+        if parameters is None:
+            raise ValueError("parameters: got None; a parametrisation by a function needs parameters to start from")
+        require_real("parameters", parameters)
+        return Free(parametrisation, parameters, init)
+    return Nodal(choose_parametrisation(parametrisation), init, nodes_of(domain))
 
 
 def _moved(first: Any, inner_product: InnerProduct, spread: float, seed: int, start: int) -> Any:

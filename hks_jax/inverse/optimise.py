@@ -1,6 +1,5 @@
 """The loop: steps of an optimistix solver, each compiled, with what lies between them in Python."""
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.metric_fit import Step
+from hks_jax.inverse.log import Log
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.truncated import Outcome, residuals_and_outcome
 from hks_jax.inverse.unknowns import Values
@@ -104,10 +103,7 @@ def optimise(
     optimiser: Optimiser,
     noise: float | None,
     max_steps: int,
-    report: Callable[[Step, Values, float], None],
-    stage: int,
-    start: int,
-    clock: float,
+    log: Log,
 ) -> tuple[Values, Outcome | None, str]:
     """Run until the solver, the noise level or the number of steps says stop.
 
@@ -117,10 +113,7 @@ def optimise(
         optimiser: the solver.
         noise: standard deviation of the residuals that noise explains; None runs to convergence.
         max_steps: steps after which to give up.
-        report: called after each step with its record, the unknowns, and the solver's step size.
-        stage: for the record.
-        start: for the record.
-        clock: when the fit began.
+        log: called after each step.
 
     Returns:
         The best unknowns seen, their outcome (None where none was computed), and one of the keys of
@@ -144,12 +137,11 @@ def optimise(
             if new or isinstance(optimiser, GaussNewton):
                 seen, loss, misfit = told.values, float(told.outcome.loss), float(told.outcome.misfit)
                 gradient = float(told.gradient) / np.sqrt(len(values))
-                record = Step(number, loss, misfit, gradient, new, time.perf_counter() - clock, stage, start)
                 if not np.isfinite(loss):
                     return best, outcome, "not finite"
                 if loss <= least:
                     best, least, outcome = seen, loss, told.outcome
-                report(record, seen, float(size))
+                log(number, (loss, misfit, gradient), new, seen, float(size))
                 number += 1
                 if misfit <= explained:
                     return best, outcome, "noise level reached"
