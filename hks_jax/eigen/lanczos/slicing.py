@@ -16,6 +16,7 @@ from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, ste
 from hks_jax.eigen.quality import allowed_defects, indistinct, values_and_defects
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
+from hks_jax.traced import is_traced
 
 _ERROR = 0.1
 """How far the error of solves may reach towards the tolerance of the lowest eigenvalue sought."""
@@ -83,7 +84,11 @@ def _needed(
 def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float, state: SlicingState) -> SlicingState:
     """Find the eigenpairs around the shift."""
     assert state.vectors is not None
-    window, shifted = _window(problem, plan, state), ShiftedSolve(factor, state.shift, state.passes)
+    # Where one slice is enough nothing is known as a rule, and there are no rows of zeros to stay orthogonal to. Of
+    # several slices the first would have to be compiled apart.
+    nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
+    window = _window(problem, plan, state, 0 if nothing else plan.window)
+    shifted = ShiftedSolve(factor, state.shift, state.passes)
     ritz = block_lanczos(problem.pencil, shifted, state.start, window.vectors, plan.steps, window.steps, plan.ritz)
     interval = window.low, window.high
     order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
@@ -91,13 +96,13 @@ def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float
     return following._replace(vectors=_stored(state.vectors, ritz[1], order, state.known))
 
 
-@jit_quickly(static_argnames="plan")
-def _window(problem: Problem, plan: Plan, state: SlicingState) -> Window:
-    """Return how to search around the state's shift."""
+@jit_quickly(static_argnames=("plan", "rows"))
+def _window(problem: Problem, plan: Plan, state: SlicingState, rows: int) -> Window:
+    """Return how to search around the state's shift, orthogonal to so many eigenvectors."""
     assert state.vectors is not None
-    nearest = jnp.argsort(jnp.abs(state.values - state.shift))
-    vectors = jnp.where((nearest < state.known)[: plan.window, None], state.vectors[nearest[: plan.window]], 0)
-    others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest[: plan.window]), jnp.nan, state.values)
+    nearest = jnp.argsort(jnp.abs(state.values - state.shift))[:rows]
+    vectors = jnp.where((nearest < state.known)[:, None], state.vectors[nearest], 0)
+    others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest), jnp.nan, state.values)
     bottom = jnp.where(problem.negative > 0, 0, -jnp.inf)
     low = jnp.fmax(jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf), bottom)
     high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
