@@ -30,6 +30,7 @@ HERE = Path(__file__).parent
 CASES = ["64/100", "128/100", "256/100", "512/100", "1024/100", "256/200", "256/500"]
 TOLERANCE = 1e-8
 SHORT = 10.0
+"""Seconds up to which a call is repeated more often."""
 Pairs = tuple[np.ndarray, np.ndarray]
 
 
@@ -163,7 +164,7 @@ def peak_memory() -> float:
 
 
 def timed(run: Callable[[], tuple]) -> tuple[float, tuple]:
-    """Return how long a call takes, and its result."""
+    """Return how long a call takes, and its result: without JAX, whose memory would count as that of the peers."""
     start = time.perf_counter()
     result = run()
     return time.perf_counter() - start, result

@@ -101,7 +101,7 @@ class DampedDescent(eqx.Module):
     #
     #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
     def step(
-        self, step_size: Array, linearised: Any, state: _State, needed: bool | Array = True
+        self, step_size: Array, linearised: Any, state: _State, needed: bool | Bool[Array, ""]
     ) -> tuple[Values, _State]:
         """Return the step δ, zero if none is needed, and the state with the gradient and what the step promises."""
         jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape

@@ -64,9 +64,7 @@ class Search:
         method = choose_optimiser(self.optimiser, problem, tolerance, self.noise, self.inner_product, step_size)
         return Reached(*optimise(problem, values, method, self.noise, self.max_steps, self.log))
 
-    def through_stages(
-        self, problems: Sequence[Problem], values: Values, first: int = 0, step_size: float = 1.0
-    ) -> Reached:
+    def through_stages(self, problems: Sequence[Problem], values: Values, first: int, step_size: float) -> Reached:
         """Solve the problems from the first on, one after another; the outcome is that of the last of them."""
         reached, last = Reached(values, None, "interrupted"), len(problems) - 1
         for self.log.stage in range(first, len(problems)):
@@ -95,9 +93,10 @@ class Search:
         best = Reached(self.log.best, None, "interrupted")
         for self.log.start in range(resumed.start if resumed else 0, starts):
             if resumed and self.log.start == resumed.start:
-                reached = self.through_stages(problems, jnp.asarray(resumed.values), resumed.stage, resumed.step_size)
+                where = jnp.asarray(resumed.values), resumed.stage, resumed.step_size
             else:
-                reached = self.through_stages(problems, begin(self.log.start))
+                where = begin(self.log.start), 0, 1.0
+            reached = self.through_stages(problems, *where)
             assert reached.outcome is not None
             loss = float(reached.outcome.loss)
             if not self.log.losses or not loss >= min(self.log.losses):
@@ -123,8 +122,11 @@ class Search:
         while True:
             outcome = reached.outcome or outcome_of(problem, reached.values)
             shows = truncation_shows(float(outcome.misfit), float(outcome.truncation))
-            wanted = more_pairs(problem, reached.values) if shows and renewed else problem.k
-            if wanted <= problem.k or reached.stopped or renewed is None:
-                return reached.values, outcome, reached.result, problem
+            if renewed is None or reached.stopped or not shows:
+                break
+            wanted = more_pairs(problem, reached.values)
+            if wanted <= problem.k:
+                break
             problem = renewed(wanted)
             reached = self.solve(problem, reached.values)
+        return reached.values, outcome, reached.result, problem

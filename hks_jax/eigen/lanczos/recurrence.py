@@ -79,7 +79,7 @@ def block_lanczos(
         pencil: K and M.
         shifted: how to solve with K − σM.
         start: the first block, any vectors.
-        known: M-orthonormal eigenvectors, or zero rows; w a multiple of b.
+        known: M-orthonormal eigenvectors, or zero rows; w a multiple of b, 0 where nothing is known.
         room: for how many blocks there is room; static.
         steps: how many blocks to compute, even; traced, as many as there is room for.
         wanted: how many Ritz pairs to return.
