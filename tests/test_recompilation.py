@@ -108,6 +108,16 @@ def test_tolerances_of_fits_compile_nothing_anew(optimiser):
     assert len(fine.history) > len(rough.history)
 
 
+def test_all_slices_are_one_compilation(rng):
+    pencil = hj.assemble(hj.TensorField(hj.Grid((21, 22)), random_spd(rng, (21, 22))))
+    told = []
+    with compilations() as seen:
+        hj.BlockLanczos(slice_size=20).lowest(pencil, 70, told.append)
+    assert len(told) > 2
+    assert sum("_advance" in name for name in seen) == 1
+    assert len(seen) == len(set(seen)), sorted(seen)
+
+
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")  # of so few pairs
 def test_plain_derivatives_use_the_solver_as_it_was_compiled(rng):
     grid, solver = hj.Grid((9, 11)), hj.BlockLanczos(block=2)

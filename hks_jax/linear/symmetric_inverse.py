@@ -1,5 +1,6 @@
 """The inverses of a batch of symmetric indefinite matrices together with their inertia."""
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -12,8 +13,11 @@ from hks_jax.linear.products import batched, transposed
 
 Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
 
-_BLOCK = 32
-_SMALL, _LARGE = 32, 256
+_BLOCK, _BLOCKS, _LARGE = 48, 8, 2048
+"""On CPUs, matrices up to the first size are inverted by their eigenvalues, and of those up to the last about so many
+blocks swept."""
+_ROWS = 32
+"""The largest blocks that are swept row by row."""
 _MANY = 128
 """Fronts of a level from which on all of them are definite as a rule: the shift is below their eigenvalues."""
 
@@ -55,16 +59,20 @@ def by_cholesky_factors(matrices: Float[Array, "m n n"]) -> Inverses:
 
 
 def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
-    """Invert the eigenvalues; of the many small matrices and the few large ones, those of two halves.
+    """Invert the eigenvalues: of small matrices their own, of others those of the blocks that are swept.
 
-    Each halving takes a quarter of the time.
+    Large matrices are swept in large blocks, these in turn in small ones, so that there are few passes over them. Of
+    the largest, halves take fewer operations.
     """
     n = matrices.shape[1]
-    if n <= _SMALL // 2 or _SMALL < n <= _LARGE:
+    if n <= _BLOCK:
         eigh = partial(jax.lax.linalg.eigh, symmetrize_input=False)
         vectors, values = at_once_or_in_turn(eigh, matrices)
         values = _away_from_zero(values, least[:, None])
         return batched(vectors / values[:, None, :], transposed(vectors)), values
+    if n <= _LARGE:
+        count = -(-n // max(_BLOCK, n // _BLOCKS))
+        return _by_blocks(by_eigenvalues, -(-n // count), matrices, least)
     half = n // 2
     first, values = by_eigenvalues(matrices[:, :half, :half], least)
     coupling = batched(matrices[:, half:, :half], first)
@@ -94,8 +102,17 @@ def by_kernels(matrices: Float[Array, "m n n"], least: Float[Array, " m"], inter
 
 def by_elimination(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
     """Sweep the matrices block by block, and these row by row."""
+    return _by_blocks(sweep_rows, min(matrices.shape[1], _ROWS), matrices, least)
+
+
+def _by_blocks(
+    invert: Callable[[Array, Array], Inverses],
+    size: int,
+    matrices: Float[Array, "m n n"],
+    least: Float[Array, " m"],
+) -> Inverses:
+    """Sweep the matrices in blocks of one size, given how to invert these."""
     m, n, _ = matrices.shape
-    size = min(n, _BLOCK)
     whole = -(-n // size) * size
     a = jnp.broadcast_to(jnp.eye(whole, dtype=matrices.dtype), (m, whole, whole)).at[:, :n, :n].set(matrices)
 
@@ -103,7 +120,7 @@ def by_elimination(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -
         a, pivots = state
         at = number * size
         rows = jax.lax.dynamic_slice_in_dim(a, at, size, axis=1)
-        inverses, of_block = sweep_rows(jax.lax.dynamic_slice_in_dim(rows, at, size, axis=2), least)
+        inverses, of_block = invert(jax.lax.dynamic_slice_in_dim(rows, at, size, axis=2), least)
         return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))

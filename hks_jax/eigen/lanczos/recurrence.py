@@ -29,12 +29,12 @@ class ShiftedSolve(NamedTuple):
         factor: the factorisation of K − σM.
         shift: σ.
         passes: how often to solve: once, or again with the defect, where the factorisation is inaccurate; at most twice
-            on accelerators.
+            on accelerators. None: once, for which nothing else is compiled.
     """
 
     factor: Factorisation
     shift: Float[Array, ""]
-    passes: int | Int[Array, ""]
+    passes: Int[Array, ""] | None
 
 
 class _Blocks(NamedTuple):
@@ -96,14 +96,16 @@ def block_lanczos(
     if is_traced(shifted):
         # All of them in one loop: were its length to differ within a batch, each turn would copy all of the state.
         steps, state = room, advance(state, 0, room)
-    elif accelerators.at_hand():
-        steps, passes = int(steps), int(shifted.passes)
-        for done in range(0, steps, 2):
-            state = _advance_by_two(pencil, shifted.factor, shifted.shift, state, len(known), done, passes)
     else:
         steps = int(steps)
-        for done in range(0, steps, _STRETCH):
-            state = advance(state, done, min(done + _STRETCH, steps))
+        if shifted.passes is not None and int(shifted.passes) == 1:
+            shifted = shifted._replace(passes=None)
+        if accelerators.at_hand():
+            for done in range(0, steps, 2):
+                state = _advance_by_two(pencil, shifted, state, len(known), done)
+        else:
+            for done in range(0, steps, _STRETCH):
+                state = advance(state, done, min(done + _STRETCH, steps))
     return _ritz_pairs(state, len(known), steps, wanted)
 
 
@@ -113,9 +115,10 @@ def _begin(
 ) -> _Recurrence:
     """Return the state before the first step: the first block is orthogonal to what is known."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
-    for _ in range(2):
+    for _ in range(2 if len(known) else 0):
         block = block - combine(products_with_columns(known, mass(block)).T, known).T
-        block, image, _ = orthonormal(mass, block)
+        block, _, _ = orthonormal(mass, block)
+    block, image, _ = orthonormal(mass, block)
     basis = begin(known, len(known) + room * b, b)
     none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, 2, b, b), start.dtype)
     return _Recurrence(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix)
@@ -135,31 +138,27 @@ def _advance(
     if accelerators.at_hand():
         # Whether to project is known of every step in two. How often to solve is asked once, and not in each step, for
         # which the host would wait.
-        def by_two(passes: int, state: _Recurrence) -> _Recurrence:
-            steps = _stepping(pencil, shifted._replace(passes=passes), offset)
+        def by_two(shifted: ShiftedSolve, state: _Recurrence) -> _Recurrence:
+            steps = _stepping(pencil, shifted, offset)
             return jax.lax.fori_loop(
                 first // 2, last // 2, lambda two, state: steps(2 * two, state, (every == 1, True)), state
             )
 
-        return jax.lax.cond(_in_any(jnp.asarray(shifted.passes > 1)), partial(by_two, 2), partial(by_two, 1), state)
+        assert shifted.passes is not None
+        once = partial(by_two, shifted._replace(passes=None))
+        return jax.lax.cond(_in_any(shifted.passes > 1), partial(by_two, shifted), once, state)
     steps = _stepping(pencil, shifted, offset)
     return jax.lax.fori_loop(
         first, last, lambda number, state: steps(number, state, ((number + 1) % every == 0,)), state
     )
 
 
-@jit_quickly(static_argnames=("offset", "passes"), donate_argnames="state")
+@jit_quickly(static_argnames="offset", donate_argnames="state")
 def _advance_by_two(
-    pencil: SymmetricPencil,
-    factor: Factorisation,
-    shift: Float[Array, ""],
-    state: _Recurrence,
-    offset: int,
-    first: int | Array,
-    passes: int,
+    pencil: SymmetricPencil, shifted: ShiftedSolve, state: _Recurrence, offset: int, first: int | Array
 ) -> _Recurrence:
     """Take two steps without a loop or a condition, so that nothing has to wait for the device."""
-    steps = _stepping(pencil, ShiftedSolve(factor, shift, passes), offset)
+    steps = _stepping(pencil, shifted, offset)
     return steps(jnp.asarray(first), state, (_every(state.blocks.block.dtype) == 1, True))
 
 
@@ -171,17 +170,19 @@ def _stepping(
     factor, shift, passes = shifted
 
     def solve(rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+        def defect_of(x: Array) -> Array:
+            return rhs - (stiffness(x) - shift * mass(x))
+
         def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, defect = state
             x = x + factor.solve_columns(defect)
-            again = done < passes - 1
-            return x, jax.lax.cond(again, lambda: rhs - (stiffness(x) - shift * mass(x)), lambda: defect)
+            return x, jax.lax.cond(done < passes - 1, defect_of, lambda _: defect, x)
 
-        def refined(_: Array, x: Array) -> Array:
-            return x + factor.solve_columns(rhs - (stiffness(x) - shift * mass(x)))
-
+        if passes is None:
+            return factor.solve_columns(rhs)
         if accelerators.at_hand():
-            return jax.lax.fori_loop(0, passes - 1, refined, factor.solve_columns(rhs))
+            x = factor.solve_columns(rhs)
+            return x + factor.solve_columns(defect_of(x))
         return jax.lax.fori_loop(0, passes, refine, (jnp.zeros_like(rhs), rhs))[0]
 
     def step(

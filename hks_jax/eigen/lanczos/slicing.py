@@ -194,7 +194,7 @@ def _accept(
         complete_below=jnp.where(complete, jnp.maximum(shift, state.complete_below), state.complete_below),
         start=vectors[leftover].T + noise,
         moved=jnp.zeros((), int),
-        passes=jnp.where(complete | stuck, 1, 2),
+        passes=jnp.where(complete | stuck, 1, 2).astype(int),
         stuck=stuck,
     )
     following = jnp.maximum(_next_shift(problem, plan, state), onward)

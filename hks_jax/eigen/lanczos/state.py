@@ -143,7 +143,7 @@ def first_state(problem: Problem, plan: Plan) -> SlicingState:
         vectors=jnp.zeros((plan.capacity, n), dtype),
         known=jnp.zeros((), int),
         shift=problem.first,
-        below=jnp.full((), -1),
+        below=jnp.full((), -1, int),
         reached=jnp.zeros((), dtype),
         complete_below=jnp.zeros((), dtype),
         start=noise,
