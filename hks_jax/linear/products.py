@@ -99,6 +99,11 @@ def times(x: Float[Array, "n b"], mix: Float[Array, "b c"]) -> Float[Array, "n c
     return jnp.matmul(x, mix, precision="highest")
 
 
+def even_size(count: int, most: int) -> int:
+    """Return the size of as few blocks as can be, none larger than the most, if all are of one size."""
+    return -(-count // -(-count // most))
+
+
 def row_blocks(
     count: int, size: int
 ) -> tuple[Int[np.ndarray, " blocks"], tuple[Int[np.ndarray, " count"], Int[np.ndarray, " count"]]]:

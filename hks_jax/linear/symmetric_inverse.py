@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.linear import accelerators, sweep_kernel
 from hks_jax.linear.lapack import at_once_or_in_turn
-from hks_jax.linear.products import batched, transposed
+from hks_jax.linear.products import batched, even_size, transposed
 
 Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
 
@@ -71,8 +71,8 @@ def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -
         values = _away_from_zero(values, least[:, None])
         return batched(vectors / values[:, None, :], transposed(vectors)), values
     if n <= _LARGE:
-        count = -(-n // max(_BLOCK, n // _BLOCKS))
-        return _by_blocks(by_eigenvalues, -(-n // count), matrices, least)
+        size = even_size(n, max(_BLOCK, n // _BLOCKS))
+        return _by_blocks(by_eigenvalues, size, matrices, least)
     half = n // 2
     first, values = by_eigenvalues(matrices[:, :half, :half], least)
     coupling = batched(matrices[:, half:, :half], first)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.pencil import MirrorPencil, Pencil
-from hks_jax.linear.products import row_blocks
+from hks_jax.linear.products import even_size, row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter
 from hks_jax.static_array import StaticArray
@@ -133,7 +133,7 @@ def _tangent(
     d_frame: Float[Array, "k n_dof"],
 ) -> Array:
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where it does not count
-    size = min(_ROWS, len(vectors))
+    size = even_size(len(vectors), _ROWS)
     starts, place = row_blocks(len(vectors), size)
 
     @jax.checkpoint  # reverse mode would keep a copy of the vectors

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.complement.common import norms, wanted_errors
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, inner_products, products_with_columns, row_blocks
+from hks_jax.linear.products import combine, even_size, inner_products, products_with_columns, row_blocks
 
 _ROWS = 128
 """Rows that the known eigenvectors are taken out of at once: fewer read them more often from memory."""
@@ -70,7 +70,7 @@ def cleaned(
 
 def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[Array, ...]:
     """Return the projections of rows, of some at a time: of a few of them twice, which changes nothing."""
-    size = min(_ROWS, len(rows[0]))
+    size = even_size(len(rows[0]), _ROWS)
     starts, _ = row_blocks(len(rows[0]), size)
 
     def step(number: Array, rows: tuple[Array, ...]) -> tuple[Array, ...]:
