@@ -13,7 +13,7 @@ from hks_jax.linear.products import batched, even_size, transposed
 
 Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
 
-_BLOCK, _BLOCKS, _LARGE = 48, 8, 2048
+_BLOCK, _BLOCKS, _LARGE = 48, 4, 2048
 """On CPUs, matrices up to the first size are inverted by their eigenvalues, and of those up to the last about so many
 blocks swept."""
 _ROWS = 32
