@@ -170,16 +170,18 @@ def _stepping(
     factor, shift, passes = shifted
 
     def solve(rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+        if passes is None:
+            return factor.solve_columns(rhs)
+        last = passes - 1
+
         def defect_of(x: Array) -> Array:
             return rhs - (stiffness(x) - shift * mass(x))
 
         def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, defect = state
             x = x + factor.solve_columns(defect)
-            return x, jax.lax.cond(done < passes - 1, defect_of, lambda _: defect, x)
+            return x, jax.lax.cond(done < last, defect_of, lambda _: defect, x)
 
-        if passes is None:
-            return factor.solve_columns(rhs)
         if accelerators.at_hand():
             x = factor.solve_columns(rhs)
             return x + factor.solve_columns(defect_of(x))
