@@ -15,6 +15,7 @@ from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
+from hks_jax.inverse.single_precision import residuals_of
 from hks_jax.inverse.unknowns import Unknowns, Values
 from hks_jax.signatures.tail import resolving
 from hks_jax.signatures.weyl import weyl_count
@@ -60,7 +61,7 @@ class Problem(eqx.Module):
         """Return the residuals, and the eigenpairs from which they were computed."""
         field = self.unknowns.field(values)
         pairs = self._pairs_of(field)
-        data = self.observation.residuals(pairs)
+        data = residuals_of(self.observation, pairs, self.solver)
         penalties = [each.residuals(self.unknowns, values, field) for each in self.regularisers]
         return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties]), pairs
 

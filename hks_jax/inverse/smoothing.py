@@ -87,7 +87,7 @@ class Smoothing(InnerProduct):
 def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     """Return the inner product for numbers at the nodes of a grid's domain."""
     d = grid.dimension
-    flat = TensorField(grid, jnp.broadcast_to(jnp.eye(d, dtype=dtype), (*grid.shape, d, d)))
+    flat = TensorField(grid, np.broadcast_to(np.eye(d, dtype=dtype), (*grid.shape, d, d)))
     pencil = assemble(flat, mass="lumped")
     assert isinstance(pencil, Pencil)
     assert isinstance(pencil.space, GridSpace)
