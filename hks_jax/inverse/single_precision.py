@@ -12,8 +12,8 @@ from hks_jax.eigen.solver import Eigensolver
 from hks_jax.inverse.observation import Observation
 
 _ENOUGH = 1e-5
-"""The accuracy of the solver's derivative for which single precision will do. Measured at 64² nodes, its errors are 1e-6
-in J and 1e-5 to 3e-5 in Jᵀ; those of solves to this tolerance 5e-6 and 5e-5, where nothing is smooth."""
+"""The accuracy of the solver's derivative for which single precision will do. Measured at 64² nodes, it costs 1e-6 in J
+and 1e-5 to 3e-5 in Jᵀ; solves to this tolerance cost 5e-6 and 5e-5, where nothing is smooth."""
 
 
 # A heat signature is not below that of the constants. Others, and those where the constants are no eigenfunctions, may
