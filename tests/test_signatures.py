@@ -10,7 +10,7 @@ from fields import flat, random_spd, turning
 from scipy.linalg import expm
 
 import hks_jax as hj
-from hks_jax.signatures.tail import beyond_by_weyl
+from hks_jax.signatures.tail import beyond, beyond_by_weyl
 from hks_jax.signatures.truncation import median_of_shares
 
 
@@ -138,12 +138,23 @@ def test_tail_estimate_is_of_the_right_size():
     assert not alone.messages()
 
 
+def incomplete_gamma(a, x):
+    """What lies beyond Λ where N(λ) = 7 (λ/Λ)^a: N(Λ) Γ(a + 1) x^(−a) Q(a, x), x = Λt, by SciPy."""
+    return 7 * scipy.special.gamma(a + 1) * x**-a * scipy.special.gammaincc(a, x)
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_tail_by_weyl_in_closed_form(d):
     x = np.geomspace(1e-3, 60, 40)
-    a = d / 2  # N(Λ) Γ(a + 1) (Λt)^(−a) Q(a, Λt), by SciPy
-    general = 7 * scipy.special.gamma(a + 1) * x**-a * scipy.special.gammaincc(a, x)
-    np.testing.assert_allclose(beyond_by_weyl(jnp.asarray(7.0), d, jnp.asarray(x)), general, rtol=1e-12)
+    tail = beyond_by_weyl(jnp.asarray(7.0), d, jnp.asarray(x))
+    np.testing.assert_allclose(tail, incomplete_gamma(d / 2, x), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("least", "rtol"), [(0.1, 2e-3), (1, 2e-8), (3, 1e-12)])
+def test_the_tail_for_any_exponent(least, rtol):
+    x, a = np.meshgrid(np.geomspace(least, 400, 40), np.linspace(0.5, 8, 16))
+    tail = beyond(jnp.asarray(7.0), jnp.asarray(a), jnp.asarray(x))
+    np.testing.assert_allclose(tail, incomplete_gamma(a, x), rtol=rtol)
 
 
 @pytest.mark.parametrize(
