@@ -87,9 +87,16 @@ def _lowest_jvp(
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
     prepared = prepare(solver.adjoint, k, pencil, values)
     eigenvalues, functions, following = _cut(values, vectors, k)
-    tangents = tangents_of(solver.adjoint, telling, prepared, pencil, change, values, vectors, functions)
+    known = prepared, _matrices(pencil), change, values, vectors, functions
+    tangents = tangents_of(solver.adjoint, telling, *known)
     constants = following, complete_below
     return (eigenvalues, functions, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
+
+
+# The transpose keeps what its arguments have, needed or not.
+def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
+    """Return a pencil without estimates of its resolution."""
+    return eqx.tree_at(lambda p: p.resolution, pencil, None) if isinstance(pencil, Pencil) else pencil
 
 
 def _solve_pencil(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: Report) -> RawPairs:

@@ -44,14 +44,15 @@ class Resolution(eqx.Module):
 # A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6, which adds d/24 Σₐ hₐ²gₐₐ/t, by E λkₐ² = (d + 2)gₐₐ/4t²;
 # 1/20 in place of 1/24 is what the next terms make of it at t = 6h².
 def dispersion(
-    tensors: Float[Array, "*shape d d"], spacing: Float[np.ndarray | Array, " d"], lumped: bool
+    tensors: Float[Array, "*shape d d"], spacing: Float[np.ndarray | Array, " d"], lumped: bool | Bool[Array, ""]
 ) -> Float[Array, "*shape"]:
     """Return the error, times t, of the signature that Q1 elements give where tensors do not vary."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
+    of_mass = 1 / 12 + jnp.where(lumped, d / 20, 0.0)
     total = jnp.zeros(tensors.shape[:-2], tensors.dtype)
     for a in range(d):
         along = tensors[..., a, a]
-        total = total + spacing[a] ** 2 * along * (1 / 12 + lumped * d / 20 - inverse[..., a, a] * along / 16)
+        total = total + spacing[a] ** 2 * along * (of_mass - inverse[..., a, a] * along / 16)
     return total
 
 
@@ -110,14 +111,14 @@ def _neighbours(domain: Bool[Array, "*shape"], axis: int, wraps: bool) -> Bool[A
     return pairs & (jnp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@partial(jax.jit, static_argnames=("periodic", "interpolation", "lumped"))
+@partial(jax.jit, static_argnames=("periodic", "interpolation"))
 def grid_resolution(
     tensors: Float[Array, "*shape d d"],
     domain: Bool[Array, "*shape"],
     periodic: tuple[bool, ...],
     spacing: Float[np.ndarray | Array, " d"],
     interpolation: Interpolation,
-    lumped: bool,
+    lumped: bool | Bool[Array, ""],
 ) -> Resolution:
     """Return what the spacing of a grid does, (*shape) in place of (n_dof,)."""
     tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))

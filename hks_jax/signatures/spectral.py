@@ -105,7 +105,7 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         terms.append(_kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs))
     if not _is_constant(d_pairs.pencil):
         pairs = first_order_only(pairs)
-        known = pairs.pencil, pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
+        known = pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
         terms.append(_tangent(contraction, filters, *known, *_instantiated((d_pairs.pencil, d_pairs.frame))))
     elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
         pairs = first_order_only(pairs)
@@ -124,7 +124,6 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def _tangent(
     contraction: Contraction,
     filters: Filter,
-    pencil: Pencil | MirrorPencil,
     values: Float[Array, " k"],
     vectors: Float[Array, "k n_dof"],
     kept: Bool[Array, " k"],
@@ -140,7 +139,7 @@ def _tangent(
     def products(start: Array) -> tuple[Float[Array, "size k"], Float[Array, "size k"]]:
         own, of = (jax.lax.dynamic_slice_in_dim(x, start, size) for x in (vectors, part))
         stiffness, mass = d_pencil.apply_stiffness(own, of), d_pencil.apply_mass(own, of)
-        return pencil.among(stiffness, of, vectors, part), pencil.among(mass, of, vectors, part)
+        return d_pencil.among(stiffness, of, vectors, part), d_pencil.among(mass, of, vectors, part)
 
     stiffness, mass = (blocks[place] for blocks in jax.lax.map(products, jnp.asarray(starts)))
     weights = _all_weights(filters, values, kept)
