@@ -70,6 +70,14 @@ def test_a_torus_is_halved_by_short_separators():
     assert halves.min() > 0.9 * halves.max()
 
 
+def test_single_vertices_beside_a_graph_do_not_turn_its_cuts():
+    path, short = (sp.diags([1.0, 1.0], [-1, 1], (n, n)) for n in (40, 20))
+    lattice = sp.kron(path, sp.eye(20)) + sp.kron(sp.eye(40), short)
+    pattern = hj.sparse_pencil(sp.block_diag([lattice, sp.eye(12)]).tocsr() + 9 * sp.eye(812)).pattern
+    level, *_ = bisect_graph(pattern.size, pattern.rows, pattern.cols)
+    assert np.sum(level == 0) <= 20 * 1.2
+
+
 def test_products_with_a_few_long_rows(matrix, rng):
     operator = hj.sparse_pencil(matrix).stiffness
     x = rng.standard_normal((matrix.shape[0], 3))

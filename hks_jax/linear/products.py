@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Inexact, Int
 
 from hks_jax.linear import accelerators
 
-_MANY, _TERMS = 512, 64
+_MANY, _TERMS = 512, 40
 """For how many matrices, of how many columns at most, products on a CPU are written out: others take longer to compile
 than they gain."""
 
