@@ -28,8 +28,6 @@ _SMOOTHING = 6
 random closed surfaces, the factors are then as large as where the vertices' positions serve as coordinates, and 3 to
 8 % larger than with the cuts of METIS, whose own nested dissection takes a tenth to a quarter longer; a factorisation
 takes 12 to 28 % more operations."""
-_SAMPLE = 200
-"""About how many vertices tell a part's principal axis."""
 
 
 class Parts(NamedTuple):
@@ -145,14 +143,12 @@ def _along_axes(
 ) -> Int[np.ndarray, " n"]:
     """Return an order in which the vertices of each part, which lie together, follow each other along its principal
     axis."""
-    (n, c), parts = x.shape, counts.size
-    step = max(n // (parts * _SAMPLE), 1)
-    some, of = x[::step], q[::step]
-    mean = np.stack([np.bincount(of, column, parts) for column in some.T], axis=1)
-    some = some - (mean / np.maximum(np.bincount(of, minlength=parts), 1)[:, None])[of]
+    c, parts = x.shape[1], counts.size
+    mean = np.stack([np.bincount(q, column, parts) for column in x.T], axis=1) / np.maximum(counts, 1)[:, None]
+    centred = np.ascontiguousarray((x - np.repeat(mean.astype(x.dtype), counts, axis=0)).T)
     moments = np.empty((parts, c, c))
     for i, j in combinations_with_replacement(range(c), 2):
-        moments[:, i, j] = moments[:, j, i] = np.bincount(of, some[:, i] * some[:, j], parts)
+        moments[:, i, j] = moments[:, j, i] = np.bincount(q, centred[i] * centred[j], parts)
     axis = np.linalg.eigh(moments)[1][:, :, -1].astype(x.dtype)
     along = np.einsum("nc,nc->n", x, np.repeat(axis, counts, axis=0))
     along -= along.min()
