@@ -26,8 +26,8 @@ _LANDMARKS = 8
 _SMOOTHING = 6
 """How often distances are averaged with those of neighbours: they are integers, of which many are equal. Measured on
 random closed surfaces, the factors are then as large as where the vertices' positions serve as coordinates, and 3 to
-8 % larger than with the cuts of METIS, whose own nested dissection takes about as long; a factorisation takes 12 to 28 %
-more operations."""
+8 % larger than with the cuts of METIS, whose own nested dissection takes about as long; a factorisation takes 12 to
+28 % more operations."""
 
 
 class Parts(NamedTuple):
