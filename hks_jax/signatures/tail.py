@@ -34,8 +34,9 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     To 1e-3 from x = 0.1 on, to 1e-7 from x = 1 on, for exponents from ½ to 8; x below 1e-3 counts as that.
     """
     x = jnp.maximum(x, 1e-3)  # nothing overflows
-    powers = jnp.exp((exponent - 1)[..., None] * jnp.log1p(_POINTS / x[..., None]))
-    return count * exponent / x * jnp.exp(-x) * jnp.sum(_WEIGHTS * powers, axis=-1)
+    points, weights = (jnp.asarray(each, x.dtype) for each in (_POINTS, _WEIGHTS))
+    powers = jnp.exp((exponent - 1)[..., None] * jnp.log1p(points / x[..., None]))
+    return count * exponent / x * jnp.exp(-x) * jnp.sum(weights * powers, axis=-1)
 
 
 # For a = 1 the integral is 1, for a = 3/2, by parts, 1 + (√π/2) erfc(√x) e^x/√x.
