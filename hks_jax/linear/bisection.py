@@ -47,7 +47,8 @@ class Parts(NamedTuple):
 
 def bisect_graph(n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> Parts:
     """Bisect the graph of n vertices whose edges (row, column) are given in both directions, in the order of rows."""
-    banded, graph = _banded(n, rows[rows != cols], cols[rows != cols])
+    off = rows != cols
+    banded, graph = _banded(n, rows[off], cols[off])
     tails, heads = np.repeat(np.arange(n, dtype=np.int32), np.diff(graph.indptr)), graph.indices
     once = tails < heads
     tails, heads = tails[once], heads[once]
@@ -96,13 +97,14 @@ def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
     own."""
     n = graph.shape[0]
     count, label = connected_components(graph, directed=False)
-    nearest, roots = np.arange(n, 0, -1), np.empty(count, int)  # the first in the order is far from the last
+    # The first in the order is far from the last; no distance is as large.
+    nearest, roots = np.arange(2 * n, n, -1), np.empty(count, int)
     distances: list[Int[np.ndarray, " n"]] = []
     for _ in range(_LANDMARKS):
         ends = np.flatnonzero(nearest == _largest(nearest, label, count)[label])
         roots[label[ends]] = ends  # one in each component, as far as can be from the landmarks so far
         distances.append(_distances(graph, roots))
-        nearest = np.min(distances, axis=0)
+        nearest = np.minimum(nearest, distances[-1])
     x = np.stack(distances, axis=1).astype(np.float32)
     if count > 1:
         lengths = 1 + _largest(distances[0], label, count)
