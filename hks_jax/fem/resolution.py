@@ -48,7 +48,7 @@ def dispersion(
 ) -> Float[Array, "*shape"]:
     """Return the error, times t, of the signature that Q1 elements give where tensors do not vary."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
-    of_mass = 1 / 12 + jnp.where(lumped, d / 20, 0.0).astype(tensors.dtype)
+    of_mass = 1 / 12 + jnp.where(lumped, d / 20, 0.0)
     total = jnp.zeros(tensors.shape[:-2], tensors.dtype)
     for a in range(d):
         along = tensors[..., a, a]
