@@ -1,11 +1,14 @@
 """Small symmetric positive definite matrices: d = 2 and 3, batched over leading axes."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from hks_jax.linear.dense_eigh import differentiable_eigh
 
 
 @jax.jit
@@ -55,6 +58,15 @@ def determinant(tensors: Float[Array, "... d d"]) -> Float[Array, "..."]:
 def inverse(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return T⁻¹, d = 2 or 3."""
     return adjugate(tensors) / determinant(tensors)[..., None, None]
+
+
+def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+    """Return the lower triangular L of T = LLᵀ; NaN for what is not positive definite."""
+    d, factor = tensors.shape[-1], jnp.zeros_like(tensors)
+    for j in range(d):
+        column = tensors[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
+        factor = factor.at[..., j:, j].set(column[..., j:] / jnp.sqrt(column[..., j, None]))
+    return factor
 
 
 def is_spd(tensors: np.ndarray) -> np.ndarray:
@@ -159,7 +171,7 @@ def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
 
 @jax.custom_jvp
 def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    values, vectors = jnp.linalg.eigh(tensors)
+    values, vectors = _eigh(tensors)
     return _log_of_pairs(values, vectors)
 
 
@@ -167,11 +179,15 @@ def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d
 # eigenvalues meet; the derivatives of the eigenvectors are not.
 @_log_by_eigenvalues.defjvp
 def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    values, vectors = jnp.linalg.eigh(primals[0])
+    values, vectors = _eigh(primals[0])
     a, b = values[..., :, None], values[..., None, :]
     differences = 2 / (a + b) * _atanhc((a - b) / (a + b))
     inner = _matmul(_matmul(jnp.swapaxes(vectors, -1, -2), tangents[0]), vectors)
     return _log_of_pairs(values, vectors), _compose(vectors, differences * inner)
+
+
+def _eigh(tensors: Float[Array, "... d d"]) -> tuple[Float[Array, "... d"], Float[Array, "... d d"]]:
+    return jnp.vectorize(partial(differentiable_eigh, None), signature="(d,d)->(d),(d,d)")(tensors)
 
 
 def _log_of_pairs(values: Float[Array, "... d"], vectors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:

@@ -11,14 +11,13 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_number
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.standard_form import standard_form, transposed_solve
+from hks_jax.linear.standard_form import pencil_eigh
 
 
 class Dense(Eigensolver[SymmetricPencil]):
     """Cholesky reduction M = LLᵀ to L⁻¹KL⁻ᵀ, then `eigh`: O(n³) time, O(n²) memory, exact multiplicities."""
 
     name: ClassVar[str] = "dense"
-    batches: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
 
     def __check_init__(self) -> None:
@@ -36,7 +35,5 @@ class Dense(Eigensolver[SymmetricPencil]):
 
 @partial(jax.jit, static_argnames="k")
 def _dense(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"], k: int) -> RawPairs:
-    reduced, factor = standard_form(stiffness, mass)
-    values, vectors = jnp.linalg.eigh(reduced)
-    vectors = transposed_solve(factor, vectors[:, :k])
-    return values[:k], vectors.T, jnp.asarray(jnp.inf, values.dtype)
+    values, vectors = pencil_eigh(stiffness, mass, k)
+    return values, vectors.T, jnp.asarray(jnp.inf, values.dtype)

@@ -13,12 +13,12 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import unsolved
 from hks_jax.eigen.first_order import first_order_only
-from hks_jax.eigen.in_turn import in_turn
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.masks import mask_for
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.linear_map import with_transpose
+from hks_jax.linear.one_by_one import one_by_one
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products
 from hks_jax.traced import is_traced
@@ -101,7 +101,7 @@ def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
 
 def _solve_pencil(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: Report) -> RawPairs:
     """Return the solver's k lowest pairs."""
-    return solver.lowest(pencil, k, report) if solver.batches else in_turn(_lowest, (solver, k, report), pencil)
+    return one_by_one(_lowest, (solver, k, report), pencil)
 
 
 @partial(jax.jit, static_argnames="k")
@@ -115,7 +115,7 @@ def _cut(
 # Apart from the tangents, so that many products with one Jacobian share it.
 def prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Array, " p"]) -> Any:
     """Return what the adjoint needs for the first k of p computed pairs; None where it has nothing to solve."""
-    return in_turn(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
+    return one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
 
 
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
@@ -187,7 +187,7 @@ def _outside(
         return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
 
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return _told(telling, in_turn(_solve, (adjoint,), prepared, pencil, values, vectors, b))
+        return _told(telling, one_by_one(_solve, (adjoint,), prepared, pencil, values, vectors, b))
 
     # No force acts on the constants: they stay in the kernel of the stiffness. In reverse mode, where their rows are
     # cotangents, it is their solutions that do not count.
@@ -197,7 +197,7 @@ def _outside(
     return without_constants(jax.lax.custom_linear_solve(matvec, without_constants(rhs), solve, symmetric=True))
 
 
-# What `in_turn` calls are functions of the module, not methods, so that they are the same objects in every call.
+# What `one_by_one` calls are functions of the module, not methods, so that they are the same objects in every call.
 def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
     return solver.lowest(pencil, k, report)
 

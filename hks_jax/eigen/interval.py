@@ -10,10 +10,10 @@ from hks_jax.eigen.complement.interior import InteriorAdjoint
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import Certified, Telling, prepare, tangents_of
 from hks_jax.eigen.first_order import first_order_only
-from hks_jax.eigen.in_turn import in_turn
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.located import LocatedPencil, lowered, translated
 from hks_jax.eigen.solver import RawPairs, Report
+from hks_jax.linear.one_by_one import one_by_one
 from hks_jax.traced import is_traced
 
 
@@ -23,7 +23,7 @@ def in_interval(solver: BlockLanczos | Dense, pencil: LocatedPencil, k: int, thr
 
     All of it as `hks_jax.eigen.derivative.lowest` has it.
     """
-    values, vectors, bound = in_turn(_solve, (solver, k, 0, report), pencil)
+    values, vectors, bound = one_by_one(_solve, (solver, k, 0, report), pencil)
     return values, vectors, vectors, bound
 
 
@@ -43,7 +43,7 @@ def _in_interval_jvp(
     pencil, change = first_order_only(primals[0]), changes[0]
     room = min(solver.max_pairs(pencil.size), pencil.size) - k
     guards = max(min(2 * solver.guards(k, pencil.size), room), 0)
-    values, vectors, bound = in_turn(_solve, (solver, k, guards, report), pencil)
+    values, vectors, bound = one_by_one(_solve, (solver, k, guards, report), pencil)
     telling: Telling = "error" if throw else "nothing" if is_traced(primals) else "warning"
     adjoint = InteriorAdjoint(solver.adjoint.tolerance)
     prepared = prepare(adjoint, k, pencil, values)

@@ -45,14 +45,12 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     Attributes:
         name: what reports call the method.
-        batches: whether a batch under `vmap` is solved together on CPUs too, and not one problem after another.
         adjoint: what derivatives solve linear systems with; by default for any pencil that can be factorised.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, unless
             rounding in the matrices' dtype forbids it.
     """
 
     name: ClassVar[str]
-    batches: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
     adjoint: Adjoint = eqx.field(default=FactorisedAdjoint(), static=True, kw_only=True)
 

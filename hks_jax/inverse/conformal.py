@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.compilation import jit_quickly
+from hks_jax.domain import spd
 from hks_jax.inverse.smoothing import InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Nodal, Values
 
@@ -69,7 +70,7 @@ def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Arra
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)
     # Nodes outside the domain may hold anything; no edge leads there.
     metric = jnp.where(grid.inside[..., None, None], unknowns.init.domain_tensors, jnp.eye(grid.dimension))
-    inverse = jnp.linalg.inv(metric)
+    inverse = spd.inverse(metric)
     weights, rows = [], jnp.zeros_like(at_nodes)
     for axis in range(grid.dimension):
         size, along = (jnp.moveaxis(x, axis, 0) for x in (at_nodes, inverse[..., axis, axis]))

@@ -12,6 +12,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.metric_fit import MetricFit
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
+from hks_jax.linear import lapack
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 
 _ROUNDS = 4
@@ -172,14 +173,14 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
 
 
 def _orthonormal(rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    return jnp.linalg.qr(rows.T)[0].T
+    return lapack.orthonormal_columns(rows.T).T
 
 
 def _ritz(block: Array, image: Array, largest: bool) -> tuple[Array, Array]:
     """Return Ritz values and vectors in the span of orthonormal directions."""
     flat, images = block.reshape(len(block), -1), image.reshape(len(block), -1)
     projected = jnp.matmul(flat, images.T, precision="highest")
-    values, mix = jnp.linalg.eigh((projected + projected.T) / 2)
+    values, mix = lapack.eigh((projected + projected.T) / 2)
     mix = mix[:, ::-1] if largest else mix
     values = values[::-1] if largest else values
     return values, jnp.matmul(mix.T, flat, precision="highest").reshape(block.shape)

@@ -5,14 +5,17 @@ Every one of them gives symmetric positive definite tensors for any numbers.
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.domain import spd
+from hks_jax.linear.dense_eigh import differentiable_eigh
 
 Tensors = Float[Array, "n d d"]
 Parameters = Float[Array, "n c"]
@@ -59,7 +62,7 @@ class Cholesky(Parametrisation):
 
     def start(self, base: Tensors) -> Parameters:
         """Return the Cholesky factor of T₀."""
-        factor, d = jnp.linalg.cholesky(base), base.shape[-1]
+        factor, d = spd.cholesky(base), base.shape[-1]
         below = [factor[:, i, j] for i in range(d) for j in range(i)]
         return jnp.stack([*(jnp.log(factor[:, i, i]) for i in range(d)), *below], axis=-1)
 
@@ -98,7 +101,7 @@ class Eigenvalues(Parametrisation):
 
     def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
         """Return V diag(e^uᵢ λᵢ) Vᵀ."""
-        values, vectors = jnp.linalg.eigh(base)
+        values, vectors = jax.vmap(partial(differentiable_eigh, None))(base)
         return jnp.einsum("nia,na,nja->nij", vectors, jnp.exp(parameters) * values, vectors, precision="highest")
 
 

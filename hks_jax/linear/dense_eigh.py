@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import require_number
+from hks_jax.linear import lapack
 from hks_jax.linear.standard_form import checked_standard_form, transposed_solve
 
 
@@ -55,13 +56,19 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
         require_number("multiplet_tolerance", multiplet_tolerance, 1, inclusive=True)
     a, factor = checked_standard_form(A, B)
     tolerance = 4 * len(a) * float(jnp.finfo(a.dtype).eps) if multiplet_tolerance is None else multiplet_tolerance
-    values, vectors = _eigh(float(tolerance), a)
+    values, vectors = differentiable_eigh(float(tolerance), a)
     return DenseEigenpairs(values, vectors if factor is None else transposed_solve(factor, vectors))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _eigh(tolerance: float, a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    return tuple(jnp.linalg.eigh(a, symmetrize_input=False))
+def differentiable_eigh(
+    tolerance: float | None, a: Float[Array, "n n"]
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Return the eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors in columns.
+
+    With a tolerance, derivatives are those of `eigh`. Without one they are NaN where eigenvalues are equal.
+    """
+    return lapack.eigh(a)
 
 
 # From AV = VΛ and VᵀV = I, with G = VᵀȦV,
@@ -72,9 +79,9 @@ def _eigh(tolerance: float, a: Float[Array, "n n"]) -> tuple[Float[Array, " n"],
 # projector on it: there it may be set to zero. So may it in that of tr f(A) = Σ f(λᵢ), where no vector enters. The
 # derivative of 1/gap, which second derivatives take, is NaN there: a sum like Σᵢ f'(λᵢ) Gᵢᵢ changes with what this rule
 # leaves out.
-@_eigh.defjvp
-def _eigh_jvp(tolerance: float, primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
-    values, vectors = _eigh(tolerance, primals[0])
+@differentiable_eigh.defjvp
+def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
+    values, vectors = differentiable_eigh(tolerance, primals[0])
     change = jnp.matmul(tangents[0], vectors, precision="highest")
     change = jnp.matmul(vectors.T, change, precision="highest")
     rotation = (change + change.T) / 2 * _inverse_gaps(tolerance, values)
@@ -82,14 +89,15 @@ def _eigh_jvp(tolerance: float, primals: tuple[Array], tangents: tuple[Array]) -
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _inverse_gaps(tolerance: float, values: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return 1/(λⱼ − λᵢ), and 0 where λᵢ and λⱼ count as equal."""
+def _inverse_gaps(tolerance: float | None, values: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """Return 1/(λⱼ − λᵢ), and 0, or without a tolerance NaN, where λᵢ and λⱼ count as equal."""
     gap, apart = _gaps(tolerance, values)
-    return jnp.where(apart, 1 / jnp.where(apart, gap, 1), 0)
+    equal = 0 if tolerance is not None else jnp.where(jnp.eye(len(values), dtype=bool), 0, jnp.nan)
+    return jnp.where(apart, 1 / jnp.where(apart, gap, 1), equal)
 
 
 @_inverse_gaps.defjvp
-def _inverse_gaps_jvp(tolerance: float, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+def _inverse_gaps_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     values, change = primals[0], tangents[0]
     gap, apart = _gaps(tolerance, values)
     slope = jnp.where(apart, -1 / jnp.square(jnp.where(apart, gap, 1)), jnp.nan)
@@ -97,7 +105,7 @@ def _inverse_gaps_jvp(tolerance: float, primals: tuple[Array], tangents: tuple[A
     return _inverse_gaps(tolerance, values), slope * (change - change[:, None])
 
 
-def _gaps(tolerance: float, values: Float[Array, " n"]) -> tuple[Float[Array, "n n"], Bool[Array, "n n"]]:
+def _gaps(tolerance: float | None, values: Float[Array, " n"]) -> tuple[Float[Array, "n n"], Bool[Array, "n n"]]:
     """Return λⱼ − λᵢ in row i and column j, and where it is not zero but for the tolerance."""
     gap = values - values[:, None]
-    return gap, jnp.abs(gap) > tolerance * jnp.max(jnp.abs(values))
+    return gap, jnp.abs(gap) > (tolerance or 0) * jnp.max(jnp.abs(values))

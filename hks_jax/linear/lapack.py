@@ -1,24 +1,80 @@
-"""Batches of matrices for LAPACK where several devices share one CPU."""
+"""Decompositions of one small dense matrix, of which `vmap` makes a loop on CPUs: batches given to LAPACK can hang.
 
-from collections.abc import Callable
-from typing import TypeVar
+jaxlib 0.10.0 to 0.11.0 deal LAPACK's work on a batch out to the CPU's pool of threads and wait, in the thread that does
+so, until the others are done (`ParallelBatchMap`). Where that thread belongs to the pool itself and every other one
+waits likewise, nobody is left to do the work. This takes as many calls beside each other as the pool has threads: two
+computations that do not depend on each other, or two devices made out of one CPU. On two cores the smallest program is
+
+    @jax.jit
+    def hangs(factors):  # (2, 64, 32, 32); within the first hundred calls
+        return [solve_triangular(a, jnp.broadcast_to(jnp.eye(32), a.shape), lower=True) for a in factors]
+
+and batched `cholesky`, `eigh`, `inv` or `qr` do the same behind a product, or four of them without one. A call on one
+matrix, with less than 2·10⁵ operations or on a pool of one thread works at once and waits for nobody. So every
+computation of this package calls LAPACK through this file, matrix by matrix, and a user's own batch beside ours finds
+threads that do its work.
+"""
 
 import jax
-from jaxtyping import Array
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Inexact
 
-Output = TypeVar("Output")
+from hks_jax.linear.one_by_one import one_by_one
 
 
-def at_once_or_in_turn(function: Callable[[Array], Output], matrices: Array) -> Output:
-    """Apply a function of LAPACK to a batch: at once, or among several devices of one CPU one matrix after another.
+def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Return the eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors in columns.
 
-    Devices made out of one CPU share its pool of threads. With JAX 0.10, LAPACK's work on a batch is dealt out to that
-    pool by a thread that waits there: as soon as as many devices wait as there are threads, they wait for ever.
-
-    Args:
-        function: of matrices (m, …) or one matrix, differentiable or not.
-        matrices: (m, n, n).
+    Only the lower triangle is read. Not differentiable, as is nothing here: `hks_jax.linear.dense_eigh` has the rule.
     """
-    if not jax.sharding.get_abstract_mesh().manual_axes:
-        return function(matrices)
-    return jax.lax.platform_dependent(matrices, cpu=lambda batch: jax.lax.map(function, batch), default=function)
+    return one_by_one(_eigh, (), a)
+
+
+def _eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False)
+    return values, vectors
+
+
+def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the lower triangular L of A = LLᵀ, computed from A's lower triangle; NaN where A is not definite."""
+    return one_by_one(_cholesky, (), a)
+
+
+def _cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return jax.lax.linalg.cholesky(a, symmetrize_input=False)
+
+
+def triangular_solve(
+    factor: Float[Array, "n n"], columns: Float[Array, "n m"], transpose: bool = False
+) -> Float[Array, "n m"]:
+    """Return L⁻¹, or L⁻ᵀ, times the columns, L lower triangular."""
+    return one_by_one(_triangular_solve, (transpose,), factor, columns)
+
+
+def _triangular_solve(
+    transpose: bool, factor: Float[Array, "n n"], columns: Float[Array, "n m"]
+) -> Float[Array, "n m"]:
+    return jax.lax.linalg.triangular_solve(factor, columns, left_side=True, lower=True, transpose_a=transpose)
+
+
+def inverse_cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return L⁻¹ of A = LLᵀ; NaN where A is not definite."""
+    return one_by_one(_inverse_cholesky, (), a)
+
+
+def _inverse_cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return _triangular_solve(False, _cholesky(a), jnp.eye(len(a), dtype=a.dtype))
+
+
+def inverse(a: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+    """Return A⁻¹, A real or complex."""
+    return one_by_one(jnp.linalg.inv, (), a)
+
+
+def orthonormal_columns(a: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """Return Q of A = QR, n ≥ m."""
+    return one_by_one(_orthonormal_columns, (), a)
+
+
+def _orthonormal_columns(a: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    return jnp.linalg.qr(a)[0]

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.linear import lapack
 from hks_jax.linear.divided_differences import divided_difference, second_divided_difference
 from hks_jax.linear.linear_map import linear_map
 from hks_jax.linear.not_differentiable import not_differentiable
@@ -83,7 +84,7 @@ def _along(f: Function, parameters: Any, others: Any, change: Any) -> Callable[[
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _function(f: Function, parameters: Any, others: Any, a: Matrix) -> tuple[Matrix, Float[Array, " n"], Matrix]:
     """Return f(A), and the eigenvalues and eigenvectors of A as constants."""
-    values, vectors = jnp.linalg.eigh(a, symmetrize_input=False)
+    values, vectors = lapack.eigh(a)
     return _compose(vectors, jnp.diag(f(parameters, others, values))), values, vectors
 
 

@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from hks_jax.compilation import jit_quickly
+from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.level import Level
 from hks_jax.linear.merging import Merged
@@ -124,9 +125,8 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
     # Solutions have most of the eigenvector nearest to the shift, on which the error may be smaller than on others.
     products = gram(x, image)
     norms = jnp.sqrt(jnp.diagonal(products))
-    factor_of_products = jnp.linalg.cholesky(products / norms / norms[:, None])
     # Of a matrix this small the inverse is as good, and a long triangular solve is slow.
-    inverse = jax.scipy.linalg.solve_triangular(factor_of_products, jnp.diag(1 / norms), lower=True)
+    inverse = lapack.inverse_cholesky(products / norms / norms[:, None]) / norms
     defects, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
     return jnp.max(defects / images)
 

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
-from hks_jax.linear.lapack import at_once_or_in_turn
 from hks_jax.linear.multifrontal import eliminate, gather_symmetric, taken
 from hks_jax.linear.products import batched, transposed
 
@@ -80,7 +80,7 @@ def inversion_cost(dissection: Dissection) -> Cost:
 
 @jax.custom_jvp
 def _inverses(matrices: Inexact[Array, "m n n"]) -> Inexact[Array, "m n n"]:
-    return at_once_or_in_turn(jnp.linalg.inv, matrices)
+    return jax.vmap(lapack.inverse)(matrices)
 
 
 @_inverses.defjvp

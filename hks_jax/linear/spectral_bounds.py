@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.linear import lapack
+
 _FAILURE = 1e-6
 _START = 30
 """How far from uniform the start may be: the root of the condition of PD and more."""
@@ -56,4 +58,4 @@ def lanczos_bound(
     epsilon = (math.log(1.648 * _START * math.sqrt(n) / _FAILURE) / (2 * steps - 1)) ** 2
     if steps >= n:  # the whole space was seen
         epsilon = 1e-3
-    return jnp.linalg.eigvalsh(matrix)[-1] / (1 - epsilon)
+    return lapack.eigh(matrix)[0][-1] / (1 - epsilon)

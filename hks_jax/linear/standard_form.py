@@ -1,29 +1,79 @@
 """Dense symmetric pencils: checks of what users pass, and the reduction A − λB to a standard problem by Cholesky."""
 
+from functools import partial, reduce
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hks_jax.checks import real_array
+from hks_jax.linear import lapack
 from hks_jax.traced import is_traced
 
 
+@jax.custom_jvp
 def standard_form(a: Float[Array, "n n"], b: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Return L⁻¹AL⁻ᵀ and the lower triangular L of B = LLᵀ; NaN where B is not positive definite.
 
     Where w is an eigenvector of the first, L⁻ᵀw is one of Av = λBv.
     """
-    factor = jnp.linalg.cholesky(b)
-    half = solve_triangular(factor, a, lower=True)
-    return solve_triangular(factor, half.T, lower=True), factor
+    factor = lapack.cholesky(b)
+    half = lapack.triangular_solve(factor, a)
+    return lapack.triangular_solve(factor, half.T), factor
 
 
+# With P lower triangular and L̇ = LP, Ḃ = L̇Lᵀ + LL̇ᵀ says P + Pᵀ = L⁻¹ḂL⁻ᵀ; and Ċ = L⁻¹ȦL⁻ᵀ − PC − CPᵀ of C = L⁻¹AL⁻ᵀ.
+@standard_form.defjvp
+def _standard_form_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[tuple, tuple]:
+    reduced, factor = standard_form(*primals)
+    inverse = _triangular_inverse(factor)
+    of_a, of_b = (_product(inverse, tangent, inverse.T) for tangent in tangents)
+    p = jnp.tril(of_b) - jnp.diag(jnp.diagonal(of_b)) / 2
+    change = _product(p, reduced)
+    return (reduced, factor), (of_a - change - change.T, _product(factor, p))
+
+
+@jax.custom_jvp
 def transposed_solve(factor: Float[Array, "n n"], columns: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Return L⁻ᵀ times the columns."""
-    return solve_triangular(factor, columns, trans="T", lower=True)
+    return lapack.triangular_solve(factor, columns, transpose=True)
+
+
+# Lᵀx = c: ẋ = L⁻ᵀ(ċ − L̇ᵀx).
+@transposed_solve.defjvp
+def _transposed_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    x, (d_factor, d_columns) = transposed_solve(*primals), tangents
+    return x, _product(_triangular_inverse(primals[0]).T, d_columns - _product(d_factor.T, x))
+
+
+# (L⁻¹)˙ = −L⁻¹L̇L⁻¹.
+@jax.custom_jvp
+def _triangular_inverse(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return lapack.triangular_solve(factor, jnp.eye(len(factor), dtype=factor.dtype))
+
+
+@_triangular_inverse.defjvp
+def _triangular_inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    inverse = _triangular_inverse(*primals)
+    return inverse, -_product(inverse, *tangents, inverse)
+
+
+def _product(*matrices: Float[Array, "_ _"]) -> Float[Array, "_ _"]:
+    return reduce(partial(jnp.matmul, precision="highest"), matrices)
+
+
+def pencil_eigh(
+    a: Float[Array, "n n"], b: Float[Array, "n n"], k: int | None = None
+) -> tuple[Float[Array, " k"], Float[Array, "n k"]]:
+    """Return the k lowest eigenvalues of a pencil, or all, and B-orthonormal eigenvectors in columns.
+
+    Not differentiable.
+    """
+    reduced, factor = standard_form(a, b)
+    values, vectors = lapack.eigh(reduced)
+    return values[:k], transposed_solve(factor, vectors[:, :k])
 
 
 def checked_standard_form(A: Any, B: Any) -> tuple[Float[Array, "n n"], Float[Array, "n n"] | None]:

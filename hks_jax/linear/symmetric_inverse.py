@@ -1,14 +1,12 @@
 """The inverses of a batch of symmetric indefinite matrices together with their inertia."""
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hks_jax.linear import accelerators, sweep_kernel
-from hks_jax.linear.lapack import at_once_or_in_turn
+from hks_jax.linear import accelerators, lapack, sweep_kernel
 from hks_jax.linear.products import batched, even_size, transposed
 
 Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
@@ -43,13 +41,7 @@ def by_cholesky_factors(matrices: Float[Array, "m n n"]) -> Inverses:
 
     That takes a third of the time.
     """
-
-    def inverted(matrices: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
-        factors = jax.lax.linalg.cholesky(matrices, symmetrize_input=False)
-        identity = jnp.broadcast_to(jnp.eye(matrices.shape[-1], dtype=matrices.dtype), matrices.shape)
-        return jax.lax.linalg.triangular_solve(factors, identity, left_side=True, lower=True)
-
-    inverses = at_once_or_in_turn(inverted, matrices)
+    inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2)
     return jax.lax.cond(
         jnp.all(pivots > 0),  # they are NaN where a matrix is not definite
@@ -66,8 +58,7 @@ def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -
     """
     n = matrices.shape[1]
     if n <= _BLOCK:
-        eigh = partial(jax.lax.linalg.eigh, symmetrize_input=False)
-        vectors, values = at_once_or_in_turn(eigh, matrices)
+        values, vectors = jax.vmap(lapack.eigh)(matrices)
         values = _away_from_zero(values, least[:, None])
         return batched(vectors / values[:, None, :], transposed(vectors)), values
     if n <= _LARGE:

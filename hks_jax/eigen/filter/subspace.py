@@ -14,6 +14,7 @@ from hks_jax.fem.columns import product_with_rim, side_by_side, stencil, to_colu
 from hks_jax.fem.halo import Slabs
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.products import combine
+from hks_jax.linear.standard_form import pencil_eigh
 
 _CHUNK = 1 << 14
 """Nodes rotated at once."""
@@ -58,11 +59,8 @@ def rayleigh_ritz(
 
     both = total(slabs, jax.lax.map(products, jnp.arange(m // block)))
     stiffness, mass = (jnp.moveaxis(p, 0, 1).reshape(m, m) for p in both)
-    factor = jnp.linalg.cholesky((mass + mass.T) / 2)
-    half = jax.scipy.linalg.solve_triangular(factor, (stiffness + stiffness.T) / 2, lower=True)
-    values, mix = jnp.linalg.eigh(jax.scipy.linalg.solve_triangular(factor, half.T, lower=True))
-    mix = jax.scipy.linalg.solve_triangular(factor, mix, lower=True, trans=1).T
-    values, mix = first_of(slabs, values), first_of(slabs, mix)
+    values, vectors = pencil_eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
+    values, mix = first_of(slabs, values), first_of(slabs, vectors.T)
 
     def rotate(number: Array, x: Array) -> Array:
         rotated = combine(mix, jax.lax.dynamic_slice_in_dim(x, number * _CHUNK, _CHUNK, axis=1))

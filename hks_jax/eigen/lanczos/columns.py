@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.linear import accelerators, column_kernels
+from hks_jax.linear import accelerators, column_kernels, lapack
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import gram, times
 
@@ -85,6 +85,6 @@ def _factored(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float
     """Return F with FFᵀ = G, the inner products, and F⁻ᵀ."""
     norms = jnp.sqrt(jnp.diagonal(products))
     norms = jnp.where(norms > 0, norms, 1)
-    sizes, mix = jnp.linalg.eigh(products / norms / norms[:, None])
+    sizes, mix = lapack.eigh(products / norms / norms[:, None])
     sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(products.dtype).eps * sizes[-1]))
     return norms[:, None] * mix * sizes, mix / sizes / norms[:, None]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.basis import Basis, begin, combined, within, write
 from hks_jax.eigen.lanczos.columns import orthonormal, recur, without
-from hks_jax.linear import accelerators
+from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.multifrontal import Factorisation
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, products_with_columns
@@ -254,6 +254,6 @@ def _ritz_pairs(
     full = jnp.zeros((room, b, room, b), below.dtype).at[i, :, i, :].set(diagonal)
     full = full.at[i[:-1], :, i[1:], :].set(below)
     full = full.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
-    theta, modes = jnp.linalg.eigh(full.reshape(room * b, room * b))
+    theta, modes = lapack.eigh(full.reshape(room * b, room * b))
     order = jnp.argsort(-jnp.abs(theta))[:wanted]
     return theta[order], combined(jnp.pad(modes[:, order].T, ((0, 0), (offset, 0))), state.basis)

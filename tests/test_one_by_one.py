@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.eigen.in_turn import in_turn
+from hks_jax.linear.one_by_one import one_by_one
 
 
 def halvings(most, x, unit):
@@ -18,7 +18,7 @@ def halvings(most, x, unit):
 
 
 def run(values, unit):
-    return in_turn(halvings, (6,), {"value": values}, unit)
+    return one_by_one(halvings, (6,), {"value": values}, unit)
 
 
 VALUES, UNITS = np.array([[0.5, 1.0, 5.0], [9.0, 100.0, 1e9]]), np.array([1.0, 2.0])
@@ -52,5 +52,5 @@ def test_on_a_cpu_it_is_a_loop_and_elsewhere_one_computation():
 
 def test_plain_values_are_not_traced():
     seen = []
-    in_turn(lambda x: seen.append(isinstance(x, jax.core.Tracer)), (), jnp.ones(3))
+    one_by_one(lambda x: seen.append(isinstance(x, jax.core.Tracer)), (), jnp.ones(3))
     assert seen == [False]

@@ -1,4 +1,4 @@
-"""Batches of eigenproblems: one after another where a device gains nothing from taking them together."""
+"""Batches of problems: one after another where a device gains nothing from taking them together."""
 
 import contextlib
 from collections.abc import Callable, Hashable, Sequence
@@ -14,7 +14,7 @@ from hks_jax.traced import is_traced
 # Of a batch taken together, every loop runs until its last problem is done, both branches of a condition are computed,
 # and the factorisations no longer fit into a CPU's cache: that took three times as long as one after another. One
 # problem alone leaves most of an accelerator idle, though.
-def in_turn(function: Callable[..., Any], settings: tuple[Hashable, ...], *args: Any) -> Any:
+def one_by_one(function: Callable[..., Any], settings: tuple[Hashable, ...], *args: Any) -> Any:
     """Return function(*settings, *args), mapped over the problems of a batch one by one where `vmap` runs on a CPU.
 
     Not differentiable; derivative rules may call it.
@@ -57,7 +57,7 @@ def _batch(
         return call(*jax.tree.unflatten(structure, whole))
 
     # A batch of batches comes one by one, too.
-    alone = partial(problem, partial(in_turn, function, settings))
+    alone = partial(problem, partial(one_by_one, function, settings))
     together = jax.vmap(partial(problem, partial(function, *settings)))
     own = [leaf for of_batch, leaf in zip(batched, leaves, strict=True) if of_batch]
     return jax.lax.platform_dependent(own, cpu=partial(jax.lax.map, alone), default=together)

@@ -1,0 +1,40 @@
+"""No program stops for ever: linear algebra beside other linear algebra, compiled as users have it."""
+
+import re
+from pathlib import Path
+
+import pytest
+from concurrent_programs import PROGRAMS, run
+
+PACKAGE = Path(__file__).parent.parent / "hks_jax"
+
+
+def test_a_program_that_stopped_within_two_calls():
+    run(["count, mirror"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", [name for name in PROGRAMS if name != "fit"])
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_a_program_ends(program, threads):
+    run([program], threads=threads)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", ["gradients on devices", "gradient, mean"])
+def test_devices_of_one_cpu_do_not_wait_for_each_other(program):
+    run([program], devices=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_a_fit_ends(threads):
+    run(["fit"], calls=4, threads=threads)
+
+
+def test_nothing_else_calls_lapack():
+    call = re.compile(
+        r"(?<!np\.)linalg\.(cholesky|eig\w*|inv|lu\w*|pinv|qr|slogdet|solve\w*|svd\w*|triangular_solve)\("
+    )
+    files = [path for path in PACKAGE.rglob("*.py") if path.name != "lapack.py"]
+    assert [path.name for path in files if call.search(path.read_text().replace("jnp.", "jax.numpy."))] == []
