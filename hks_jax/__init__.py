@@ -29,7 +29,6 @@ from hks_jax.eigen.count import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
 from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
-from hks_jax.eigen.eigsh import MatrixEigenpairs as MatrixEigenpairs
 from hks_jax.eigen.eigsh import eigsh as eigsh
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter as ChebyshevFilter
 from hks_jax.eigen.host.complement import HostAdjoint as HostAdjoint
@@ -42,11 +41,11 @@ from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import reflect as reflect
 from hks_jax.fem.pencil import MirrorPencil as MirrorPencil
 from hks_jax.fem.pencil import Pencil as Pencil
+from hks_jax.fem.sparse_input import sparse_pencil as sparse_pencil
 from hks_jax.linear.dense_eigh import DenseEigenpairs as DenseEigenpairs
 from hks_jax.linear.dense_eigh import eigh as eigh
 from hks_jax.linear.matrix_function import matrix_function as matrix_function
 from hks_jax.linear.pencil import SymmetricPencil as SymmetricPencil
-from hks_jax.linear.sparse_input import sparse_pencil as sparse_pencil
 from hks_jax.signatures.boundary import boundary_influence as boundary_influence
 from hks_jax.signatures.custom import spectral_signature as spectral_signature
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance

@@ -344,7 +344,7 @@ def test_other_bad_arguments(pairs):
     with pytest.raises(ValueError, match="n: got 0"):
         hj.default_times(pairs, 0)
     alone = hj.eigenpairs(flat((5, 6), (1.0, 1.2)), 1)
-    with pytest.raises(ValueError, match="all 1 eigenvalues kept are zero"):
+    with pytest.raises(ValueError, match="none of the 1 eigenvalues that are kept is positive"):
         hj.default_times(alone)
 
 

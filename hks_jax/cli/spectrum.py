@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> None:
             "input": describe_input(volume, field.grid.mask),
             "settings": {**chosen, "k": pairs.k},
             "eigenpairs": describe_pairs(pairs),
-            "volume": float(pairs.pencil.volume),
+            "volume": np.asarray(pairs.pencil.volume).item(),
             "eigenvalues": columns["eigenvalue"].tolist(),
         }
         with progress.stage("writing", str(args.output)), atomic_folder(args.output) as folder:

@@ -9,7 +9,7 @@ from hks_jax.eigen.complement.factorised import FactorisedAdjoint
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.host.shift_invert import ShiftInvert
-from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
+from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos, known_by_weyl
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
@@ -76,6 +76,8 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
+    if not known_by_weyl(pencil):
+        return BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
     exact = pencil.stiffness.dtype == np.float64
     # In 3D factorisations fill in, and in float32 they lose too many digits.
     matrix_free = isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)

@@ -123,6 +123,8 @@ def count_once(
 
 def _smallest_scale(pencil: SymmetricPencil | MirrorPencil) -> Float[Array, ""]:
     """Return the least distance of eigenvalues to expect: what σ near zero is compared with."""
-    if isinstance(pencil, Pencil | MirrorPencil):
+    if isinstance(pencil, Pencil | MirrorPencil) and pencil.measured:
+        assert pencil.volume is not None
         return 1 / pencil.volume ** (2 / pencil.space.dimension)
+    assert isinstance(pencil, SymmetricPencil)
     return indistinct(pencil, pencil.stiffness.dtype)

@@ -1,4 +1,4 @@
-"""The lowest eigenpairs of a pencil, and their derivatives with respect to stiffness and mass."""
+"""Eigenpairs of a pencil, the lowest or those from an origin, and their derivatives by stiffness and mass."""
 
 from functools import partial
 from typing import Any, Literal
@@ -12,11 +12,13 @@ from jaxtyping import Array, Float
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import unsolved
+from hks_jax.eigen.complement.interior import InteriorAdjoint
 from hks_jax.eigen.first_order import first_order_only
+from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
-from hks_jax.fem.masks import mask_for
 from hks_jax.fem.pencil import Pencil
+from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import with_transpose
 from hks_jax.linear.one_by_one import one_by_one
 from hks_jax.linear.pencil import SymmetricPencil
@@ -27,25 +29,29 @@ Telling = Literal["nothing", "warning", "error"]
 """What follows where the derivative does not converge, besides NaN."""
 
 Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
-Certified = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""]]
 Followed = tuple[
     Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""], Float[Array, ""]
 ]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5))
-def lowest(
-    solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, throw: bool, report: Report = silent
+@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5, 6))
+def solved(
+    solver: Eigensolver,
+    pencil: SymmetricPencil,
+    k: int,
+    extra: int,
+    interior: bool,
+    throw: bool,
+    report: Report = silent,
 ) -> Followed:
-    """Return the k lowest eigenvalues, their eigenvectors, these again as the frame, what follows, and a bound.
+    """Return k eigenvalues, their eigenvectors, these again as the frame, the next eigenvalue, and a bound.
 
-    The derivative of the frame is that of the eigenvectors without what rotates them among the k. What follows is the
-    next eigenvalue, where one ``extra`` is asked for, else infinity; the bound is the solver's: both are constants to
-    derivatives. Where the derivative does not converge it is NaN: an error, if ``throw``; else a warning where values
-    are concrete.
+    The pairs are the lowest ones or, if ``interior``, the first from the origin of a `LocatedPencil` upwards. The
+    derivative of the frame is that of the eigenvectors without what rotates them among the k. The next eigenvalue is
+    infinite unless one ``extra`` is asked for; the bound is the solver's. Both are constants to derivatives. Where the
+    derivative does not converge it is NaN: an error, if ``throw``; else a warning where values are concrete.
     """
-    values, vectors, complete_below = _solve_pencil(solver, pencil, k + extra, report)
-    values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
+    values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)
     return values, vectors, vectors, following, complete_below
 
@@ -60,7 +66,8 @@ def lowest(
 #
 # on the M-orthogonal complement of the computed Φ, where K − λᵢM is positive definite. The map fᵢ ↦ xᵢ is symmetric,
 # which gives reverse mode. The solver computes some guard pairs beyond k, so that λᵢ keeps a distance from what is
-# left to the linear solve.
+# left to the linear solve. In the interior of a spectrum eigenvalues are left on both sides, and there are guards on
+# both sides: the origin is lowered past at most half of them, and the rest are those that follow the k.
 #
 # Within a multiple eigenvalue the rotation (j ≠ i, λᵢ = λⱼ) is a matter of gauge: a perturbation may choose any basis
 # there. The rule takes −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN; and so it does where the gap is
@@ -68,40 +75,49 @@ def lowest(
 # simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What does not depend on the basis, such
 # as every spectral function, must not be computed from that gauge. For it there is the frame: its derivative has the
 # sum over j > k alone, which no basis of the first k changes (hks_jax/signatures/spectral.py).
-@lowest.defjvp
-def _lowest_jvp(
+@solved.defjvp
+def _solved_jvp(
     solver: Eigensolver,
     k: int,
     extra: int,
+    interior: bool,
     throw: bool,
     report: Report,
     primals: tuple[SymmetricPencil],
     changes: tuple[SymmetricPencil],
 ) -> tuple[Followed, Followed]:
     pencil, change = first_order_only(primals[0]), changes[0]
-    n_dof = pencil.size
-    total = max(k + extra, min(k + solver.guards(k, n_dof), solver.max_pairs(n_dof)))
-    values, vectors, complete_below = _solve_pencil(solver, pencil, total, report)
-    values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
-    quiet = is_traced(primals) or solver.adjoint.warns
+    n_dof, sides = pencil.size, 2 if interior else 1
+    spare = max(extra, min(sides * solver.guards(k, n_dof), min(solver.max_pairs(n_dof), n_dof) - k))
+    values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
+    adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
+    quiet = is_traced(primals) or adjoint.warns
     telling: Telling = "error" if throw else "nothing" if quiet else "warning"
-    prepared = prepare(solver.adjoint, k, pencil, values)
+    prepared = prepare(adjoint, k, pencil, values)
     eigenvalues, functions, following = _cut(values, vectors, k)
     known = prepared, _matrices(pencil), change, values, vectors, functions
-    tangents = tangents_of(solver.adjoint, telling, *known)
-    constants = following, complete_below
+    tangents = tangents_of(adjoint, telling, *known)
+    constants = following if extra else jnp.full_like(following, jnp.inf), complete_below
     return (eigenvalues, functions, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
 # The transpose keeps what its arguments have, needed or not.
 def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
     """Return a pencil without estimates of its resolution."""
-    return eqx.tree_at(lambda p: p.resolution, pencil, None) if isinstance(pencil, Pencil) else pencil
+    if not isinstance(pencil, Pencil) or pencil.resolution is None:
+        return pencil
+    return eqx.tree_at(lambda p: p.resolution, pencil, None)
 
 
-def _solve_pencil(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: Report) -> RawPairs:
-    """Return the solver's k lowest pairs."""
-    return one_by_one(_lowest, (solver, k, report), pencil)
+def _computed(
+    solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
+) -> RawPairs:
+    """Return k pairs and some spare ones."""
+    if interior:
+        return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
+    values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
+    values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
+    return values, vectors, bound
 
 
 @partial(jax.jit, static_argnames="k")
@@ -120,7 +136,7 @@ def prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Arr
 
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     """Return whether derivatives of the first k of p computed pairs have parts in other eigenvectors."""
-    return p < pencil.size and pencil.n_null < k
+    return p < pencil.size and pencil.n_fixed < k
 
 
 # What else were kept for the transpose would be copies of the eigenvectors.
@@ -181,7 +197,7 @@ def _outside(
     rhs: Float[Array, "k n_dof"],
 ) -> Float[Array, "k n_dof"]:
     """Solve (K − λᵢM) xᵢ = Q rhsᵢ on the complement of the p computed eigenvectors."""
-    shifts, n_null = values[: len(rhs), None], pencil.n_null
+    shifts, n_fixed = values[: len(rhs), None], pencil.n_fixed
 
     def matvec(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
@@ -189,12 +205,12 @@ def _outside(
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return _told(telling, one_by_one(_solve, (adjoint,), prepared, pencil, values, vectors, b))
 
-    # No force acts on the constants: they stay in the kernel of the stiffness. In reverse mode, where their rows are
+    # No force acts on null vectors that every perturbation annihilates. In reverse mode, where their rows are
     # cotangents, it is their solutions that do not count.
-    def without_constants(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return jnp.where(np.arange(len(x))[:, None] < n_null, 0, x)
+    def moved(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        return jnp.where(np.arange(len(x))[:, None] < n_fixed, 0, x)
 
-    return without_constants(jax.lax.custom_linear_solve(matvec, without_constants(rhs), solve, symmetric=True))
+    return moved(jax.lax.custom_linear_solve(matvec, moved(rhs), solve, symmetric=True))
 
 
 # What `one_by_one` calls are functions of the module, not methods, so that they are the same objects in every call.
@@ -230,18 +246,19 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
 def _exact_null_modes(
     pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    """Put the constants, which the stiffness annihilates exactly, in place of the solver's approximations to them.
+    """Put the null vectors, which the stiffness annihilates exactly, in place of the solver's approximations to them.
 
     Their eigenvalue is 0 and not the ±1e-13 of a solver; what rounding left of them in the other vectors is taken out.
     """
-    mass, dtype = pencil.mass, values.dtype
-    assert isinstance(pencil, Pencil)
+    mass, product = pencil.mass, partial(jnp.matmul, precision="highest")
+    assert pencil.null_space is not None
     n_null = min(pencil.n_null, values.size)
     # The barrier keeps XLA from computing with long constants while it compiles.
-    labelled = mask_for(vectors, pencil.space.null_labels == np.arange(n_null)[:, None])
-    constants = jax.lax.optimization_barrier(jnp.asarray(labelled).astype(dtype))
-    constants /= jnp.sqrt(jnp.sum(constants * mass.apply(constants), axis=1, keepdims=True))
-    share = jnp.matmul(vectors, mass.apply(constants).T, precision="highest")
-    vectors = vectors - jnp.matmul(share, constants, precision="highest")
+    nulls = jax.lax.optimization_barrier(pencil.null_space.vectors[:n_null])
+    lengths = jnp.sqrt(jnp.sum(nulls * mass.apply(nulls), axis=1, keepdims=True))
+    nulls = nulls / lengths
+    nulls = product(lapack.inverse_cholesky(product(nulls, mass.apply(nulls).T)), nulls)
+    share = product(vectors, mass.apply(nulls).T)
+    vectors = vectors - product(share, nulls)
     vectors = vectors / jnp.sqrt(1 - jnp.sum(share * share, axis=1, keepdims=True))
-    return values.at[:n_null].set(0), vectors.at[:n_null].set(constants)
+    return values.at[:n_null].set(0), vectors.at[:n_null].set(nulls)

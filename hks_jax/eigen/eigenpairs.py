@@ -1,4 +1,4 @@
-"""Eigenpairs of the Laplace–Beltrami operator, and what is known of their quality."""
+"""Eigenpairs, and what is known of their quality."""
 
 from typing import Any
 
@@ -13,6 +13,7 @@ from hks_jax.eigen.messages import messages
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.traced import is_traced
 
 
 class RESULTS(eqx.Enumeration):
@@ -42,29 +43,37 @@ def result_of(
 
 
 class Eigenpairs(eqx.Module):
-    """The k lowest eigenpairs of Kφ = λMφ; a pytree.
+    """The k lowest eigenpairs of Kφ = λMφ, or those in an interval; a pytree.
 
-    The derivatives of signatures with respect to tensors run through `pencil` and `frame`, not through `eigenvalues`
-    and `vectors`. Pairs whose arrays were replaced may be differentiated with respect to the replacement alone: rescale
-    times or the pencil instead.
+    The derivatives of signatures with respect to the matrices run through `pencil` and `frame`, not through
+    `eigenvalues` and `vectors`. Pairs whose arrays were replaced may be differentiated with respect to the replacement
+    alone: rescale times or the pencil instead.
 
     Attributes:
-        eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for the constant of each natural component.
+        eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for null vectors.
         vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the doubled domain under "mirror"
             and "mean", that is 1/√2 of it here, for each doubling).
         frame: (k, n_dof) the same numbers; only their derivative differs. It leaves out the rotations of the
             eigenfunctions among themselves, which are singular at multiple eigenvalues and of no use to signatures.
-        residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁).
+        residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), λ₁ the first positive eigenvalue. Where nothing is known of
+            the null space, and in an interval, they are relative to the distance of λ from the origin, at least to the
+            mean distance of eigenvalues.
         converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
         kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was
             dropped or completed: then signatures leave out the last pairs, those that are not kept.
         part: (k,) under "mirror" and "mean", which of the problems a pair comes from (0: the Neumann problem); else 0.
-        next_eigenvalue: the first eigenvalue not kept; infinite if there is none. Constant to derivatives.
+        next_eigenvalue: the first eigenvalue not kept; infinite if there is none, or none is known, as after an
+            interval. Constant to derivatives.
         complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
-            because all were computed. NaN where there is none. Constant to derivatives.
-        multiplet_tolerance: the relative gap below which neighbouring eigenvalues count as one multiple eigenvalue.
+            because all were computed; in an interval, none between its lower end and the bound. NaN where there is
+            none. Constant to derivatives.
+        origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else a number at or just below the lowest one; the
+            lower end of an interval.
+        multiplet_tolerance: the gap, relative to the distance from the origin, below which neighbouring eigenvalues
+            count as one multiple eigenvalue.
         pencil: the matrices.
         solver_name: the method that found them.
+        lowest: whether these are the lowest pairs, and not those in an interval.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -76,9 +85,11 @@ class Eigenpairs(eqx.Module):
     part: Int[Array, " k"]
     next_eigenvalue: Float[Array, ""]
     complete_below: Float[Array, ""]
+    origin: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
     pencil: Pencil | MirrorPencil
     solver_name: str = eqx.field(static=True)
+    lowest: bool = eqx.field(static=True, default=True)
 
     def __repr__(self) -> str:
         """Return one line; `summary` says more."""
@@ -105,8 +116,20 @@ class Eigenpairs(eqx.Module):
 
     @property
     def n_null(self) -> int:
-        """The number of zero eigenvalues among the k."""
-        return min(self.k, sum(part.space.n_null for part in self.pencil.parts))
+        """The number of zero eigenvalues among the k.
+
+        Raises:
+            ValueError: values are traced, and nothing is known of the null space.
+        """
+        if self.lowest and all(part.null_space is not None for part in self.pencil.parts):
+            return min(self.k, sum(part.n_null for part in self.pencil.parts))
+        values = jax.lax.stop_gradient(self.eigenvalues)
+        if is_traced(values):
+            raise ValueError(
+                "pairs: how many eigenvalues are zero is not known where values are traced; give `sparse_pencil` the "
+                "null vectors"
+            )
+        return int((values == 0).sum())
 
     @property
     def last_eigenvalue(self) -> Float[Array, ""]:
@@ -116,13 +139,16 @@ class Eigenpairs(eqx.Module):
     @property
     def cut_multiplet(self) -> Array:
         """How many of the last kept pairs belong to a multiple eigenvalue that the truncation cuts; 0 if none is."""
-        known = self.eigenvalues, self.kept, self.next_eigenvalue, self.multiplet_tolerance
-        return _cut_multiplet(*jax.lax.stop_gradient(known))
+        known = self.eigenvalues, self.kept, self.next_eigenvalue, self.origin, self.multiplet_tolerance
+        return _cut_multiplet(*jax.lax.stop_gradient(known)) if self.k else jnp.zeros((), int)
 
     @property
     def unconfirmed(self) -> Bool[Array, ""]:
         """Whether the solver has a certificate, and it ends before the last eigenvalue."""
-        return self.complete_below < self.last_eigenvalue * (1 - 2 * self.multiplet_tolerance)
+        if not self.k:
+            return jnp.zeros((), bool)
+        allowed = 2 * self.multiplet_tolerance * (self.last_eigenvalue - self.origin)
+        return self.complete_below < self.last_eigenvalue - allowed
 
     @property
     def result(self) -> RESULTS:
@@ -131,6 +157,8 @@ class Eigenpairs(eqx.Module):
 
     def messages(self) -> list[str]:
         """Say in sentences what limits these pairs; empty if nothing does. Needs concrete values."""
+        if not self.k:
+            return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
         return messages(self, int(self.kept.sum()), int(self.cut_multiplet), other)
 
@@ -152,6 +180,14 @@ class Eigenpairs(eqx.Module):
         return "\n".join(lines + self.messages())
 
 
+def multiplet_gap(
+    values: Float[Array, "*k"], origin: Float[Array, ""], tolerance: Float[Array, ""]
+) -> Float[Array, "*k"]:
+    """Return the gaps up to which the next eigenvalues count as copies."""
+    finfo = jnp.finfo(values.dtype)
+    return tolerance * jnp.maximum(jnp.maximum(values - origin, finfo.eps * jnp.abs(values)), finfo.tiny)
+
+
 @jax.jit
 def _last(values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, ""]:
     return values[jnp.sum(kept) - 1]
@@ -162,9 +198,10 @@ def _cut_multiplet(
     values: Float[Array, " k"],
     kept: Bool[Array, " k"],
     next_eigenvalue: Float[Array, ""],
+    origin: Float[Array, ""],
     multiplet_tolerance: Float[Array, ""],
 ) -> Int[Array, ""]:
     last = _last(values, kept)
-    tolerance = multiplet_tolerance * jnp.maximum(last, jnp.finfo(last.dtype).tiny)
+    tolerance = multiplet_gap(last, origin, multiplet_tolerance)
     together = jnp.sum(kept & (values >= last - tolerance))
     return jnp.where(next_eigenvalue - last <= tolerance, together, 0)

@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.count import count_once
 from hks_jax.linear.dissection import Dissection, dissect
-from hks_jax.linear.operators import SparseOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
@@ -30,6 +29,7 @@ class LocatedPencil(SymmetricPencil):
     Attributes:
         stiffness: K − σ₀M.
         mass: M.
+        null_space: None: that of K belongs to another eigenvalue here.
         negative: how many eigenvalues lie below the origin.
         first: a number above the origin with about as many eigenvalues below it as were asked for.
         spacing: the mean distance of eigenvalues between the two.
@@ -48,9 +48,7 @@ def translated(
     spacing: Float[Array, ""],
 ) -> LocatedPencil:
     """Return the pencil whose eigenvalues are counted from the origin."""
-    stiffness = pencil.stiffness
-    assert isinstance(stiffness, SparseOperator)
-    moved = SparseOperator(pencil.shifted(jax.lax.stop_gradient(origin)), stiffness.pattern)
+    moved = pencil.stiffness.with_flat(pencil.shifted(jax.lax.stop_gradient(origin)))
     return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)))
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
-from hks_jax.eigen.part import solve_part
+from hks_jax.eigen.part import solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.pencil import MirrorPencil
@@ -41,7 +41,7 @@ def solve_mirror(
     ]
     problems = zip(parts, solvers, wanted, strict=True)
     solved = [
-        solve_part(part, solver, size, 0, name, throw, _of_problem(report, number, len(parts)))
+        solve_lowest(part, solver, size, 0, name, throw, _of_problem(report, number, len(parts)))
         for number, (part, solver, size) in enumerate(problems)
     ]
     while not traced:
@@ -57,8 +57,14 @@ def solve_mirror(
             break
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
-            solved[i] = solve_part(parts[i], solvers[i], wanted[i], 0, name, throw, report)
+            solved[i] = solve_lowest(parts[i], solvers[i], wanted[i], 0, name, throw, report)
     return _merge(pencil, tuple(solved), k, extra, name)
+
+
+def solve_intervals(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> Eigenpairs:
+    """Return the pairs in an interval of all problems."""
+    name = " + ".join(dict.fromkeys(pairs.solver_name for pairs in solved))
+    return _merge(pencil, solved, sum(pairs.k for pairs in solved), 0, name)
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
@@ -105,15 +111,17 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: 
         part=part,
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
         complete_below=jnp.min(jnp.stack([_complete_below(pairs) for pairs in solved])),
+        origin=solved[0].origin,
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         pencil=pencil,
         solver_name=name,
+        lowest=solved[0].lowest,
     )
 
 
 def _complete_below(pairs: Eigenpairs) -> Float[Array, ""]:
     """Return the bound below which a part's pairs are complete: of those beyond its last, nothing is known here."""
-    if pairs.k == pairs.space.n_dof:
+    if pairs.k == pairs.space.n_dof or not pairs.lowest:
         return pairs.complete_below
     return jnp.minimum(pairs.complete_below, pairs.eigenvalues[-1])
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, multiplet_gap
 
 MultipletChoice = Literal["report", "drop", "complete"]
 
@@ -32,7 +32,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
             (unless nothing would be left); ``"complete"`` takes its missing copies in if there are at most `SPARE`,
             and else drops it.
     """
-    known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.multiplet_tolerance
+    known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.origin, pairs.multiplet_tolerance
     chosen = _choose(*jax.lax.stop_gradient(known), k, multiplet)
     return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), pairs, chosen)
 
@@ -41,6 +41,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
 def _choose(
     values: Float[Array, " n"],
     following: Float[Array, ""],
+    origin: Float[Array, ""],
     multiplet_tolerance: Float[Array, ""],
     k: int,
     multiplet: MultipletChoice,
@@ -49,7 +50,7 @@ def _choose(
     size = len(values)
     sequence = jnp.append(values, following)
     index = jnp.arange(size)
-    tolerance = multiplet_tolerance * jnp.maximum(values, jnp.finfo(values.dtype).tiny)
+    tolerance = multiplet_gap(values, origin, multiplet_tolerance)
     complete_up_to = jnp.diff(sequence) > tolerance
     if multiplet == "report":
         count = jnp.asarray(k)

@@ -1,36 +1,151 @@
-"""One pencil's lowest eigenpairs, with what is known of their quality."""
+"""Eigenpairs of one pencil, the lowest or those in an interval, with what is known of their quality."""
+
+import os
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.derivative import lowest
+from hks_jax.eigen.count import certain_count, count_eigenvalues
+from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.quality import quality
+from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
+from hks_jax.eigen.located import LocatedPencil, locate, translated
+from hks_jax.eigen.quality import indistinct, quality
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
-from hks_jax.linear.pencil import tabulated
+from hks_jax.linear.pencil import SymmetricPencil, tabulated
+from hks_jax.traced import is_traced
 
 
-def solve_part(
+def solve_lowest(
     pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool, report: Report
 ) -> Eigenpairs:
-    """Return k pairs of one pencil and, where one ``extra`` is asked for, the next eigenvalue.
+    """Return the k lowest pairs of one pencil and, where one ``extra`` is asked for, the next eigenvalue.
 
     With ``throw``, a derivative that does not converge is an error.
     """
-    n_dof = pencil.space.n_dof
-    if k + extra > solver.max_pairs(n_dof):
+    n_dof = pencil.size
+    if pencil.null_space is None and not solver.indefinite:
+        raise ValueError(
+            f"solver: {solver.name!r} needs a stiffness that is positive semidefinite, with its null space, and of "
+            'this pencil nothing is known. Use "block-lanczos" or "dense", or give `sparse_pencil` the null vectors'
+        )
+    if k + extra > solver.max_pairs(n_dof) and pencil.null_space is None:
+        solver = Dense(solver.tolerance)
+        name = solver.name
+    elif k + extra > solver.max_pairs(n_dof):
         raise ValueError(
             f"k: the {solver.name} solver gives at most {solver.max_pairs(n_dof)} of {n_dof} pairs, and {k + extra} "
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
-    values, vectors, frame, following, complete_below = lowest(solver, pencil, k, extra, throw, report)
-    known = jax.lax.stop_gradient((tabulated(pencil), values, vectors))
-    residuals, converged, *others = _quality(*known, solver.tolerance)
-    kept, part, multiplet_tolerance = others
+    if not isinstance(solver, BlockLanczos) or known_by_weyl(pencil):
+        found = solved(solver, pencil, k, extra, False, throw, report)
+        return _pairs(pencil, pencil, jnp.zeros((), found[0].dtype), found, solver, name)
+    half = max(solver.plan(k).slice_size // 2, 1)
+    origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
+    number, method = k, cast(Eigensolver, solver)
+    if not is_traced(below) and below > 2 * half:
+        # Of a lowest eigenvalue with more copies than are asked for, all are computed: the count is of all.
+        number = max(k, int(below))
+        method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
+    spacing = (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
+    moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spacing)
+    found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+    if number > k:
+        values, vectors, frame, _, bound = found
+        found = values[:k], vectors[:k], frame[:k], jax.lax.stop_gradient(values[k]), bound
+    return _pairs(pencil, moved, origin, found, method, name if method is solver else method.name)
+
+
+class Interval(NamedTuple):
+    """An interval of the spectrum of one pencil.
+
+    Attributes:
+        low: its lower end, which belongs to it.
+        high: its upper end, which does not.
+        below: how many eigenvalues lie under ``low``.
+        k: how many lie in it.
+    """
+
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+    below: Int[Array, ""]
+    k: int
+
+
+def solve_interval(
+    pencil: Pencil, interval: Interval, solver: BlockLanczos | Dense, throw: bool, report: Report
+) -> Eigenpairs:
+    """Return the k eigenpairs in [low, high)."""
+    low, high, below, k = interval
+    length = high - low
+    moved = translated(pencil, low, below, length / (2 * max(k / SLICE, 1)), length / max(k, 1))
+    nothing = jnp.zeros((0, pencil.size), low.dtype)
+    found = jnp.zeros(0, low.dtype), nothing, nothing, jnp.asarray(jnp.inf, low.dtype), length
+    if k:
+        found = solved(solver, moved, k, 0, True, throw, report)
+    found = *found[:4], jnp.minimum(found[4], length)
+    return _pairs(pencil, moved, low, found, solver, solver.name, lowest=False)
+
+
+def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | None) -> Interval:
+    """Return an interval as a user gives it, with what inertia counts; pencil and ends may be traced.
+
+    Raises:
+        ValueError: see `hks_jax.eigenpairs`.
+    """
+    low, high = (jnp.asarray(end, pencil.stiffness.dtype) for end in interval)
+    if is_traced((pencil, low, high)):
+        if k is None:
+            raise ValueError(
+                "k: not given, and values are traced; expected the number of eigenvalues in the interval, which must "
+                "be known beforehand: `count_eigenvalues` at both ends, outside jax.jit"
+            )
+        require_count("k", k)
+        return Interval(low, high, certain_count(pencil, low)[0], int(k))
+    if not float(low) < float(high):
+        raise ValueError(f"interval: got ({float(low):g}, {float(high):g}); expected (a, b) with a < b, both finite")
+    try:
+        below, above = (count_eigenvalues(pencil, end) for end in (low, high))
+    except ValueError as error:
+        raise ValueError(f"interval: {str(error).removeprefix('below: ')}") from None
+    count = int(above - below)
+    if k is not None and k != count:
+        raise ValueError(f"k: got {k}; there are {count} eigenvalues in the interval. Leave k out")
+    needed = 4 * count * pencil.size * low.dtype.itemsize
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > available:
+        raise ValueError(
+            f"interval: it holds {count} eigenpairs, which need about {needed / 1e9:.3g} GB, and the machine has "
+            f"{available / 1e9:.3g} GB; divide the interval"
+        )
+    return Interval(low, high, below, count)
+
+
+def _pairs(
+    pencil: Pencil,
+    solved_pencil: SymmetricPencil,
+    origin: Float[Array, ""],
+    found: tuple[Any, ...],
+    solver: Eigensolver,
+    name: str,
+    lowest: bool = True,
+) -> Eigenpairs:
+    """Return eigenpairs, found as those of a pencil whose eigenvalues count from the origin."""
+    values, vectors, frame, following, bound = found
+    held = jax.lax.stop_gradient((tabulated(solved_pencil), values, vectors))
+    known = not isinstance(solved_pencil, LocatedPencil) and solved_pencil.null_space is not None
+    residuals, converged, kept, part, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
+    if not known:
+        # Eigenvalues that are zero within rounding become exactly zero; their derivatives stay.
+        values = values + origin
+        values = values + jax.lax.stop_gradient(jnp.where(zero, -values, 0))
     return Eigenpairs(
         values,
         vectors,
@@ -39,21 +154,36 @@ def solve_part(
         converged,
         kept=kept,
         part=part,
-        next_eigenvalue=following,
-        complete_below=jnp.asarray(complete_below),  # of a constant JAX makes a number where it differentiates
-        multiplet_tolerance=multiplet_tolerance,
+        next_eigenvalue=jnp.asarray(following) + origin,  # of a constant JAX makes a number where it differentiates
+        complete_below=jnp.asarray(bound) + origin,
+        origin=origin if known or isinstance(solved_pencil, LocatedPencil) else jax.lax.stop_gradient(values[0]),
+        multiplet_tolerance=tolerance,
         pencil=pencil,
         solver_name=name,
+        lowest=lowest,
     )
 
 
-@jit_quickly(static_argnames="tolerance")
+@jit_quickly(static_argnames=("tolerance", "known"))
 def _quality(
-    pencil: Pencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"], tolerance: float
+    pencil: SymmetricPencil,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    origin: Float[Array, ""],
+    tolerance: float,
+    known: bool,
 ) -> tuple[Array, ...]:
-    """Return residuals (k,), whether they are small enough (k,), and what `Eigenpairs` has of pairs not yet cut."""
-    first = values[min(pencil.n_null, values.size - 1)]
-    residuals, small, rounding = quality(pencil, values, vectors, first, tolerance)
-    converged = small & (values >= 0)
-    kept, part = jnp.ones(values.shape, bool), jnp.zeros(values.shape, int)
-    return residuals, converged, kept, part, jnp.clip(rounding[-1], 1e-6, 1e-3)
+    """Return what `Eigenpairs` has of pairs not yet cut, and which eigenvalues are zero within rounding.
+
+    Residuals are relative to eigenvalues as they count from the origin; small ones are measured by the first positive
+    one where the null space is known, and else by the mean distance of eigenvalues.
+    """
+    k = values.size
+    kept, part = jnp.ones(k, bool), jnp.zeros(k, int)
+    if k == 0:
+        return jnp.zeros(0, values.dtype), kept, kept, part, kept, jnp.asarray(1e-6, values.dtype)
+    unit = values[min(pencil.n_null, k - 1)] if known else (values[-1] - values[0]) / k
+    residuals, small, rounding = quality(pencil, values, vectors, unit, tolerance)
+    converged = small & (values >= 0) if known else small
+    zero = jnp.abs(values + origin) <= indistinct(pencil, values.dtype)
+    return residuals, converged, kept, part, zero, jnp.clip(rounding[-1], 1e-6, 1e-3)

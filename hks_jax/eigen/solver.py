@@ -45,12 +45,14 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     Attributes:
         name: what reports call the method.
+        indefinite: whether it takes pencils of whose null space nothing is known.
         adjoint: what derivatives solve linear systems with; by default for any pencil that can be factorised.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, unless
             rounding in the matrices' dtype forbids it.
     """
 
     name: ClassVar[str]
+    indefinite: ClassVar[bool] = True
     tolerance: eqx.AbstractVar[float]
     adjoint: Adjoint = eqx.field(default=FactorisedAdjoint(), static=True, kw_only=True)
 

@@ -23,6 +23,8 @@ from hks_jax.fem.resolution import grid_resolution, mesh_resolution
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
 from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
 from hks_jax.linear.pattern import SparsePattern
+from hks_jax.linear.pencil import NullSpace
+from hks_jax.traced import is_traced
 
 MassKind = Literal["consistent", "lumped"]
 MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
@@ -106,7 +108,19 @@ def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Penc
     resolution = grid_resolution(fixed, domain, space.periodic, steps, field.interpolation, mass == "lumped")
     chosen = _chosen_mass(mass, space, StencilOperator(coefficients=consistent, space=space), lumped)
     stiffness = StencilOperator(coefficients=stiffness, space=space)
-    return Pencil(stiffness, chosen, resolution.mapped(space.restrict), volume, space)
+    constants = _constants(space, tensors)
+    return Pencil(stiffness, chosen, resolution.mapped(space.restrict), volume, space, null_space=constants)
+
+
+def _constants(space: FunctionSpace, values: Array) -> NullSpace:
+    """Return what every stiffness of a Laplace–Beltrami operator annihilates: constants on natural components."""
+    n_null, labels, numbers = space.n_null, space.null_labels, jnp if is_traced(values) else np
+    if n_null == 0 or (n_null == 1 and (labels == 0).all()):
+        vectors = numbers.ones((n_null, space.n_dof), values.dtype)
+    else:
+        number = numbers.arange(n_null, dtype=np.int32)[:, None]
+        vectors = (numbers.asarray(labels, np.int32) == number).astype(values.dtype)
+    return NullSpace(jnp.asarray(vectors), fixed=True)
 
 
 def _chosen_mass(
@@ -197,7 +211,8 @@ def _assemble_mesh(mesh: SimplicialMesh, space: MeshSpace, mass: MassKind) -> Pe
     lumped = jax.ops.segment_sum(jnp.sum(consistent, axis=-1).ravel(), cells.ravel(), n_vertices)
     resolution = mesh_resolution(metric, cells, n_vertices, mass == "lumped")
     chosen = _chosen_mass(mass, space, gather(consistent), lumped)
-    return Pencil(gather(stiffness), chosen, resolution.mapped(space.restrict), jnp.sum(lumped), space)
+    fine, constants = resolution.mapped(space.restrict), _constants(space, metric)
+    return Pencil(gather(stiffness), chosen, fine, jnp.sum(lumped), space, null_space=constants)
 
 
 @lru_cache(maxsize=16)

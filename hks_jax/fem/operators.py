@@ -35,6 +35,10 @@ class StencilOperator(PatternedOperator):
         """Return the coefficients."""
         return self.coefficients.reshape(-1)
 
+    def with_flat(self, entries: Float[Array, " m"]) -> "StencilOperator":
+        """Return the matrix with other coefficients."""
+        return StencilOperator(entries.reshape(self.coefficients.shape), self.space)
+
     def apply_nodal(self, x: Float[Array, "*leading_and_shape"]) -> Float[Array, "*leading_and_shape"]:
         """Apply the operator to nodal arrays; rows and columns of nodes that are not free are zero."""
         shape, coefficients = self.space.node_shape, list(self.coefficients)

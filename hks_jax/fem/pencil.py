@@ -10,24 +10,26 @@ from jaxtyping import Array, Float, Int
 from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.operators import Operator
+from hks_jax.linear.operators import Operator, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products
 
 
 class Pencil(SymmetricPencil):
-    """The stiffness K ⪰ 0 and mass M ≻ 0 of functions on a domain.
+    """The stiffness K and mass M ≻ 0 of functions on a domain, or on the nodes of matrices from elsewhere.
 
     Attributes:
         stiffness: K; multiply with ``@``, or take ``.to_scipy()``, ``.to_dense()``.
         mass: M, likewise.
-        resolution: what the spacing of the nodes does to signatures, for estimates.
-        volume: the area or volume of the domain in the units of the metric, eliminated nodes included.
+        resolution: what the spacing of the nodes does to signatures, for estimates; None where it is not known.
+        volume: the area or volume of the domain in the units of the metric, eliminated nodes included; None where it is
+            not known.
         space: the space of the functions.
+        null_space: that of K ⪰ 0; None where nothing is known, and K may be indefinite.
     """
 
-    resolution: Resolution
-    volume: Float[Array, ""]
+    resolution: Resolution | None
+    volume: Float[Array, ""] | None
     space: FunctionSpace = eqx.field(static=True)
 
     def __repr__(self) -> str:
@@ -35,14 +37,28 @@ class Pencil(SymmetricPencil):
         return f"Pencil({self.space!r})"
 
     @property
-    def mesh_width(self) -> Float[Array, " n_dof"]:
-        """The local distance of neighbouring nodes in the units of the metric, (n_dof,)."""
-        return self.resolution.mesh_width
+    def measured(self) -> bool:
+        """Whether dimension and volume are known, as Weyl's law needs them."""
+        return self.volume is not None and self.space.dimension is not None
 
     @property
-    def n_null(self) -> int:
-        """How many constants K annihilates: those of natural components."""
-        return self.space.n_null
+    def mesh_width(self) -> Float[Array, " n_dof"]:
+        """The local distance of neighbouring nodes in the units of the metric, (n_dof,)."""
+        if self.resolution is None:
+            raise ValueError("mesh_width: matrices from elsewhere have no mesh; use `assemble`")
+        return self.resolution.mesh_width
+
+    def with_stiffness(self, stiffness: PatternedOperator) -> "Pencil":
+        """Return the pencil of another operator on the same domain, such as K + V, of whose kernel nothing is known.
+
+        ``pencil.with_stiffness(pencil.stiffness.plus(V))`` with V (n_dof,) adds a diagonal matrix.
+
+        Raises:
+            ValueError: a matrix of another pattern.
+        """
+        if stiffness.pattern != self.pattern:
+            raise ValueError("stiffness: got a matrix with another pattern; use `sparse_pencil` for any two matrices")
+        return Pencil(stiffness, self.mass, self.resolution, self.volume, self.space)
 
     @property
     def parts(self) -> tuple["Pencil", ...]:
@@ -78,6 +94,11 @@ class MirrorPencil(eqx.Module):
     parts: tuple[Pencil, ...]
 
     @property
+    def measured(self) -> bool:
+        """Whether dimension and volume are known."""
+        return self.parts[0].measured
+
+    @property
     def space(self) -> FunctionSpace:
         """The space of the all-Neumann part, which holds the functions of all parts."""
         return self.parts[0].space
@@ -88,14 +109,19 @@ class MirrorPencil(eqx.Module):
         return self.parts[0].mesh_width
 
     @property
-    def resolution(self) -> Resolution:
+    def n_fixed(self) -> int:
+        """How many null vectors of the first part every perturbation annihilates."""
+        return self.parts[0].n_fixed
+
+    @property
+    def resolution(self) -> Resolution | None:
         """What the spacing of the nodes does to signatures, for estimates."""
         return self.parts[0].resolution
 
     @property
-    def volume(self) -> Float[Array, ""]:
+    def volume(self) -> Float[Array, ""] | None:
         """The area or volume of the doubled domain."""
-        return len(self.parts) * self.parts[0].volume
+        return None if self.parts[0].volume is None else len(self.parts) * self.parts[0].volume
 
     def apply_stiffness(self, x: Float[Array, "k n_dof"], part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
         """Apply to each row, a function of one part in the space of the first, the stiffness of its part."""

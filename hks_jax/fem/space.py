@@ -171,6 +171,27 @@ class MeshSpace(FunctionSpace):
         self._key = (triangulation, condition)
 
 
+@jax.tree_util.register_static
+class MatrixSpace(FunctionSpace):
+    """Nodes of which nothing is known but their number, in any shape: those of matrices from elsewhere.
+
+    Attributes:
+        dimension: that of the manifold; None if it is not known.
+    """
+
+    dimension: int | None  # type: ignore[assignment]
+
+    def __init__(self, shape: tuple[int, ...], dimension: int | None = None) -> None:
+        self.node_shape, self.dimension, self.boundary = shape, dimension, ()
+        self.domain = self.free = np.ones(shape, bool)
+        self.n_components, self._labels = 1, np.zeros(shape, int)
+        self._key = (shape, dimension)
+
+    def __repr__(self) -> str:
+        """Return one line: the unknowns and their shape."""
+        return f"MatrixSpace({self.n_dof} unknowns, nodes={self.node_shape}, dimension={self.dimension})"
+
+
 def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
     """Return the space, one for all grids of the same nodes."""
     return _unit_space(grid.unit, boundary)

@@ -20,6 +20,7 @@ ARRAYS = (
     "residuals",
     "converged",
     "kept",
+    "origin",
     "part",
     "next_eigenvalue",
     "complete_below",
@@ -77,8 +78,10 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: Pencil | Mirro
     missing = [key for key in (*ARRAYS, "solver_name") if key not in arrays]
     if missing:
         raise ValueError(f"{name}: lacks {', '.join(missing)}; expected eigenpairs as save_pairs writes them")
-    dtype = pencil.volume.dtype
-    values = {key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in ARRAYS for a in [arrays[key]]}
+    dtype = pencil.parts[0].stiffness.dtype
+    values: dict[str, Any] = {
+        key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in ARRAYS for a in [arrays[key]]
+    }
     k, n = values["eigenvalues"].shape[-1], pencil.space.n_dof
     if values["vectors"].shape != (k, n):
         raise ValueError(

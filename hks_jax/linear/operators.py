@@ -94,6 +94,15 @@ class PatternedOperator(Operator):
     def flat(self) -> Float[Array, " m"]:
         """Return the array of entries into which the pattern's places point."""
 
+    @abstractmethod
+    def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
+        """Return the matrix with other entries at the same places."""
+
+    def plus(self, diagonal: Float[Array, " n_dof"]) -> "PatternedOperator":
+        """Return the sum with a diagonal matrix."""
+        minus = DiagonalOperator(-jnp.asarray(diagonal, self.dtype))
+        return self.with_flat(shifted(self, minus, jnp.ones((), self.dtype)))
+
     @property
     def size(self) -> int:
         """The number of rows, n_dof."""
@@ -122,6 +131,10 @@ class SparseOperator(PatternedOperator):
     def flat(self) -> Float[Array, " m"]:
         """Return the entries."""
         return self.entries
+
+    def with_flat(self, entries: Float[Array, " m"]) -> "SparseOperator":
+        """Return the matrix with other entries at the same places."""
+        return SparseOperator(entries, self.structure, self.table)
 
     @property
     def _places(self) -> Ellpack:

@@ -10,16 +10,31 @@ from hks_jax.linear.operators import Operator, PatternedOperator, SparseOperator
 from hks_jax.linear.pattern import Pattern, SparsePattern
 
 
+class NullSpace(eqx.Module):
+    """The null space of a stiffness K ⪰ 0, all of it.
+
+    Attributes:
+        vectors: (m, n_dof) a basis; m may be 0.
+        fixed: whether every perturbation of K annihilates it too, as of stiffness matrices of elements. Derivatives
+            then leave out what only rounding could contribute.
+    """
+
+    vectors: Float[Array, "m n_dof"]
+    fixed: bool = eqx.field(default=False, static=True)
+
+
 class SymmetricPencil(eqx.Module):
     """The stiffness K and mass M of Kφ = λMφ, symmetric, M ≻ 0.
 
     Attributes:
         stiffness: K; multiply with ``@``, or take ``.to_scipy()``, ``.to_dense()``.
         mass: M, likewise. It has no entries where K has none.
+        null_space: that of K ⪰ 0; None where nothing is known, and K may be indefinite.
     """
 
     stiffness: PatternedOperator
     mass: Operator
+    null_space: NullSpace | None = eqx.field(default=None, kw_only=True)
 
     @property
     def size(self) -> int:
@@ -34,7 +49,12 @@ class SymmetricPencil(eqx.Module):
     @property
     def n_null(self) -> int:
         """How many null vectors of K are known beforehand."""
-        return 0
+        return 0 if self.null_space is None else len(self.null_space.vectors)
+
+    @property
+    def n_fixed(self) -> int:
+        """How many of them every perturbation of K annihilates, too."""
+        return self.n_null if self.null_space is not None and self.null_space.fixed else 0
 
     @property
     def parts(self) -> tuple["SymmetricPencil", ...]:

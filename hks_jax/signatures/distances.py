@@ -2,14 +2,16 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral import source_indices, spectral_squared_distances
-from hks_jax.signatures.times import checked_times, positive_range, require_pairs
+from hks_jax.signatures.times import checked_times, dimension_of, positive_range, require_pairs, volume_of
 from hks_jax.signatures.truncation import warn_if_truncated
+from hks_jax.traced import is_traced
 
 
 def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_times n_sources *shape"]:
@@ -41,7 +43,8 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
     Raises:
         ValueError: sources out of range or outside the mask; a domain of several components; no positive eigenvalue.
     """
-    if pairs.n_null > 1:
+    known = not is_traced(jax.lax.stop_gradient(pairs.eigenvalues)) or pairs.pencil.parts[0].null_space is not None
+    if known and pairs.n_null > 1:
         raise ValueError(
             f"pairs: the domain has {pairs.n_null} components, and the biharmonic distance between two of them is "
             "infinite; compute the eigenpairs of one component"
@@ -63,7 +66,10 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
     NaN for pairs that are not kept.
     """
     values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)
-    return values if not normalise else values * pairs.pencil.volume ** (2 / pairs.space.dimension)
+    if not normalise:
+        return values
+    dimension = dimension_of(pairs, "ShapeDNA that is normalised")
+    return values * volume_of(pairs, "ShapeDNA that is normalised") ** (2 / dimension)
 
 
 def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:

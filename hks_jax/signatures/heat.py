@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import checked_times, positive_range, require_pairs
+from hks_jax.signatures.times import checked_times, dimension_of, positive_range, require_pairs, volume_of
 from hks_jax.signatures.truncation import warn_if_truncated
 
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
@@ -30,9 +30,9 @@ def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str)
     if normalisation == "heat-trace":
         return 1 / spectral_trace(pairs, Heat(times))
     if normalisation == "volume":
-        return jnp.broadcast_to(pairs.pencil.volume, times.shape)
+        return jnp.broadcast_to(volume_of(pairs, 'normalisation="volume"'), times.shape)
     if normalisation == "flat":
-        return (4 * math.pi * times) ** (pairs.space.dimension / 2)
+        return (4 * math.pi * times) ** (dimension_of(pairs, 'normalisation="flat"') / 2)
     raise ValueError(f'normalisation: got {normalisation!r}; expected "raw", "heat-trace", "volume" or "flat"')
 
 

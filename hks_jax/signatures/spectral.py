@@ -106,7 +106,8 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     if not _is_constant(d_pairs.pencil):
         pairs = first_order_only(pairs)
         known = pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
-        terms.append(_tangent(contraction, filters, *known, *_instantiated((d_pairs.pencil, d_pairs.frame))))
+        moved = _instantiated((d_pairs.pencil, d_pairs.frame))
+        terms.append(_tangent(contraction, filters, *known, pairs.pencil.n_fixed > 0, *moved))
     elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
         pairs = first_order_only(pairs)
         moved = jax.jvp(
@@ -119,8 +120,8 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 # The transpose computes again what it needs: kept, that would be two copies of the eigenvectors.
-@jax.jit
-@jax.checkpoint
+@partial(jax.jit, static_argnames="fixed")
+@partial(jax.checkpoint, static_argnums=6)
 def _tangent(
     contraction: Contraction,
     filters: Filter,
@@ -128,6 +129,7 @@ def _tangent(
     vectors: Float[Array, "k n_dof"],
     kept: Bool[Array, " k"],
     part: Int[Array, " k"],
+    fixed: bool,
     d_pencil: Pencil | MirrorPencil,
     d_frame: Float[Array, "k n_dof"],
 ) -> Array:
@@ -146,7 +148,7 @@ def _tangent(
     _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (vectors,), (d_frame,))
 
     def mixing(one: Filter) -> tuple[Float[Array, "k k"], Bool[Array, " k"]]:
-        of_f, of_lambda_f = _divided_differences(one, values, kept)
+        of_f, of_lambda_f = _divided_differences(one, values, kept, fixed)
         matters = _matters(_weights(one, values, kept), jnp.diagonal(of_f), values)
         return of_f * stiffness - of_lambda_f * mass, matters
 
@@ -181,7 +183,7 @@ _each_at_once = jax.jit(_each)
 
 
 def _divided_differences(
-    one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]
+    one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
     """Return the matrices [f] and [λf], f being zero where the pairs are not kept."""
     low, high = jnp.minimum(values[:, None], values), jnp.maximum(values[:, None], values)
@@ -190,8 +192,8 @@ def _divided_differences(
     quotient = (f[:, None] - f) / jnp.where(gap == 0, 1, gap)
     both = kept[:, None] & kept
     of_f = jnp.where(both, one.divided_difference(low, high), quotient)
-    # Between constants G vanishes, and f need not have a derivative at 0.
-    of_f = jnp.where(high == 0, 0, of_f)
+    # Between null vectors that every perturbation annihilates G vanishes; and f need not have a derivative at 0.
+    of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
     # f at the larger eigenvalue, where it is small, and not the other way round: no cancellation.
     return of_f, jnp.where(gap >= 0, f[:, None], f) + low * of_f
 

@@ -1,6 +1,5 @@
 """Times and energies: checks, and the defaults of Sun et al. and of Aubry et al."""
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -42,37 +41,61 @@ def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
     return pairs
 
 
+def dimension_of(pairs: Eigenpairs, purpose: str) -> int:
+    """Return the dimension of the manifold; raise ValueError where it is not known."""
+    if pairs.space.dimension is None:
+        raise ValueError(
+            f"pairs: {purpose} needs the dimension of the manifold, which matrices do not say; give "
+            "`sparse_pencil(K, M, dimension=…)`"
+        )
+    return pairs.space.dimension
+
+
+def volume_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
+    """Return the area or volume of the domain; raise ValueError where it is not known."""
+    volume = pairs.pencil.volume
+    if volume is None:
+        raise ValueError(
+            f"pairs: {purpose} needs the volume of the domain, which matrices do not say; give "
+            "`sparse_pencil(K, M, volume=…)`"
+        )
+    return volume
+
+
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     """Return the first positive and the last eigenvalue.
 
     Of a multiple one, the mean over its copies: the same number, and a differentiable one.
 
     Raises:
-        ValueError: if all k eigenvalues belong to constants.
+        ValueError: if no eigenvalue is positive, as far as that is known.
     """
     if _n_positive(require_pairs(pairs)) < 1:
         raise ValueError(
-            f"pairs: all {pairs.n_null} eigenvalues kept are zero (one per natural component); compute more eigenpairs"
+            f"pairs: none of the {pairs.k} eigenvalues that are kept is positive (each natural component has a zero "
+            "one); compute more eigenpairs"
         )
-    return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance, pairs.n_null)
+    return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance)
 
 
-@partial(jax.jit, static_argnames="first")
+@jax.jit
 def _ends(
-    values: Float[Array, " k"], kept: Bool[Array, " k"], tolerance: Float[Array, ""], first: int
+    values: Float[Array, " k"], kept: Bool[Array, " k"], tolerance: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     def mean_of_copies(value: Array) -> Array:
         copies = kept & (jnp.abs(values - value) <= tolerance * value)
         return jnp.sum(jnp.where(copies, values, 0)) / jnp.sum(copies, dtype=values.dtype)
 
-    return mean_of_copies(values[first]), mean_of_copies(values[jnp.sum(kept) - 1])
+    return mean_of_copies(values[jnp.argmax(values > 0)]), mean_of_copies(values[jnp.sum(kept) - 1])
 
 
 def _n_positive(pairs: Eigenpairs) -> int:
     """Return how many positive eigenvalues are kept, as far as that is known."""
-    kept = jax.lax.stop_gradient(pairs.kept)
-    count = pairs.k if is_traced(kept) else int(kept.sum())
-    return count - pairs.n_null
+    values, kept = jax.lax.stop_gradient((pairs.eigenvalues, pairs.kept))
+    if not is_traced((values, kept)):
+        return int((kept & (values > 0)).sum())
+    known = pairs.lowest and all(part.null_space is not None for part in pairs.pencil.parts)
+    return pairs.k - pairs.n_null if known else pairs.k
 
 
 def default_times(pairs: Eigenpairs, n: int = 16) -> Float[Array, " n"]:

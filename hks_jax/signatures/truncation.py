@@ -16,7 +16,7 @@ from hks_jax.fem.resolution import Resolution
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import sum_of
 from hks_jax.signatures.tail import beyond_by_weyl, resolving
-from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.times import checked_times, dimension_of, require_pairs
 from hks_jax.traced import is_traced
 
 TAIL_LIMIT = 0.01
@@ -86,18 +86,25 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     elements are too stiff, and the interpolated tensors have another volume, to whose inverse the signature tends. Both
     are of leading order in h. On fields whose tensors turn, in 2D and 3D, with either interpolation, the median error
     was a third of the estimate to three times it, where k was enough for t; at eigenvalue ratios of 30 on coarse grids
-    (errors above 10 %) down to a quarter. On meshes only the first part is estimated.
+    (errors above 10 %) down to a quarter. On meshes only the first part is estimated. Of matrices from elsewhere the
+    spacing is not known, and its error NaN.
+
+    Raises:
+        ValueError: times that are not positive and finite; pairs in an interval; matrices whose dimension is not known.
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
+    if not pairs.lowest:
+        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
     known = pairs.pencil.resolution, pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue
     return _truncation(
-        *jax.lax.stop_gradient((*known, checked_times("times", times, dtype))), dimension=pairs.space.dimension
+        *jax.lax.stop_gradient((*known, checked_times("times", times, dtype))),
+        dimension=dimension_of(pairs, "an estimate of the truncation"),
     )
 
 
 @partial(jax.jit, static_argnames="dimension")
 def _truncation(
-    resolution: Resolution,
+    resolution: Resolution | None,
     values: Float[Array, " k"],
     kept: Bool[Array, " k"],
     next_eigenvalue: Float[Array, ""],
@@ -110,9 +117,12 @@ def _truncation(
     trace = sum_of(Heat(at), values, kept)
     tail = jnp.where(complete, 0, left / (left + trace))
     slope = -sum_of(Derivative(Heat(at), Heat(at)), values, kept) / (dimension / 2 * trace)
+    smallest = jnp.where(complete, 0, resolving(TAIL_LIMIT, dimension) / following)
+    if resolution is None:
+        unknown = jnp.full_like(at, jnp.nan)
+        return Truncation(at, tail, unknown, unknown, unknown, smallest)
     bias, lasting = _resolution_bias(resolution, at, 1 - (1 - slope) * (1 - tail))
     coarse = jnp.mean(bias > BIAS_LIMIT, axis=1)
-    smallest = jnp.where(complete, 0, resolving(TAIL_LIMIT, dimension) / following)
     return Truncation(at, tail, median_of_shares(bias), median_of_shares(lasting), coarse, smallest)
 
 
@@ -148,9 +158,13 @@ def median_of_shares(x: Float[Array, "n m"]) -> Float[Array, " n"]:
 
 
 def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
-    """Warn (AccuracyWarning) of times that k or the spacing does not resolve, where values are concrete."""
+    """Warn (AccuracyWarning) of times that k or the spacing does not resolve, where values are concrete.
+
+    Nothing is said of pairs in an interval, whose sums are meant to be those of a band, nor where the dimension of the
+    manifold is not known.
+    """
     pairs, times = jax.lax.stop_gradient((pairs, times))
-    if is_traced((pairs.eigenvalues, pairs.pencil, times)):
+    if is_traced((pairs.eigenvalues, pairs.pencil, times)) or not pairs.lowest or pairs.space.dimension is None:
         return
     for message in truncation(pairs, times).messages():
         warn_of_accuracy(message)

@@ -36,15 +36,18 @@ def weyl_count(
     """
     pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
     d = pencil.space.dimension
+    volume = pencil.volume if pencil.measured else None
+    if volume is None:
+        raise ValueError("problem: Weyl's law needs dimension and volume; give them to `sparse_pencil`")
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():
         raise ValueError(f"values: got {numbers.min()}; expected eigenvalues, finite and not negative")
     if domain is None:
-        return weyl_number(numbers, float(pencil.volume), d)
+        return weyl_number(numbers, float(volume), d)
     shape = domain.grid.shape if isinstance(domain, TensorField) else (len(domain.vertices),)
     if shape != pencil.space.node_shape:
         raise ValueError(f"domain: got one of shape {shape}; expected that of the problem, {pencil.space.node_shape}")
     # The problems that make up a doubled domain have opposite conditions where it was doubled.
     rim = sum(rim_measure(domain, part.space) for part in pencil.parts)
-    return weyl_number(numbers, float(pencil.volume), d, rim)
+    return weyl_number(numbers, float(volume), d, rim)

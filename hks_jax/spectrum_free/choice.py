@@ -49,7 +49,12 @@ def choose_method(
         raise ValueError(
             f'method: got {method!r}; expected "auto", "colouring", "selected-inversion" or what `colouring` returns'
         )
-    if method == "selected-inversion":
+    if any(part.null_space is None for part in pencil.parts):
+        raise ValueError(
+            "domain: nothing is known of the null space of its stiffness, which may be indefinite, and the exponential "
+            "is approximated for K ⪰ 0. Give `sparse_pencil` the null vectors, or use eigenpairs"
+        )
+    if method == "selected-inversion" or (method == "auto" and pencil.space.dimension is None):
         return None
     if method == "auto":
         settings = least_work(pencil, times, tolerance)

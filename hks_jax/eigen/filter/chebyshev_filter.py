@@ -64,6 +64,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     """
 
     name: ClassVar[str] = "chebyshev-filter"
+    indefinite: ClassVar[bool] = False
     tolerance: float = eqx.field(default=1e-8, static=True)
     block: int = eqx.field(default=32, static=True)
     spare: float = eqx.field(default=0.35, static=True)

@@ -63,7 +63,7 @@ class HostAdjoint(Adjoint[Pencil]):
         data, matrices = host_matrices(pencil)
         tolerance = attainable(self.tolerance, rhs.dtype)
 
-        def on_host(data_k: ArrayLike, data_m: ArrayLike, *arrays: ArrayLike) -> np.ndarray:
+        def on_host(data_k: ArrayLike, data_m: ArrayLike, nulls: ArrayLike, *arrays: ArrayLike) -> np.ndarray:
             values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
             if not all(np.isfinite(array).all() for array in (values, vectors, b)):
                 warn_of_accuracy(
@@ -71,7 +71,7 @@ class HostAdjoint(Adjoint[Pencil]):
                     "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
                 )
                 return np.full(rhs.shape, np.nan, rhs.dtype)
-            K, M = matrices(data_k, data_m)
+            K, M = matrices(data_k, data_m, nulls)
             x, errors = _solve(K, M, values, vectors, b, tolerance, rhs.dtype)
             failed = ~(errors <= 1)
             if failed.any():

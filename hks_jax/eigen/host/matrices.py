@@ -2,15 +2,16 @@
 
 from collections.abc import Callable
 
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import SuperLU, splu
 
-from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.multifrontal import CONTRACTION
 from hks_jax.linear.operators import Places
+from hks_jax.linear.pencil import SymmetricPencil
 
 
 def factorise_on_host(matrix: csc_matrix) -> SuperLU:
@@ -38,19 +39,26 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
     return int((factor.U.diagonal() < 0).sum()), sound
 
 
-def host_matrices(pencil: Pencil) -> tuple[tuple[Array, Array], Callable[..., tuple[csc_matrix, csc_matrix]]]:
-    """Return the entries of K and M, and the function that makes float64 SciPy matrices of them on the host."""
-    (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
-    n = pencil.space.n_dof
-    natural = bool((pencil.space.free == pencil.space.domain).all())
+def host_matrices(
+    pencil: SymmetricPencil,
+) -> tuple[tuple[Array, Array, Array], Callable[..., tuple[csc_matrix, csc_matrix]]]:
+    """Return the entries of K and M with the null vectors, and the function that makes SciPy matrices of them.
 
-    def matrices(data_k: ArrayLike, data_m: ArrayLike) -> tuple[csc_matrix, csc_matrix]:
-        K, M = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n)
-        if natural:  # the rows add up to zero; what float32 entries leave would act as a potential
-            K = K - diags(np.asarray(K.sum(axis=1)).ravel())
+    The matrices are float64. What rounding left of Kv, v a null vector, would act as a potential: it is subtracted from
+    the diagonal where each node belongs to one null vector alone.
+    """
+    (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
+    n = pencil.size
+    nulls = jnp.zeros((0, n), data_k.dtype) if pencil.null_space is None else pencil.null_space.vectors
+
+    def matrices(data_k: ArrayLike, data_m: ArrayLike, nulls: ArrayLike) -> tuple[csc_matrix, csc_matrix]:
+        K, M, vectors = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n), np.asarray(nulls, np.float64)
+        if ((vectors != 0).sum(axis=0) == 1).all():
+            vector = vectors.sum(axis=0)
+            K = K - diags((K @ vector) / vector)
         return K, M
 
-    return (data_k, data_m), matrices
+    return (data_k, data_m, nulls), matrices
 
 
 def _csc(data: ArrayLike, pattern: Places, n: int) -> csc_matrix:

@@ -41,6 +41,7 @@ class ShiftInvert(Eigensolver[Pencil]):
     """
 
     name: ClassVar[str] = "shift-invert"
+    indefinite: ClassVar[bool] = False
     tolerance: float = eqx.field(default=1e-8, static=True)
     max_restarts: int = eqx.field(default=300, static=True)
     basis: int | None = eqx.field(default=None, static=True)
@@ -60,15 +61,19 @@ class ShiftInvert(Eigensolver[Pencil]):
     def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs, and the shift at which inertia confirmed them."""
         n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
-        (data_k, data_m), matrices = host_matrices(pencil)
+        data, matrices = host_matrices(pencil)
 
-        def solve(data_k: ArrayLike, data_m: ArrayLike, volume: ArrayLike) -> tuple[np.ndarray, ...]:
-            # The shift keeps K + sM positive definite; Weyl's λ₁ is the scale on which it is small.
-            shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
-            K, M = matrices(data_k, data_m)
+        def solve(volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
+            K, M = matrices(*data)
+            # The shift keeps K + sM positive definite; Weyl's λ₁, or a mean eigenvalue, is the scale on which it is
+            # small.
+            if dimension is None or not np.isfinite(volume):
+                shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
+            else:
+                shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
             return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift, report))
 
-        inputs = (data_k, data_m, pencil.volume)
+        inputs = (jnp.inf if pencil.volume is None else pencil.volume, *data)
         if is_traced(inputs):
             shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))
             return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")

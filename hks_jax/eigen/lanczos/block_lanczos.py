@@ -91,6 +91,11 @@ _unfinished = jit_quickly(static_argnames="plan")(unfinished)
 _crowded = jit_quickly(static_argnames="plan")(crowded)
 
 
+def known_by_weyl(pencil: SymmetricPencil) -> bool:
+    """Return whether Weyl's law says where a spectrum begins and how dense it is; else inertia has to find out."""
+    return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
+
+
 @jit_quickly(static_argnames="plan")
 def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
     """Return what to expect of a spectrum: on a domain by Weyl's law, else by what was counted beforehand."""
@@ -98,6 +103,7 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
         spacing = pencil.spacing
         return Problem(pencil, pencil.first, spacing, spacing, spacing, pencil.negative)
     assert isinstance(pencil, Pencil)
+    assert pencil.volume is not None
     n, dtype = pencil.space.dimension, pencil.stiffness.dtype
     first, several, lowest = (
         weyl(j, pencil.volume, n).astype(dtype) for j in (min(plan.wanted, plan.slice_size) / 2 + 1, plan.slice_size, 1)

@@ -1,5 +1,6 @@
 """What users have as sparse matrices, as operators with one symmetric pattern."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -9,10 +10,12 @@ from jax.experimental.sparse import BCOO, BCSR
 from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_matrix, issparse
 
-from hks_jax.checks import real_array
+from hks_jax.checks import real_array, require_number
+from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.operators import DiagonalOperator, Operator, SparseOperator
 from hks_jax.linear.pattern import SparsePattern
-from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
 
 _ROUNDING = 1000
@@ -28,31 +31,95 @@ class _Entries(NamedTuple):
     size: int
 
 
-def sparse_pencil(K: Any, M: Any = None) -> SymmetricPencil:
+def sparse_pencil(
+    K: Any,
+    M: Any = None,
+    *,
+    null_vectors: Any = None,
+    dimension: int | None = None,
+    volume: Any = None,
+    shape: tuple[int, ...] | None = None,
+) -> Pencil:
     """Return a pair of matrices as a pencil with one pattern, that of either matrix and of its transpose.
 
     The entries of the operators are what K and M have as numbers; of an entry and the one across the diagonal it is the
-    mean that counts, in derivatives too.
+    mean that counts, in derivatives too. Eigenpairs of the pencil have every signature. Those that need a geometry say
+    which of the arguments below they lack.
 
     Args:
         K: symmetric (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data may be
             traced, and whose indices may not), an operator of this package, or a full array; or a pencil, without M.
         M: symmetric, positive definite, likewise; or its diagonal (n,); None is the identity. Its pattern may be
             another one.
+        null_vectors: (m, n) a basis of the null space of K ⪰ 0, all of it: m may be 0. None if nothing is known; then K
+            may be indefinite, and eigenvalues that are zero within rounding are set to zero.
+        dimension: 2 or 3, that of the manifold: for Weyl's law, and signatures with ``normalisation="flat"``.
+        volume: in the units of the metric, for ``normalisation="volume"``.
+        shape: of the nodes, n in all; None is (n,).
 
     Returns:
         The pencil: ``.stiffness`` is a `SparseOperator`, ``.mass`` one with the same pattern or diagonal.
 
     Raises:
         ValueError: matrices that are not square or of different sizes, complex, NaN or infinite, or unsymmetric (by how
-            much, and where); a diagonal M with an entry that is not positive; traced indices.
+            much, and where); a diagonal M with an entry that is not positive; traced indices; null vectors that K does
+            not annihilate (by how much), or that depend on each other; another dimension, volume or shape.
     """
     if isinstance(K, SymmetricPencil):
         if M is not None:
             raise ValueError("M: a pencil has its mass already; leave it out")
-        if isinstance(K.stiffness, SparseOperator):
-            return K
         K, M = K.stiffness, K.mass
+    pencil = _pencil(K, M)
+    n, dtype = pencil.size, pencil.stiffness.dtype
+    if dimension not in (None, 2, 3):
+        raise ValueError(f"dimension: got {dimension!r}; expected 2 or 3, or None if there is none")
+    if shape is not None and math.prod(shape) != n:
+        raise ValueError(f"shape: got {shape}, {math.prod(shape)} nodes; expected {n} in all")
+    if volume is not None:
+        require_number("volume", volume)
+        volume = jnp.asarray(volume, dtype)
+    space = MatrixSpace(tuple(shape or (n,)), dimension)
+    null_space = None if null_vectors is None else NullSpace(_checked_null_vectors(pencil, null_vectors))
+    return Pencil(pencil.stiffness, pencil.mass, None, volume, space, null_space=null_space)
+
+
+def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[Array, "m n"]:
+    vectors = jnp.asarray(real_array("null_vectors", null_vectors), pencil.stiffness.dtype)
+    if vectors.ndim != 2 or vectors.shape[1] != pencil.size or len(vectors) > pencil.size:
+        raise ValueError(f"null_vectors: got shape {vectors.shape}; expected (m, {pencil.size}), a vector in each row")
+    if not is_traced(vectors) and len(vectors):
+        lengths = np.linalg.norm(np.asarray(vectors), axis=1, keepdims=True)
+        sizes = np.linalg.svd(np.asarray(vectors) / np.where(lengths > 0, lengths, 1), compute_uv=False)
+        if sizes[-1] < len(vectors) * np.sqrt(np.finfo(vectors.dtype).eps):
+            raise ValueError("null_vectors: they depend on each other; expected a basis, without zero vectors")
+    require_null_space(SymmetricPencil(pencil.stiffness, pencil.mass, null_space=NullSpace(vectors)))
+    return vectors
+
+
+def require_null_space(pencil: SymmetricPencil) -> None:
+    """Raise ValueError where the stiffness does not annihilate what is said to be its null space.
+
+    Nothing is checked where values are traced.
+    """
+    if pencil.null_space is None or is_traced(pencil) or not pencil.n_null:
+        return
+    vectors, n = pencil.null_space.vectors, pencil.size
+    data, (rows, _) = pencil.stiffness.triplets()
+    sums = np.bincount(rows, np.abs(np.asarray(data)), n)
+    images = np.asarray(pencil.stiffness.apply(vectors))
+    tiny = np.finfo(data.dtype).tiny
+    sizes = np.maximum(np.max(np.abs(np.asarray(vectors)), axis=1), tiny)
+    defects = np.max(np.abs(images), axis=1) / sizes / max(sums.max(), tiny)
+    worst = int(np.argmax(defects))
+    if defects[worst] > _ROUNDING * np.finfo(data.dtype).eps:
+        raise ValueError(
+            f"null_vectors: the stiffness does not annihilate vector {worst}: ‖Kv‖ is {defects[worst]:.2g} ‖K‖ ‖v‖ in "
+            "the largest entry, which is more than rounding. After a change of K, say nothing of its null space: "
+            "`pencil.with_stiffness(K)`, or `sparse_pencil(K, M)`"
+        )
+
+
+def _pencil(K: Any, M: Any) -> SymmetricPencil:
     stiffness = _entries("K", K)
     n = stiffness.size
     diagonal, mass = _diagonal(M, n, stiffness.values.dtype), None
@@ -83,7 +150,7 @@ def _entries(name: str, matrix: Any) -> _Entries:
         entries = _Entries(values, rows, cols, matrix.size)
     elif issparse(matrix):
         _check_square(name, matrix.shape)
-        held = matrix.tocoo()
+        held = matrix.tocoo(copy=True)  # what follows would otherwise change the caller's
         held.sum_duplicates()
         entries = _Entries(real_array(name, held.data), held.row, held.col, held.shape[0])
     else:
