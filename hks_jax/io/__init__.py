@@ -12,6 +12,7 @@ from hks_jax.io.mesh import read_mesh_arrays as read_mesh_arrays
 from hks_jax.io.pairs import load_pairs as load_pairs
 from hks_jax.io.pairs import save_pairs as save_pairs
 from hks_jax.io.positive import positive_tensors as positive_tensors
+from hks_jax.io.questions import questions as questions
 from hks_jax.io.read import read_tensors as read_tensors
 from hks_jax.io.repair import REPAIRS as REPAIRS
 from hks_jax.io.repair import find_invalid as find_invalid
@@ -19,4 +20,5 @@ from hks_jax.io.repair import repair_tensors as repair_tensors
 from hks_jax.io.save import save as save
 from hks_jax.io.save import save_tensors as save_tensors
 from hks_jax.io.tensor_order import ORDERS as ORDERS
+from hks_jax.io.units import UNITS as UNITS
 from hks_jax.io.volume import TensorVolume as TensorVolume

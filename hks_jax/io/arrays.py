@@ -53,6 +53,8 @@ def read_tensors(
         frame=frame,
         source=name,
         invalid_by_order=None if order == "matrix" else invalid_by_order(values, order),
+        length_unit=_text(arrays, "length_unit") or "",
+        unit=_text(arrays, "unit") or "",
     )
 
 

@@ -1,11 +1,9 @@
 """Tensors in six images, one for each component: BIDS's ``param-txx`` … ``param-tzz``, DSI Studio's, ANTs'."""
 
-import json
 import math
 import os
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +11,9 @@ import numpy as np
 from hks_jax.io import nifti
 from hks_jax.io.tensor_order import ORDERS
 from hks_jax.io.volume import TensorVolume
-from hks_jax.reading import reading
 
 NAMES = ORDERS["nifti"]
 _NAME = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
-_REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world"}
-"""The frame that BIDS names by the field Reference of OrientationEncoding."""
 
 
 def component_of(path: str | os.PathLike[str]) -> str | None:
@@ -81,15 +76,17 @@ def read_tensors(
         )
     images = [_image(files[name]) for name in NAMES]
     first = images[0]
+    affine = nifti.affine_in_mm(files["xx"], first)[0]
     for name, image in zip(NAMES, images, strict=True):
         if image.shape != first.shape:
             raise ValueError(f"{files[name]}: got shape {image.shape}; expected that of {files['xx']}, {first.shape}")
-        if not np.allclose(image.affine, first.affine, rtol=1e-4, atol=1e-3):
+        if not np.allclose(nifti.affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected the same voxels")
     values = np.stack([nifti.voxels(files[name], image) for name, image in zip(NAMES, images, strict=True)], axis=-1)
     joined = nifti.nibabel().Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
+    joined.header["xyzt_units"] = first.header["xyzt_units"]
     joined.header.set_intent(nifti.SYMMETRIC_MATRIX, (3,))
-    return nifti.tensors_of(files["xx"], joined, None, frame or _declared_frame(files["xx"]))
+    return nifti.tensors_of(files["xx"], joined, None, frame)
 
 
 def _image(path: str) -> Any:
@@ -99,14 +96,3 @@ def _image(path: str) -> Any:
     if len(image.shape) < 3 or math.prod(image.shape[3:]) != 1:
         raise ValueError(f"{path}: got shape {image.shape}; expected (nx, ny, nz), one component")
     return image
-
-
-def _declared_frame(path: str) -> str | None:
-    """Return the frame that the sidecar of an image names, if there is one."""
-    sidecar = Path(path.removesuffix(".gz").removesuffix(".nii") + ".json")
-    if not sidecar.is_file():
-        return None
-    with reading(sidecar, "a BIDS sidecar in JSON"):
-        encoding = json.loads(sidecar.read_text(encoding="utf-8")).get("OrientationEncoding") or {}
-        reference = encoding.get("Reference")
-    return _REFERENCES.get(reference) if isinstance(reference, str) else None

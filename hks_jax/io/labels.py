@@ -43,7 +43,8 @@ def read_labels(
         while values.ndim > 3 and values.shape[-1] == 1:
             values = values[..., 0]
         if affine is not None and values.ndim == 3:
-            values = _at_voxels(name, values, image.affine, affine, shape, slice_axis)
+            place = nifti.affine_beside(name, image, affine)
+            values = _at_voxels(name, values, place, affine, shape, slice_axis)
     elif name.endswith(".npy"):
         values = load_npy(path)
     else:

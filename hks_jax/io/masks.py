@@ -31,7 +31,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         while values.ndim > 3 and values.shape[-1] == 1:
             values = values[..., 0]
         if affine is not None:
-            _check_same_place(name, image.affine, affine, values.shape)
+            _check_same_place(name, nifti.affine_beside(name, image, affine), affine, values.shape)
     elif mrtrix.is_mrtrix(path):
         mask = mrtrix.load(path)
         values = mask.values[..., 0] if mask.values.ndim == 4 and mask.values.shape[-1] == 1 else mask.values
@@ -43,7 +43,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
             raise ValueError(f"{name}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
         values = arrays["mask"]
     elif nrrd.is_nrrd(path):
-        values, place = nrrd.read_image(path)
+        values, place = nrrd.read_image(path, affine)
         if affine is not None and place is not None:
             _check_same_place(name, place, affine, values.shape)
     elif name.endswith(".npy"):

@@ -86,6 +86,7 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
         notes=(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes',),
         source=name,
         invalid_by_order=invalid_by_order(components, order),
+        length_unit="mm",
     )
 
 

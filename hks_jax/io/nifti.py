@@ -1,8 +1,10 @@
 """NIfTI through nibabel, which is optional."""
 
 import gzip
+import json
 import math
 import os
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -10,13 +12,22 @@ import numpy as np
 
 from hks_jax.checks import require_real
 from hks_jax.io.order_check import invalid_by_order
+from hks_jax.io.provenance import own_record
+from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.tensor_order import FRAMES, choices, pack, to_voxel_axes, unpack
+from hks_jax.io.units import scaled_beside
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
 SYMMETRIC_MATRIX = 1005
 """NIfTI's intent code for symmetric matrices."""
+COMMENT = 6
+"""NIfTI's code for an extension of the header that is a comment."""
+_LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
+"""NIfTI's codes for units of space, and how many mm each is; no unit is taken for mm, as programs do."""
+_REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world", "scanner": "world"}
+"""The frame that BIDS names by the field Reference of OrientationEncoding, in its drafts' words, too."""
 
 
 def is_nifti(path: str | os.PathLike[str]) -> bool:
@@ -90,6 +101,57 @@ def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
     return np.ascontiguousarray(data, dtype=dtype.newbyteorder("="))
 
 
+def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
+    """Return the affine with lengths in mm, and the unit that the file declares; the empty text if none.
+
+    Raises:
+        ValueError: a code for a unit that NIfTI does not have.
+    """
+    code = int(image.header["xyzt_units"]) & 7
+    if code not in _LENGTHS:
+        raise ValueError(f"{name}: its unit of space has the code {code}; expected one of NIfTI's, 0 to 3")
+    unit, scale = _LENGTHS[code]
+    return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
+
+
+def affine_beside(name: str, image: Any, affine: np.ndarray) -> np.ndarray:
+    """Return an image's affine in mm, as `affine` is, that of the image which it belongs to (see `scaled_beside`)."""
+    own, unit = affine_in_mm(name, image)
+    return own if unit else scaled_beside(own, affine)
+
+
+def _sidecar(path: str) -> dict[str, Any]:
+    """Return the field OrientationEncoding of the BIDS sidecar beside an image; empty if there is none."""
+    sidecar = Path(path.removesuffix(".gz").removesuffix(".nii") + ".json")
+    if not sidecar.is_file():
+        return {}
+    with reading(sidecar, "a BIDS sidecar in JSON"):
+        content = json.loads(sidecar.read_text(encoding="utf-8"))
+    encoding = content.get("OrientationEncoding") if isinstance(content, dict) else None
+    if not isinstance(encoding, dict):
+        return {}
+    reference = encoding.get("Reference")
+    if reference is not None and reference not in _REFERENCES:
+        raise ValueError(
+            f"{sidecar}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Correct it, or "
+            "remove it and pass frame"
+        )
+    return encoding
+
+
+def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
+    """Return what the file says of its tensors, where we wrote it; empty otherwise.
+
+    Where the affine's directions are no longer those that were recorded, another program has moved the voxels, and
+    the record is no longer true.
+    """
+    for extension in image.header.extensions:
+        record = own_record(extension.get_content()) if extension.get_code() == COMMENT else {}
+        if "axes" in record and np.allclose(record["axes"], affine[:3, :3], rtol=1e-4, atol=1e-4):
+            return record
+    return {}
+
+
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
     """Read tensors; see `hks_jax.io.read_tensors`."""
     return tensors_of(name, load(name), order, frame)
@@ -104,34 +166,40 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
             "(nx, ny, nz, 6). Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi, or --bval and --bvec"
         )
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
-    if order is None and not declared:
+    affine, length_unit = affine_in_mm(name, image)
+    encoding, record, notes = _sidecar(name), _own_record(image, affine) if declared else {}, list[str]()
+    if order is None and declared:
+        order = "nifti"
+    elif order is None and encoding.get("Type") == "tensor":
+        order = "fsl"  # as BIDS has it: xx xy xz yy yz zz
+    elif order is None:
         raise ValueError(
             f"{name}: six components, but the file does not declare their order (its NIfTI intent is not "
             f"symmetric-matrix), and programs differ. Pass order (--order), one of {choices()}"
         )
-    notes, open_frame = [], order is None and frame is None
-    if order is None:
-        order = "nifti"
     elif declared and order != "nifti":
         notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
+    declared_frame = _REFERENCES.get(encoding.get("Reference", ""), record.get("frame"))
+    open_frame = frame is None and declared_frame is None and order == "nifti"
+    if frame is not None and declared_frame not in (None, frame):
+        notes.append(f"the {declared_frame} axes that the file declares are set aside for the {frame} axes, as asked")
+    frame = frame or declared_frame or FRAMES[order]
     components = voxels(name, image).reshape(*shape[:3], 6)
     tensors = unpack(components, order)
-    frame = FRAMES[order] if frame is None else frame
-    affine = np.asarray(image.affine, np.float64)
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not (np.isfinite(affine).all() and spacing.min() > 0):
         raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
     axes = affine[:3, :3] / spacing
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
         notes.append("the affine's axes are not orthogonal: the shear is ignored")
+    stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
+    if length_unit not in ("", "mm"):
+        notes.append(f"lengths in {length_unit}, as the file declares: voxels of {_sizes(stored)} are in mm here")
     header = np.asarray(image.header.get_zooms()[:3], np.float64)
-    if np.abs(header / spacing - 1).max() > 1e-3:
-        notes.append(f"voxel sizes {_sizes(spacing)} are those of the affine; the header's own are {_sizes(header)}")
+    if np.abs(header / stored - 1).max() > 1e-3:
+        notes.append(f"voxel sizes {_sizes(stored)} are those of the affine; the header's own are {_sizes(header)}")
     if open_frame and np.linalg.det(affine[:3, :3]) > 0:
-        notes.append(
-            "NIfTI does not declare the axes of its tensors: taken for those of the voxels; if they were fitted with "
-            'FSL\'s b-vectors as they are, as DIPY does, pass frame "fsl"'
-        )
+        notes.append(OPEN_FRAME)
     notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
     return TensorVolume(
         to_voxel_axes(tensors, frame, affine),
@@ -143,6 +211,8 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
         notes=tuple(notes),
         source=name,
         invalid_by_order=invalid_by_order(components, order),
+        length_unit="mm",
+        unit=record.get("unit", ""),
     )
 
 

@@ -13,7 +13,9 @@ from jaxtyping import Float
 from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import check_data, check_header
 from hks_jax.io.order_check import invalid_by_order
+from hks_jax.io.provenance import own_record
 from hks_jax.io.tensor_order import choices, nearest_rotation, pack, to_voxel_axes, unpack
+from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
 
@@ -47,19 +49,21 @@ KINDS = {
 
 
 class Placement(NamedTuple):
-    """Where the voxels lie.
+    """Where the voxels lie, in mm where the file declares a unit.
 
     Attributes:
         directions: (d, d), the step along each voxel axis as a column, in the file's space.
         origin: (d,), in the file's space.
         signs: (d,), what takes the file's space to right, anterior, superior; None where it is not patient-based.
         placed: whether the file gives directions at all, and not spacings alone.
+        unit: of length in the file; empty if it declares none.
     """
 
     directions: Float[np.ndarray, "d d"]
     origin: Float[np.ndarray, " d"]
     signs: Float[np.ndarray, " d"] | None
     placed: bool
+    unit: str = ""
 
     @property
     def affine(self) -> Float[np.ndarray, "4 4"] | None:
@@ -114,10 +118,17 @@ def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
     return data.astype(data.dtype.newbyteorder("=")), header
 
 
-def read_image(path: str | os.PathLike[str]) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
-    """Return the voxel values of a scalar image, and its affine if it has one."""
+def read_image(
+    path: str | os.PathLike[str], beside: np.ndarray | None = None
+) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
+    """Return the voxel values of a scalar image, and its affine if it has one.
+
+    Without a unit of its own it has that of the image whose affine is `beside` (see `scaled_beside`).
+    """
     data, header = load(path)
-    return data, _placement(os.fspath(path), header, list(range(data.ndim))).affine
+    place = _placement(os.fspath(path), header, list(range(data.ndim)))
+    affine = place.affine
+    return data, affine if affine is None or beside is None or place.unit else scaled_beside(affine, beside)
 
 
 def read_tensors(name: str, order: str | None, frame: str | None, confidence: float) -> TensorVolume:
@@ -160,6 +171,8 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
         notes.append(f"space {header.get('space', 'unnamed')!r}: the affine's axes are those of the file")
     elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
         notes.append("the grid's axes are those of the voxels; their directions in the plane are not kept")
+    if place.unit not in ("", "mm"):
+        notes.append(f"lengths in {place.unit}, as the file declares, are in mm here")
     what = "whole matrices" if used == "matrix" else f'components in order "{used}"'
     notes.append(f"{what} ({label or 'as asked'}), given along the {frame} axes, taken to the voxel axes")
     return TensorVolume(
@@ -173,6 +186,8 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
         notes=tuple(notes),
         source=name,
         invalid_by_order=invalid_by_order(components, order) if order is not None else None,
+        length_unit="mm" if place.unit or place.signs is not None else "",  # patients are measured in mm
+        unit=own_record(header.get("provenance", "")).get("unit", ""),
     )
 
 
@@ -212,7 +227,7 @@ def write(
         header["measurement frame"] = nearest_rotation(linear).T  # its vectors, which are the matrix's columns
     elif array.ndim > d:
         directions, kinds = np.concatenate([directions, none]), [*kinds, "list"]
-    if placed:
+    if placed or volume.length_unit:
         header["space units"] = ["mm"] * d
     header |= {"space directions": directions, "space origin": origin, "kinds": kinds, "encoding": "gzip"}
     header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in (more or {}).items()}
@@ -265,18 +280,39 @@ def _rows(header: Mapping[str, Any], n: int) -> Float[np.ndarray, "n d"] | None:
 
 def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Placement:
     d, rows = len(domain), _rows(header, int(header["dimension"]))
+    unit, scales = _lengths(name, header, domain)
     if rows is None:
         spacings = np.asarray(header.get("spacings", np.full(int(header["dimension"]), np.nan)), np.float64)[domain]
-        return Placement(np.diag(np.where(np.isnan(spacings), 1.0, spacings)), np.zeros(d), None, False)
+        return Placement(np.diag(np.where(np.isnan(spacings), 1.0, spacings * scales)), np.zeros(d), None, False, unit)
     directions = rows[domain].T
     if directions.shape != (d, d) or not np.isfinite(directions).all() or np.linalg.norm(directions, axis=0).min() == 0:
         raise ValueError(
             f"{name}: space directions {rows[domain].tolist()} of the {d} voxel axes; expected {d} vectors of {d} "
             "finite numbers, none of them zero"
         )
-    origin = np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
+    origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
     signs = TO_RAS.get(str(header.get("space", "")).lower().removesuffix("-time").removesuffix("t"))
-    return Placement(directions, origin, None if signs is None or d != 3 else np.array(signs), True)
+    to_ras = None if signs is None or d != 3 else np.array(signs)
+    return Placement(scales[:, None] * directions, origin, to_ras, True, unit)
+
+
+def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
+    """Return the unit of the file's lengths, empty if it declares none, and how many mm it is along each axis.
+
+    Directions are in the units of the axes of space, spacings in those of the voxels' axes.
+    """
+    if "space directions" in header:
+        field, given = "space units", list(header.get("space units", ()))[: len(domain)]
+    else:
+        field, units = "units", header.get("units", ())
+        given = [units[axis] for axis in domain if axis < len(units)]
+    scales = [millimetres(f"{name}: {field}", str(text)) for text in given]
+    declared = [text for text, scale in zip(given, scales, strict=True) if scale is not None]
+    if not declared:
+        return "", np.ones(len(domain))
+    if len(declared) < len(domain):
+        raise ValueError(f"{name}: {field} {given}; expected one for each of the {len(domain)} axes, or none")
+    return " ".join(dict.fromkeys(declared)), np.array(scales, np.float64)
 
 
 def _to_voxel_axes(

@@ -27,5 +27,25 @@ def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str
     return json.dumps({**record, **(more or {})}, default=_plain)  # in ASCII, which NRRD's header needs
 
 
+def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:
+    """Return the same of tensors that are written: their order, frame, axes and units are those in the new file.
+
+    What the file had that they came from is ``source_order`` and ``source_frame``.
+    """
+    stored = {"order": order, "frame": frame, "source_order": volume.order, "source_frame": volume.frame}
+    stored |= {"axes": volume.volume_affine[:3, :3].tolist(), "length_unit": volume.length_unit, "unit": volume.unit}
+    return describe(volume, {**stored, **(more or {})})
+
+
+def own_record(text: str | bytes) -> dict[str, Any]:
+    """Return what `describe_tensors` wrote; empty where the text is anything else."""
+    try:
+        record = json.loads(text.rstrip(b"\0") if isinstance(text, bytes) else text)
+    except ValueError:
+        return {}
+    ours = isinstance(record, dict) and str(record.get("software", "")).startswith("hks-jax ")
+    return record if ours and "source_frame" in record else {}
+
+
 def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

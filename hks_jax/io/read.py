@@ -14,6 +14,7 @@ from hks_jax.io.masks import as_mask, of_mrtrix, read_mask
 from hks_jax.io.provenance import digest
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tensor_order import Frame, Order
+from hks_jax.io.units import Unit, in_mm2_per_s
 from hks_jax.io.volume import TensorVolume
 
 SUFFIXES = (*nifti.SUFFIXES, *mrtrix.SUFFIXES, *nrrd.SUFFIXES, *vtk_image.SUFFIXES, ".npz", ".npy")
@@ -30,6 +31,7 @@ def read_tensors(
     spacing: float | Sequence[float] | None = None,
     confidence: float = 0.5,
     repair: Repair | None = None,
+    unit: Unit | None = None,
 ) -> TensorVolume:
     """Read a field of diffusion tensors.
 
@@ -37,7 +39,9 @@ def read_tensors(
 
     NIfTI (``.nii``, ``.nii.gz``): a symmetric-matrix image, (nx, ny, nz, 1, 6) with intent code 1005, whose components
     are xx xy yy xz yz zz; or any (nx, ny, nz, 6) or (nx, ny, nz, 1, 6) image whose `order` is given, because
-    programs differ. The distance between voxels is that of the affine.
+    programs differ. The distance between voxels is that of the affine. Lengths are in mm: those of files that declare
+    another unit, as NIfTI and NRRD can, are converted, and a note says so. A BIDS sidecar beside the image is heeded
+    where it has ``OrientationEncoding``: `frame` by its Reference, and the order of its Type "tensor".
 
     Six NIfTI images, one for each component, as BIDS's ``param-txx`` … ``param-tzz``, DSI Studio and ANTs have them:
     all six, or one, whose siblings are found by its name.
@@ -69,9 +73,11 @@ def read_tensors(
         confidence: voxels of NRRD's masked kinds are inside where their confidence is larger.
         repair: what to do with tensors inside the mask that are not positive definite: see `repair_tensors`. None:
             nothing; a metric made of them is refused.
+        unit: of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``: they are
+            converted to mm²/s. None: the numbers are taken as they are.
 
     Returns:
-        The tensors along the voxel axes.
+        The tensors along the voxel axes. What about them gives reason to doubt frame or unit, `questions` asks.
 
     Raises:
         FileNotFoundError: no such file.
@@ -84,7 +90,7 @@ def read_tensors(
         if array is not None or spacing is not None:
             raise ValueError("array, spacing: they are for NumPy's and VTK's files; leave them out for six images")
         volume = components.read_tensors(list(path), order, frame)
-        return _finished(volume, mask, repair)
+        return _finished(volume, mask, repair, unit)
     name = os.fspath(path)
     numpys = name.lower().endswith((".npz", ".npy"))
     if array is not None and not (numpys or vtk_image.is_vtk_image(name)):
@@ -92,7 +98,7 @@ def read_tensors(
     if spacing is not None and not numpys:
         raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
     if nifti.is_nifti(path) and components.is_one_of_six(path):
-        return _finished(components.read_tensors(components.siblings(path), order, frame), mask, repair)
+        return _finished(components.read_tensors(components.siblings(path), order, frame), mask, repair, unit)
     if nifti.is_nifti(path):
         volume = nifti.read_tensors(name, order, frame)
     elif mrtrix.is_mrtrix(path):
@@ -107,13 +113,15 @@ def read_tensors(
         raise ValueError(f"{name}: unknown kind of file; expected {', '.join(SUFFIXES)}{of_mrtrix(name)}")
     if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
         volume = replace(volume, digest=digest(name))
-    return _finished(volume, mask, repair)
+    return _finished(volume, mask, repair, unit)
 
 
 def _finished(
-    volume: TensorVolume, mask: str | os.PathLike[str] | np.ndarray | None, repair: Repair | None
+    volume: TensorVolume, mask: str | os.PathLike[str] | np.ndarray | None, repair: Repair | None, unit: Unit | None
 ) -> TensorVolume:
-    """Return the volume with the mask, and repaired if asked to."""
+    """Return the volume with the mask, in mm²/s if its unit is told, and repaired if asked to."""
+    if unit is not None:
+        volume = in_mm2_per_s(volume, unit)
     if mask is not None:
         inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, volume.affine)
         if inside.shape != volume.shape:

@@ -13,7 +13,7 @@ from hks_jax.atomic import atomic_path
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import mesh, nifti, nrrd, vtk_image
-from hks_jax.io.provenance import describe
+from hks_jax.io.provenance import describe, describe_tensors
 from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.volume import TensorVolume
 
@@ -113,13 +113,13 @@ def save_tensors(
 
     ``.npz``: the arrays that `read_tensors` documents.
 
-    Where the tensors came from is said as by `save`.
+    Where the tensors came from is said as by `save`, with the order and the frame that they have in the file: what is
+    read back needs neither `order` nor `frame`. Units are kept but in VTK's files, which have none.
 
     Raises:
         ValueError: an unknown suffix; NIfTI for a slice; unsymmetric tensors in NIfTI or NRRD.
         ImportError: an optional library is missing; says what to install.
     """
-    record = describe(volume, provenance)
     unsymmetric = int(find_unsymmetric(volume).sum())
     if unsymmetric and (nrrd.is_nrrd(path) or nifti.is_nifti(path)):
         raise ValueError(
@@ -127,15 +127,20 @@ def save_tensors(
             "symmetric part (T + Tᵀ)/2, or an .npz or .vti"
         )
     if nrrd.is_nrrd(path):
-        return nrrd.write_tensors(path, volume, record)
+        return nrrd.write_tensors(path, volume, describe_tensors(volume, "nrrd", "measurement", provenance))
     if vtk_image.is_vtk_image(path):
-        return vtk_image.write_tensors(path, volume, record)
+        return vtk_image.write_tensors(path, volume, describe_tensors(volume, "matrix", "world", provenance))
     if not nifti.is_nifti(path):
-        return _write_npz(path, {"tensors": volume.tensors, **_place(volume), "provenance": record})
+        record = describe_tensors(volume, "matrix", "voxel", provenance)
+        units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
+        return _write_npz(
+            path, {"tensors": volume.tensors, **_place(volume), "frame": "voxel", **units, "provenance": record}
+        )
     if volume.dimension != 3:
         raise ValueError(
             "volume: NIfTI has no 2×2 tensors; write the volume that the slice is of, or an .npz, .nrrd or .vti"
         )
+    record = describe_tensors(volume, "nifti", "voxel", provenance)
     return _write_nifti(path, nifti.symmetric_matrix(volume), volume, record, symmetric=True)
 
 

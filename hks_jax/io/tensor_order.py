@@ -65,7 +65,7 @@ def to_voxel_axes(
     d = tensors.shape[-1]
     linear = affine[:d, :d]
     if frame == "fsl":
-        sign = np.array([-1.0 if np.linalg.det(linear) > 0 else 1.0, 1.0, 1.0])[:d]
+        sign = fsl_signs(linear)
         return tensors * np.outer(sign, sign).astype(tensors.dtype)
     if frame == "world":
         rotation = nearest_rotation(linear).astype(tensors.dtype)
@@ -73,6 +73,11 @@ def to_voxel_axes(
     raise ValueError(
         f'frame: got {frame!r}; expected "voxel", "fsl" or "world" ("measurement" is for NRRD files that have one)'
     )
+
+
+def fsl_signs(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " d"]:
+    """Return the signs that take FSL's axes to the voxels': −1 for the first where the affine keeps orientation."""
+    return np.array([-1.0 if np.linalg.det(linear) > 0 else 1.0, 1.0, 1.0])[: len(linear)]
 
 
 def nearest_rotation(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:

@@ -34,6 +34,8 @@ class TensorVolume:
         repair: what was done to tensors that are not positive definite, for reports; empty if nothing was.
         invalid_by_order: how many tensors of the file are not positive definite under each order of components, where
             many are under the one in which they were read; else None.
+        length_unit: ``"mm"``, which the lengths of a file that has a unit are converted to; empty where it has none.
+        unit: ``"mm²/s"`` where the tensors' unit is known, because it was told, or they were fitted; else empty.
 
     Raises:
         ValueError: shapes that do not agree; spacings that are not positive, numbers that are not finite.
@@ -52,6 +54,8 @@ class TensorVolume:
     digest: str = ""
     repair: Mapping[str, Any] = field(default_factory=dict)
     invalid_by_order: InvalidByOrder | None = None
+    length_unit: str = ""
+    unit: str = ""
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""

@@ -1,0 +1,144 @@
+"""Units: of lengths as headers declare them, and of diffusivities, which hardly any header does."""
+
+import math
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from hks_jax.io.volume import TensorVolume
+
+Unit = Literal["mm2/s", "um2/ms", "um2/s", "cm2/s", "m2/s"]
+
+UNITS: dict[str, float] = {"mm2/s": 1.0, "um2/ms": 1e-3, "um2/s": 1e-6, "cm2/s": 1e2, "m2/s": 1e6}
+"""The units of diffusivity, each in mm²/s. The unit "um2/ms" is also 10⁻³ mm²/s and 10⁻⁹ m²/s."""
+
+MM2_PER_S = "mm²/s"
+"""How messages write the unit that tensors are kept in."""
+
+LIVING_TISSUE = (1e-4, 4e-3)
+"""Mean diffusivities in mm²/s: from dense tissue to cerebrospinal fluid, which at 37 °C has 3e-3."""
+
+_B_VALUES = (20.0, 1e5)
+"""Between which the largest b-value of a diffusion scan is, in s/mm²."""
+
+_VOXELS = (0.005, 50.0)
+"""Between which the sizes of voxels are, in mm, from microscopy to the thickest slices."""
+
+_LENGTHS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "nm": 1e-6}
+_SPELLINGS = {
+    **{
+        f"{prefix}{metre}{plural}": unit
+        for prefix, unit in (("milli", "mm"), ("centi", "cm"), ("", "m"), ("micro", "um"), ("nano", "nm"))
+        for metre in ("meter", "metre")
+        for plural in ("", "s")
+    },
+    **dict.fromkeys(("micron", "microns", "\u00b5m", "\u03bcm"), "um"),  # the micro sign, and the Greek letter
+}
+_NONE = ("", "???", "none", "unknown", "n/a")
+
+
+def millimetres(where: str, text: str) -> float | None:
+    """Return how many mm a header's unit of length is, None where it names none.
+
+    Args:
+        where: the file and the field, for the error.
+        text: such as ``"mm"``, ``"microns"``, ``"µm"``, ``"meters"``.
+
+    Raises:
+        ValueError: a unit that is not known.
+    """
+    word = text.strip().lower()
+    if word in _NONE:
+        return None
+    scale = _LENGTHS.get(_SPELLINGS.get(word, word))
+    if scale is None:
+        raise ValueError(f"{where}: got {text!r}; expected one of {', '.join(_LENGTHS)}. Correct the header")
+    return scale
+
+
+def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Return the affine of an image that declares no unit of length, in mm as `affine`, beside which it belongs.
+
+    Programs lose the unit of masks and labels: it is mm, m or µm, the one in which the voxels are nearest in size.
+    """
+    ratio = np.linalg.norm(affine[:3, :3]) / np.linalg.norm(own[:3, :3])
+    scale = min((1.0, 1e3, 1e-3), key=lambda s: abs(math.log(ratio / s)))
+    return np.diag([scale, scale, scale, 1.0]) @ own
+
+
+def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
+    """Return the volume with its tensors, which are in `unit`, in mm²/s.
+
+    Raises:
+        ValueError: an unknown unit, or a volume that has one already.
+    """
+    if unit not in get_args(Unit):
+        raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
+    if volume.unit:
+        raise ValueError(f"unit: {volume.source} declares {volume.unit} itself; leave this out")
+    scale = UNITS[unit]
+    if scale == 1:
+        return replace(volume, unit=MM2_PER_S)
+    note = f"tensors in {unit} as asked: multiplied by {scale:g} they are in {MM2_PER_S}"
+    return replace(volume, tensors=volume.tensors * scale, unit=MM2_PER_S, notes=(*volume.notes, note))
+
+
+def length_question(volume: TensorVolume) -> str:
+    """Ask whether the unit of length is wrong where no scan has such voxels; the empty text where they are plausible.
+
+    Lengths that have no unit are not asked about.
+    """
+    low, high = _VOXELS
+    if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
+        return ""
+    return (
+        f"Wrong unit of length? Voxels of {' × '.join(f'{h:.5g}' for h in volume.spacing)} mm are none that scans "
+        f"have, {low:g} to {high:g} mm, and t goes with the square. Correct the unit in the header (NIfTI: xyzt_units; "
+        "NRRD: space units), or the voxel sizes"
+    )
+
+
+def unit_question(volume: TensorVolume) -> str:
+    """Ask whether the unit is wrong where no living tissue has the mean diffusivity that mm²/s give.
+
+    The empty text where the median over the voxels inside is plausible, and where nothing says that the volume is one
+    of tissue: lengths without a unit.
+    """
+    if volume.length_unit != "mm":
+        return ""
+    means = np.trace(volume.tensors[volume.inside], axis1=-2, axis2=-1) / volume.dimension
+    means = means[np.isfinite(means) & (means > 0)]
+    median = float(np.median(means)) if means.size else 0.0
+    if median == 0 or is_plausible(median):
+        return ""
+    least, largest = LIVING_TISSUE
+    said = (
+        f"Wrong unit? The median mean diffusivity is {median:.3g} {MM2_PER_S}, and living tissue has {least:g} to "
+        f"{largest:g}"
+    )
+    for name, scale in UNITS.items():
+        # Where a unit was told, the numbers are no longer those of the file.
+        if is_plausible(median * scale) and not volume.unit:
+            return f'{said}. It is {median * scale:.3g} if the numbers are in {name}: try unit "{name}"'
+    return f"{said}; no usual unit explains it"
+
+
+def b_value_question(largest: float) -> str:
+    """Ask the same of b-values, in s/mm², by the largest of them; the empty text where it is plausible."""
+    low, high = _B_VALUES
+    if low <= largest <= high:
+        return ""
+    would = next(((name, largest / scale) for name, scale in UNITS.items() if low <= largest / scale <= high), None)
+    if would is None:
+        return ""
+    return (
+        f"the largest b-value is {largest:g}, and scans have {low:g} to {high:g} s/mm². It would be {would[1]:g} s/mm² "
+        f'if the b-values are in the reciprocal of {would[0]}: pass unit "{would[0]}", that of the tensors'
+    )
+
+
+def is_plausible(diffusivity: float) -> bool:
+    """Tell whether living tissue has a mean diffusivity, in mm²/s."""
+    return LIVING_TISSUE[0] <= diffusivity <= LIVING_TISSUE[1]
