@@ -5,7 +5,7 @@ import os
 import warnings
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,8 +14,12 @@ from hks_jax.io import nifti
 from hks_jax.io.masks import as_mask, read_mask
 from hks_jax.io.provenance import digest
 from hks_jax.io.tensor_order import to_voxel_axes
+from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
+
+_LENGTH = 0.05
+"""By how much the length of a direction may differ from 1: it is rounding then."""
 
 
 class ExampleBrain(NamedTuple):
@@ -51,17 +55,24 @@ def fit_dwi(
     bvec: str | os.PathLike[str],
     mask: str | os.PathLike[str] | Bool[np.ndarray, "*shape"] | None = None,
     b_max: float | None = None,
+    *,
+    bvec_frame: Literal["fsl", "voxel", "world"] = "fsl",
+    unit: Unit | None = None,
 ) -> TensorVolume:
     """Fit diffusion tensors to diffusion-weighted images: weighted least squares on log signals (DIPY's TensorModel).
 
     Args:
-        path: NIfTI (nx, ny, nz, n).
-        bval: text file of the n b-values, in s/mm².
-        bvec: text file of the n directions, 3 × n or n × 3, in FSL's convention: voxel axes, the first reversed
-            where the affine's determinant is positive.
+        path: NIfTI (nx, ny, nz, n). Voxels where a signal is NaN or infinite are left out.
+        bval: text file of the n b-values, in s/mm² unless `unit` says otherwise.
+        bvec: text file of the n directions, 3 × n or n × 3, of length 1; those at b = 0 mean nothing.
         mask: a file (see `read_mask`) or a bool array (nx, ny, nz): fit inside only; outside, tensors are zero. None:
             what DIPY's median_otsu takes for the brain in the mean of the unweighted images, as a note says.
-        b_max: leave out images with larger b; None: use all. A tensor describes b ≲ 1000–1500 s/mm² only.
+        b_max: leave out images with larger b, in s/mm²; None: use all. A tensor describes b ≲ 1000–1500 s/mm² only.
+        bvec_frame: the axes of the directions: ``"fsl"``, voxel axes, the first reversed where the affine's determinant
+            is positive, as dcm2niix and FSL write them; ``"voxel"``, the voxel axes; ``"world"``, the scanner's, as
+            MRtrix has them.
+        unit: of diffusivity, whose reciprocal is the b-values' unit: ``"m2/s"`` for b-values in s/m², ``"um2/ms"`` for
+            ms/µm². None: mm²/s.
 
     Returns:
         Tensors along the voxel axes, in mm²/s. DIPY replaces eigenvalues that are not positive by about 1e-9 mm²/s; a
@@ -70,12 +81,13 @@ def fit_dwi(
     Raises:
         ImportError: DIPY or nibabel is missing.
         FileNotFoundError: no such file.
-        ValueError: numbers of images, b-values and directions that disagree; a mask of another shape; too few images.
+        ValueError: numbers of images, b-values and directions that disagree; b-values in another unit; directions that
+            have no length, or another than 1; a mask of another shape; too few images; no signal.
     """
     dti, gradients, segmentation = _dipy()
     image = nifti.load(path)
-    affine = np.asarray(image.affine, np.float64)
-    b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec))
+    affine, _ = nifti.affine_in_mm(os.fspath(path), image)
+    b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
     if directions.shape[-1] != 3 or directions.shape == (3, 3) != (b.size, 3):
         directions = directions.T
     if len(image.shape) != 4 or b.shape != (image.shape[-1],) or directions.shape != (b.size, 3):
@@ -83,6 +95,9 @@ def fit_dwi(
             f"path, bval, bvec: got an image of shape {image.shape}, {b.size} b-values and directions of shape "
             f"{directions.shape}; expected (nx, ny, nz, n), n and (n, 3)"
         )
+    b = b / (1.0 if unit is None else UNITS[unit])
+    if question := b_value_question(float(b.max())):
+        raise ValueError(f"{os.fspath(bval)}: {question}")
     used = np.full(b.size, True) if b_max is None else b <= b_max
     threshold = max(50.0, float(b.min()))
     weighted = int((used & (b > threshold)).sum())
@@ -91,13 +106,20 @@ def fit_dwi(
             f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
             "at least 6 and 1"
         )
+    directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(path, image)[..., used]
-    inside, remarks = _inside(mask, signal[..., b[used] <= threshold], affine, segmentation)
+    inside, found = _inside(os.fspath(path), mask, signal, b[used] <= threshold, affine, segmentation)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
-    tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fsl", affine)
+    tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), bvec_frame, affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
-    notes = [f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)", *remarks]
+    notes = [
+        f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
+        *remarks,
+        *found,
+    ]
+    if bvec_frame != "fsl":
+        notes.append(f"gradient directions along the {bvec_frame} axes, as asked; tensors taken to the voxel axes")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
     return TensorVolume(
@@ -107,32 +129,72 @@ def fit_dwi(
         inside,
         affine,
         order="fit",
-        frame="fsl",
+        frame=bvec_frame,
         notes=tuple(notes),
         source=os.fspath(path),
         digest=digest(path),
+        length_unit="mm",
+        unit=MM2_PER_S,
     )
 
 
+def _of_length_one(
+    name: str, directions: Float[np.ndarray, "n 3"], weighted: Bool[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 3"], list[str]]:
+    """Return the directions of weighted images with length 1, those of others zero; and a note of what was rounded."""
+    lengths = np.linalg.norm(directions, axis=1)
+    bad = weighted & ~(np.abs(lengths - 1) <= _LENGTH)
+    if bad.any():
+        first = int(np.argmax(bad))
+        raise ValueError(
+            f"{name}: {int(bad.sum())} directions of weighted images are not of length 1, the first that of image "
+            f"{first} (from 0), {directions[first].tolist()}, of length {lengths[first]:.4g}; expected length 1. "
+            "Divide each by its length, and if that stands for the strength of the gradient, multiply the b-value by "
+            "its square; leave out images whose direction is not known"
+        )
+    rounded = weighted & (np.abs(lengths - 1) > 1e-3)
+    unit = np.where(weighted[:, None], directions / np.where(weighted, lengths, 1.0)[:, None], 0.0)
+    notes = (
+        [
+            f"{int(rounded.sum())} directions divided by their lengths, {lengths[rounded].min():.4g} to "
+            f"{lengths[rounded].max():.4g}"
+        ]
+        if rounded.any()
+        else []
+    )
+    return unit, notes
+
+
 def _inside(
+    name: str,
     mask: str | os.PathLike[str] | np.ndarray | None,
-    unweighted: Float[np.ndarray, "nx ny nz n"],
+    signal: Float[np.ndarray, "nx ny nz n"],
+    unweighted: Bool[np.ndarray, " n"],
     affine: Float[np.ndarray, "4 4"],
     segmentation: ModuleType,
 ) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
-    """Return the mask, given or found, and a note of how it was found."""
+    """Return the mask, given or found, without the voxels whose signal is not finite, and notes of how it came."""
+    notes, finite = [], np.isfinite(signal)
     if mask is None:
+        # NaN outside, as resampling leaves it, is no signal.
         with np.errstate(invalid="ignore"):  # where its median filter leaves nothing, it divides by zero
-            _, brain = segmentation.median_otsu(unweighted.mean(axis=-1))
+            _, brain = segmentation.median_otsu(np.where(finite, signal, 0.0)[..., unweighted].mean(axis=-1))
         if not brain.any():
             raise ValueError("mask: DIPY's median_otsu finds nothing in the unweighted images; pass a mask")
-        return brain.astype(bool), [
-            f"no mask: DIPY's median_otsu of the unweighted images keeps {int(brain.sum())} voxels"
-        ]
-    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
-    if inside.shape != unweighted.shape[:3]:
-        raise ValueError(f"mask: got shape {inside.shape}; expected the images' shape {unweighted.shape[:3]}")
-    return inside, []
+        inside = brain.astype(bool)
+        notes.append(f"no mask: DIPY's median_otsu of the unweighted images keeps {int(inside.sum())} voxels")
+    else:
+        inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
+        if inside.shape != signal.shape[:3]:
+            raise ValueError(f"mask: got shape {inside.shape}; expected the images' shape {signal.shape[:3]}")
+    usable = inside & finite.all(axis=-1)
+    if inside.any() and not usable.any():
+        whole = [str(n) for n in np.flatnonzero(~finite[inside].any(axis=0))]
+        which = f"images {', '.join(whole)} of those used (from 0) have" if whole else "in each voxel one image has"
+        raise ValueError(f"{name}: {which} no finite signal inside; expected numbers. Leave such images out")
+    if lost := int((inside & ~usable).sum()):
+        notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: their signal is NaN or infinite")
+    return usable, notes
 
 
 def _dipy() -> tuple[ModuleType, ModuleType, ModuleType]:
@@ -145,11 +207,11 @@ def _dipy() -> tuple[ModuleType, ModuleType, ModuleType]:
     return dti, gradients, segmentation
 
 
-def _numbers(path: str | os.PathLike[str]) -> Float[np.ndarray, "..."]:
+def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:
     file = existing(path)
     with reading(file, "a table of numbers"), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of a table without numbers
         numbers = np.loadtxt(file, dtype=np.float64)
-        if not numbers.size or not np.isfinite(numbers).all():
+        if not numbers.size or not (may_be_nan or np.isfinite(numbers).all()):
             raise ValueError("it has none, or NaN or infinite ones")
     return numbers
