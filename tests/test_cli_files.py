@@ -285,7 +285,8 @@ def test_convert_orders_masks_and_repairs(tmp_path, capsys):
     np.testing.assert_allclose(read.tensors[7, 6, 2], D * np.outer(sign, sign), rtol=1e-6)
     assert not read.tensors[~disc()].any()
     record = json.loads(image.header.extensions[0].get_content())
-    assert (record["order"], record["frame"], record["repair"]["voxels"]) == ("fsl", "fsl", 1)
+    assert (record["order"], record["frame"], record["repair"]["voxels"]) == ("nifti", "voxel", 1)
+    assert (record["source_order"], record["source_frame"]) == ("fsl", "fsl")
 
 
 def test_convert_fits_scans_and_refuses_what_cannot_be(scan, tmp_path, capsys):

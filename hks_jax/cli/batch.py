@@ -43,6 +43,9 @@ whose row does not say otherwise.
 DIR becomes a BIDS derivative: for each subject an image with its sidecar, an .npz for hks-jax explore, plot and stats,
 a picture, and with --atlas a table of regions; for all of them group_summary.tsv and group_regions.tsv.
 
+Tensors whose mean diffusivity no living tissue has in mm2/s are refused unless --unit, or the column unit, says in
+which unit they are: subjects in different units cannot be compared.
+
 A subject that fails does not stop the others. The same command, given again, computes only what is not there yet, or
 was of other files.
 """
@@ -59,6 +62,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "batch",
         help="compute the signatures of many subjects, and tables of their regions",
+        usage="%(prog)s SUBJECTS -o DIR [options]",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -86,6 +90,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--replace", action="store_true", help="compute a study in DIR again that had other settings or times")
     add("--only", nargs="+", metavar="SUBJECT", help="compute only these, such as sub-07 or sub-07_ses-2")
     add_json_argument(parser)
+    parser.set_defaults(strict_unit=True)
     return parser
 
 

@@ -14,7 +14,8 @@ from hks_jax.io.save import SUFFIXES
 
 DESCRIPTION = f"""\
 Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT in the format of its suffix:
-{", ".join(SUFFIXES)}. Components are turned to the axes that the format has them in.
+{", ".join(SUFFIXES)}. Components are turned to the axes that the format has them in, which OUT says itself:
+it needs neither --order nor --frame. Numbers are converted only from the unit that --unit says, to mm2/s.
 """
 
 EPILOG = """\
@@ -30,6 +31,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "convert",
         help="write the tensors of a file in another format",
+        usage="%(prog)s FILE OUT [options]",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -27,24 +27,20 @@ if TYPE_CHECKING:
     from hks_jax.cli.job import Settings
 
 DESCRIPTION = """\
-Compute the heat kernel signature of a field of diffusion tensors. FILE holds tensors: NIfTI, NRRD, VTK image data, npz
-with 'tensors' (*shape, d, d) and, optional, 'spacing', 'origin', 'mask', 'affine', or npy; or diffusion-weighted
-images, with --bval and --bvec.
+Compute the heat kernel signature of a field of diffusion tensors. FILE holds one of
 
-A volume is computed whole, in three dimensions, unless --slice cuts it.
+  tensors                    of a volume, which is computed whole unless --slice cuts it; pass --metric
+  diffusion-weighted images  with --bval and --bvec: tensors are fitted to them
+  a mesh                     of triangles or tetrahedra, with the metric of space, or with that of the tensors at its
+                             vertices that --array names
+  eigenpairs                 which --save-pairs has kept: for other times, or another normalisation or method
 
-FILE may also be the eigenpairs that --save-pairs has kept, for other times, or another normalisation or method.
-
-FILE may also be a mesh of triangles or tetrahedra (see hks-jax info), with the metric of space, or with that of the
-tensors at its vertices that --array names.
-
-Writes to the folder OUT: hks.npz, hks.nii.gz (or .nrrd, .vti, as FILE is; times along the fourth axis; of a mesh .vtu,
-.vtk, .msh or .ply), hks.png (of a volume, three orthogonal slices for each time; of a mesh, its surface) and
-report.json.
+The folder OUT gets hks.npz, an image or a mesh in FILE's format (times along the fourth axis), hks.png and report.json.
 """
 
 EPILOG = """\
 examples:
+  hks-jax hks tensor.nii.gz -o out --metric inverse
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 100 --times auto:8
   hks-jax hks out/pairs.npz -o later --times auto:24 --normalisation flat
   hks-jax hks heart.vtu -o out --array D --metric inverse -k 50
@@ -57,6 +53,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "hks",
         help="compute the signature of a tensor field in a file",
+        usage="%(prog)s FILE -o OUT [options]",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -82,12 +79,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def add_signature_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say which signature is computed of the eigenpairs."""
-    add = parser.add_argument
+    add = parser.add_argument_group("the signature").add_argument
     add(
         "--times",
         nargs="+",
         metavar="T",
-        help="positive numbers, or auto, or auto:N for N times that suit the eigenvalues (default auto:6)",
+        help="positive numbers, in s for --metric inverse, or auto, or auto:N for N times that suit the eigenvalues "
+        "(default auto:6); 'hks-jax info FILE' says which suit a file",
     )
     add(
         "--normalisation",

@@ -26,10 +26,12 @@ from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.mesh import is_mesh
 from hks_jax.io.provenance import digest
 from hks_jax.io.repair import find_unsymmetric
+from hks_jax.io.units import MM2_PER_S, is_plausible
 
 DESCRIPTION = f"""\
-Say what is in a file of tensors: shape, order of components and how it was determined, frame, mask and its pieces,
-eigenvalues, tensors that are not positive definite, and the k and t that would suit. Of a mesh of triangles or
+Say what is in a file of tensors: shape, order of components and how it was determined, frame, units, mask and its
+pieces, eigenvalues, tensors that are not positive definite, and the k and t that would suit; and ask where frame or
+unit seem wrong. Of a mesh of triangles or
 tetrahedra ({", ".join(MESHES)}, or a surface of FreeSurfer's): size, boundary, pieces, and the same.
 """
 
@@ -48,6 +50,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "info",
         help="say what is in a file, and which k and t would suit it",
+        usage="%(prog)s FILE [options]",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -59,9 +62,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
-    progress = Progress(quiet=True)
+    progress, questions = Progress(quiet=True), list[str]()
     with progress.catching_warnings():
-        description = describe_mesh(args.file) if is_mesh(args.file) else describe(args.file, read(args, progress))
+        if is_mesh(args.file):
+            description = describe_mesh(args.file)
+        else:
+            description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
     if args.json:
         print(json.dumps(description, indent=2, ensure_ascii=False))
     else:
@@ -81,6 +87,8 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "dtype": volume.tensors.dtype.name,
         "shape": list(volume.shape),
         "spacing": list(volume.spacing),
+        "length_unit": volume.length_unit,
+        "unit": volume.unit,
         "order": volume.order,
         "frame": volume.frame,
         "affine": None if volume.affine is None else volume.affine.tolist(),
@@ -199,10 +207,11 @@ def _lines(description: dict[str, Any]) -> list[str]:
         ]
     else:
         bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
+        length = f" {description['length_unit']}" if description["length_unit"] else ", in no declared unit"
         placed = "without an affine" if description["affine"] is None else "placed by an affine"
         lines += [
             f"tensors         {numbers(description['shape'])}, {description['dtype']}, {placed}",
-            f"spacing         {numbers(description['spacing'])}",
+            f"spacing         {numbers(description['spacing'])}{length}",
             f"order, frame    {description['order']}, {description['frame']} axes",
             *(f"                {as_options(note, READING)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",
@@ -224,19 +233,32 @@ def _lines(description: dict[str, Any]) -> list[str]:
             lines[-1] += ": see --repair"
         if description["not_symmetric"]:
             lines.append(f"                {description['not_symmetric']} tensors are not symmetric")
+    unit, time = _units(description)
     if "eigenvalues" in description:
         e = description["eigenvalues"]
         lines += [
-            f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g}",
-            f"diffusivity     {description['median_mean_diffusivity']:.3g}, the median of the tensors' mean "
+            f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g}{unit}",
+            f"diffusivity     {description['median_mean_diffusivity']:.3g}{unit}, the median of the tensors' mean "
             "eigenvalues",
         ]
+    lines += [f"question        {question}" for question in description.get("questions", ())]
     for name, s in description.get("suits", {}).items():
         takes = f"takes k ≈ {s['k_for_least_time']}"
         if s["k_for_least_time"] > s["unknowns"] / 4:
             takes = "takes more pairs than are worth computing: see --method auto"
+        of = time if name == "inverse" else ""
         lines += [
-            f"metric {name:<8} t ≥ {s['least_time']:.3g} by the spacing (to 1 %; {takes}); "
-            f"t ≥ {s['least_time_of_k']:.3g} by k = {s['k']}; t ≤ {s['largest_time']:.3g} by the size"
+            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} by the spacing (to 1 %; {takes}); "
+            f"t ≥ {s['least_time_of_k']:.3g}{of} by k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the size"
         ]
     return lines
+
+
+def _units(description: dict[str, Any]) -> tuple[str, str]:
+    """Return how the units of diffusivities and of times in the metric D⁻¹ are written, empty where they are open."""
+    if description.get("length_unit") != "mm":
+        return "", ""
+    if description["unit"]:
+        return f" {description['unit']}", " s"
+    median = description.get("median_mean_diffusivity", 0.0)
+    return (f" {MM2_PER_S} (not declared)", " s") if is_plausible(median) else (" (unit not declared)", "")

@@ -20,14 +20,17 @@ def add_tensor_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_tensor_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how tensors are read, and what metric they make."""
-    add_options(parser)
-    add = parser.add_argument
-    add(
+    parser.add_argument_group("the metric").add_argument(
         "--metric",
         choices=("tensor", "inverse", "adjugate"),
-        help="the metric of diffusion tensors D: inverse is D⁻¹ (t is time), tensor is D itself, adjugate is |D|D⁻¹; "
-        "must be chosen but for NumPy's files, which hold the metric itself unless you choose",
+        help="how distances are made of diffusion tensors D. inverse: D⁻¹, in which places are near if water gets "
+        "quickly from one to the other, as along a fibre; t is then the time of diffusion, in s for D in mm2/s and "
+        "voxels in mm; take it for diffusion MRI unless you know better. tensor: D itself taken for a metric, near is "
+        "where water is slow. adjugate: |D|D⁻¹, D⁻¹ with other areas. Must be chosen but for NumPy's files, which "
+        "hold the metric itself unless you choose",
     )
+    add_options(parser)
+    add = parser.add_argument
     add(
         "--components",
         choices=("raise", "largest", "all"),
@@ -37,7 +40,7 @@ def add_tensor_options(parser: argparse.ArgumentParser) -> None:
     add("--dtype", choices=("float32", "float64"), default="float64", help="precision (default float64)")
 
 
-def add_interpolation_argument(parser: argparse.ArgumentParser) -> None:
+def add_interpolation_argument(parser: argparse._ActionsContainer) -> None:
     """Add the argument that says what lies between the nodes."""
     parser.add_argument(
         "--interpolation",
@@ -56,8 +59,9 @@ def add_eigenpair_arguments(parser: argparse.ArgumentParser, unless_given: str, 
         unless_given: which boundary there is without ``--boundary``, and why, for the help.
         boundary: the same, where it is known before the domain is.
     """
-    add_interpolation_argument(parser)
-    add = parser.add_argument
+    group = parser.add_argument_group("the eigenpairs")
+    add_interpolation_argument(group)
+    add = group.add_argument
     add(
         "--boundary",
         type=parse_boundary,

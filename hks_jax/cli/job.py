@@ -224,6 +224,8 @@ def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, A
         "sha256": volume.digest,
         "shape": volume.shape,
         "spacing": volume.spacing,
+        "length_unit": volume.length_unit,
+        "unit": volume.unit,
         "order": volume.order,
         "frame": volume.frame,
         "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),

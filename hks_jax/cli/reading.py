@@ -1,6 +1,7 @@
 """What commands that read tensors have in common: their options, and the volume that these describe."""
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,25 @@ import numpy as np
 from hks_jax.cli.arguments import parse_positive, parse_repair, parse_slice
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.spelling import READING, as_options
-from hks_jax.io import ORDERS, TensorVolume, erode, fit_dwi, positive_tensors, read_mask, read_tensors, repair_tensors
+from hks_jax.io import (
+    ORDERS,
+    UNITS,
+    TensorVolume,
+    erode,
+    fit_dwi,
+    positive_tensors,
+    questions,
+    read_mask,
+    read_tensors,
+    repair_tensors,
+)
 from hks_jax.io.mrtrix import is_mrtrix
 from hks_jax.io.nifti import is_nifti
 from hks_jax.io.nrrd import is_nrrd
+from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.read import SUFFIXES
 from hks_jax.io.repair import without_background
+from hks_jax.io.units import unit_question
 from hks_jax.io.vtk_image import is_vtk_image
 
 FILES = ", ".join(SUFFIXES)
@@ -52,17 +66,39 @@ def add_file_argument(parser: argparse.ArgumentParser) -> None:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that say what of FILE to read, and how."""
-    add = parser.add_argument
+    add = parser.add_argument_group("which voxels").add_argument
     add("--slice", type=parse_slice, metavar="AXIS=N", help="only one slice, such as z=14")
     add("--mask", type=Path, metavar="FILE", help="zeros and ones: NIfTI, MRtrix, NRRD, .npy, or .npz with 'mask'")
     add("--erode", type=int, default=0, metavar="N", help="peel N voxels off the mask's rim")
+    add = parser.add_argument_group(
+        "what the numbers mean", "needed only where the file does not say it; a wrong axis mirrors the tensors"
+    ).add_argument
+    add("--order", choices=tuple(ORDERS), help="order of the components")
+    add(
+        "--frame",
+        choices=("voxel", "fsl", "world", "measurement"),
+        help="axes of the components: the image's own (voxel), those of FSL's b-vectors (fsl: DIPY's and FSL's "
+        "tensors), the scanner's (world: MRtrix's), or NRRD's measurement frame",
+    )
+    add(
+        "--unit",
+        choices=tuple(UNITS),
+        help="of the tensors; they are converted to mm2/s. Water in living tissue has about 7e-4 mm2/s, which is 0.7 "
+        "um2/ms, 700 um2/s (TORTOISE) or 7e-10 m2/s. With --bval: the reciprocal of the b-values' unit",
+    )
+    add("--array", metavar="NAME", help="the array of tensors in an npz or VTK file that has several")
+    add("--spacing", type=float, nargs="+", metavar="H", help="distance between nodes, for .npy and .npz without one")
+    add("--confidence", type=float, default=0.5, metavar="C", help="NRRD's masked tensors are inside above it (0.5)")
+    add = parser.add_argument_group(
+        "tensors that are not positive definite", "without one of these they are refused"
+    ).add_argument
     add(
         "--repair",
         type=parse_repair,
         metavar="HOW[:FLOOR]",
-        help="tensors that are not positive definite: clip raises their eigenvalues to FLOOR (a hundredth of the "
-        "median mean eigenvalue), mask leaves them out, nearest takes the nearest valid one; those with an eigenvalue "
-        "below FLOOR, if given, are treated alike; without this option they are refused",
+        help="a few of them: clip raises their eigenvalues to FLOOR (a hundredth of the median mean eigenvalue), mask "
+        "leaves them out, nearest takes the nearest valid one; those with an eigenvalue below FLOOR, if given, are "
+        "treated alike",
     )
     add(
         "--positive",
@@ -71,17 +107,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="tensors that are indefinite by nature, such as stress: a metric is made of every one, exp:S takes "
         "exp(T/S), shift:C takes T + C·I; go on with --metric tensor",
     )
-    add("--order", choices=tuple(ORDERS), help="order of the components, where the file does not declare it")
-    add("--frame", choices=("voxel", "fsl", "world", "measurement"), help="axes of the components, likewise")
-    add("--array", metavar="NAME", help="the array of tensors in an npz or VTK file that has several")
-    add("--spacing", type=float, nargs="+", metavar="H", help="distance between nodes, for .npy and .npz without one")
-    add("--confidence", type=float, default=0.5, metavar="C", help="NRRD's masked tensors are inside above it (0.5)")
     dwi = parser.add_argument_group(
         "diffusion-weighted images", "Tensors are fitted by DIPY; without --mask inside what its median_otsu finds."
     )
-    dwi.add_argument("--bval", type=Path, metavar="FILE", help="b-values, s/mm²")
-    dwi.add_argument("--bvec", type=Path, metavar="FILE", help="gradient directions")
-    dwi.add_argument("--b-max", type=float, metavar="B", help="leave out images with larger b; tensors suit b ≲ 1500")
+    dwi.add_argument("--bval", type=Path, metavar="FILE", help="b-values, in s/mm2 unless --unit says otherwise")
+    dwi.add_argument(
+        "--bvec",
+        type=Path,
+        metavar="FILE",
+        help="gradient directions of length 1, three rows or three columns, as dcm2niix writes them (see --bvec-frame)",
+    )
+    dwi.add_argument(
+        "--bvec-frame",
+        choices=("fsl", "voxel", "world"),
+        help="axes of the directions: the image's, the first reversed where the affine's determinant is positive (fsl, "
+        "the default: FSL, dcm2niix, BIDS), the image's as they are (voxel), or the scanner's (world: MRtrix)",
+    )
+    dwi.add_argument(
+        "--b-max", type=float, metavar="B", help="leave out images with larger b, in s/mm2; tensors suit b ≲ 1500"
+    )
 
 
 def defaults() -> dict[str, Any]:
@@ -91,11 +135,19 @@ def defaults() -> dict[str, Any]:
     return vars(parser.parse_args([]))
 
 
-def read(args: argparse.Namespace, progress: Progress) -> TensorVolume:
-    """Read or fit the tensors, cut the slice, settle the mask, and repair if asked to."""
+def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
+    """Read or fit the tensors, cut the slice, settle the mask, and repair if asked to.
+
+    Args:
+        args: the command's arguments. With ``strict_unit``, tensors of an implausible unit are refused unless
+            ``--unit`` says that they have it.
+        progress: what says notes, and what is to be doubted.
+        ask: what says the latter instead.
+    """
     volume, mask = _load(args)
     if mask is not None and mask.shape == volume.shape:
         volume, mask = volume.with_mask(mask), None
+    volume = _questioned(volume, args, progress.warn if ask is None else ask)
     if args.slice is not None:
         try:
             volume = volume.slice(*args.slice)
@@ -128,6 +180,21 @@ def read(args: argparse.Namespace, progress: Progress) -> TensorVolume:
     return volume
 
 
+def _questioned(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str], None]) -> TensorVolume:
+    """Ask what the tensors give reason to; return them without the note of an open frame, which is asked or settled."""
+    if args.positive is not None:  # of no diffusion
+        return volume
+    for question in questions(without_background(volume)):
+        spelled = as_options(question, READING)
+        if getattr(args, "strict_unit", False) and not volume.unit and question == unit_question(volume):
+            raise ValueError(
+                f"{args.file}: {spelled}. If the numbers are right pass --unit mm2/s: the subjects of a study must "
+                "have the same unit, in the table by a column unit"
+            )
+        ask(spelled)
+    return replace(volume, notes=tuple(note for note in volume.notes if note != OPEN_FRAME))
+
+
 def _count_clipped(volume: TensorVolume) -> int:
     """Count the fitted tensors inside with an eigenvalue below a hundredth of the median mean eigenvalue."""
     values = np.linalg.eigvalsh(volume.tensors[volume.inside])
@@ -145,6 +212,8 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
     if args.bval is None and args.bvec is None:
         if args.b_max is not None:
             raise ValueError("--b-max: it is for diffusion-weighted images; pass --bval and --bvec too")
+        if args.bvec_frame is not None:
+            raise ValueError("--bvec-frame: it is for diffusion-weighted images; of tensors pass --frame")
         spacing = args.spacing[0] if args.spacing is not None and len(args.spacing) == 1 else args.spacing
         volume = read_tensors(
             [args.file, *args.others] if args.others else args.file,
@@ -153,6 +222,7 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
             array=args.array,
             spacing=spacing,
             confidence=args.confidence,
+            unit=args.unit,
         )
         return volume, None if args.mask is None else read_mask(args.mask, volume.affine)
     if args.others:
@@ -161,5 +231,7 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
         raise ValueError("--bval, --bvec: got one of them; diffusion-weighted images need both")
     for option in ("order", "frame", "array", "spacing"):
         if getattr(args, option) is not None:
-            raise ValueError(f"--{option}: it is for files of tensors; leave it out with --bval and --bvec")
-    return fit_dwi(args.file, args.bval, args.bvec, args.mask, args.b_max), None
+            instead = "pass --bvec-frame" if option == "frame" else "leave it out with --bval and --bvec"
+            raise ValueError(f"--{option}: it is for files of tensors; {instead}")
+    axes = {} if args.bvec_frame is None else {"bvec_frame": args.bvec_frame}
+    return fit_dwi(args.file, args.bval, args.bvec, args.mask, args.b_max, unit=args.unit, **axes), None

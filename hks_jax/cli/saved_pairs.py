@@ -59,6 +59,10 @@ def check_options(args: argparse.Namespace) -> None:
             )
 
 
+_ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit")
+"""What of a volume is kept as text beside its arrays."""
+
+
 def write_pairs(
     path: Path,
     volume: TensorVolume,
@@ -79,8 +83,7 @@ def write_pairs(
         warnings: what was said of the tensors and of the pairs, to be said again.
         fingerprint: of a study's subject, what the pairs were computed from.
     """
-    about = ("order", "frame", "notes", "source", "digest", "slice_axis")
-    record = {name: getattr(volume, name) for name in about}
+    record = {name: getattr(volume, name) for name in (*_ABOUT, "notes")}
     record |= {"repair": dict(volume.repair), "image": image, "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: value for name, value in asdict(settings).items() if name in _SETTLED}
     place = {"tensors": volume.tensors, "spacing": volume.spacing, "origin": volume.origin}
@@ -112,7 +115,7 @@ def read_pairs(
         tuple(arrays["origin"].tolist()),
         arrays.get("mask"),
         arrays.get("affine"),
-        **{name: record[name] for name in ("order", "frame", "source", "digest", "slice_axis", "repair")},
+        **{name: record[name] for name in (*_ABOUT, "repair") if name in record},
         notes=tuple(record["notes"]),
     )
     boundary = recorded_boundary(record["settings"])

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 
-READING = ("order", "frame", "array", "spacing", "confidence", "mask", "components", "repair")
+READING = ("order", "frame", "array", "spacing", "confidence", "mask", "components", "repair", "unit", "bvec_frame")
 """The options of the commands that read tensors."""
 
 OPTIONS = (
@@ -24,6 +24,6 @@ def as_options(message: str, names: Iterable[str]) -> str:
         option = ("-" if len(name) == 1 else "--") + name.replace("_", "-")
         message = re.sub(rf"^{re.escape(name)}: ", f"{option}: ", message)
         argument = rf"\b([Pp]ass|[Cc]hoose|or|try) {re.escape(name)}\b(?! [a-z])(?: \({option}\))?"
-        message = re.sub(rf'{argument}(?: |=|: )"([\w-]+)"', rf"\1 {option} \2", message)
+        message = re.sub(rf'{argument}(?: |=|: )"([\w/-]+)"', rf"\1 {option} \2", message)
         message = re.sub(argument, rf"\1 {option}", message)
     return message
