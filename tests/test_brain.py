@@ -1,5 +1,6 @@
 """A slice of a real brain, where its files lie beside the repository."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,3 +88,27 @@ def test_the_mean_shows_the_tissue_up_to_the_rim(plane):
     low, high = np.nanpercentile(mean, [2, 98])
     assert 0.7 < low < 0.85
     assert 1.1 < high < 1.3
+
+
+def test_its_fibres_tell_mirrored_and_turned_tensors():
+    """Of 27 000 anisotropic voxels, as they are, mirrored along each axis, and along the scanner's axes."""
+    right = hj.io.read_tensors(TENSORS, mask=MASK)
+    assert hj.io.questions(right) == ()
+    for axis in range(3):
+        signs = np.where(np.arange(3) == axis, -1, 1).astype(np.float32)
+        mirrored = replace(right, tensors=right.tensors * np.outer(signs, signs))
+        (question,) = hj.io.questions(mirrored)
+        assert question.startswith("Wrong frame?")
+        assert f"{'xyz'[axis]} axis reversed" in question or (axis == 0 and 'try frame "world"' in question)
+    # Stored from the other side, the determinant is positive: FSL's axes are not the voxels' then.
+    turned = replace(right, affine=right.affine @ np.diag([-1.0, 1, 1, 1]), mask=right.inside[::-1])
+    signs = np.outer([-1, 1, 1], [-1, 1, 1]).astype(np.float32)
+    (question,) = hj.io.questions(replace(turned, tensors=right.tensors[::-1]))
+    assert 'try frame "fsl"' in question
+    assert hj.io.questions(replace(turned, tensors=right.tensors[::-1] * signs)) == ()
+
+
+def test_its_other_units_are_asked_about():
+    right = hj.io.read_tensors(TENSORS, mask=MASK)
+    assert 'are in um2/s: try unit "um2/s"' in hj.io.questions(replace(right, tensors=right.tensors * 1e6))[0]
+    assert 'are in m2/s: try unit "m2/s"' in hj.io.questions(replace(right, tensors=right.tensors * 1e-6))[0]

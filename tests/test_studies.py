@@ -305,6 +305,31 @@ def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
     assert {row["participant_id"] for row in table(study / "out" / "group_regions.tsv")} == {"sub-03"}
 
 
+def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    image = nib.load(study / "t1.nii.gz")
+    for number, matrix, scale in ((4, AFFINE, 1e6), (5, AFFINE, 1e6), (6, AFFINE @ np.diag([-1.0, 1, 1, 1]), 1.0)):
+        other = nib.Nifti1Image(image.get_fdata() * scale, matrix)  # without the record that our files have
+        other.header.set_intent("symmetric matrix", (3,))
+        nib.save(other, study / f"t{number}.nii.gz")
+    (study / "subjects.tsv").write_text(
+        "participant_id\tfile\tunit\tatlas\n01\tt1.nii.gz\t\tn/a\n04\tt4.nii.gz\t\tn/a\n05\tt5.nii.gz\tum2/s\tn/a\n"
+        "06\tt6.nii.gz\t\tn/a\n"
+    )
+    arguments = [word for word in command(study, "out", "--times", "3e3") if "atlas" not in word]
+    assert main(arguments) == 1
+    printed = capsys.readouterr().err
+    assert "1 of 4 subjects failed (sub-04)" in printed
+    assert "sub-04 failed: " in printed
+    mean = np.median(np.trace(tensors(), axis1=-2, axis2=-1)) / 3
+    assert f"It is {mean:.3g} if the numbers are in um2/s: try --unit um2/s. If the numbers are right pass" in printed
+    # The determinant of the last is positive, and so few voxels do not tell.
+    assert [line for line in printed.splitlines() if line.startswith("warning: sub-06: NIfTI does not declare")]
+    assert "warning: sub-01" not in printed
+    values = [np.load(next((study / "out" / f"sub-0{i}" / "dwi").glob("*.npz")))["hks"] for i in (1, 5)]
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -13,13 +13,13 @@ from hks_jax.io.volume import AXES, TensorVolume
 ANISOTROPIC = 0.3
 """The fractional anisotropy from which on a tensor's principal direction is taken for a fibre's."""
 _ENOUGH = 1000
-"""Fewer voxels with a neighbour along their direction decide nothing."""
+"""Fewer voxels with both neighbours along their direction decide nothing."""
 _BLOCK = 8
 """Voxels, per axis, of the blocks whose scatter tells the error of a mean: neighbours are not independent."""
 CLEAR = 3.5
 """Standard errors by which one mean must be below another."""
-_BY = 0.99
-"""And by which factor."""
+_SMOOTH = 3.0
+"""Degrees below which fibres go on so well that the difference is one of the steps from voxel to voxel."""
 
 
 class Alternative(NamedTuple):
@@ -28,7 +28,7 @@ class Alternative(NamedTuple):
     Attributes:
         name: a frame, or an axis of the voxels that is reversed.
         is_frame: whether it is a frame.
-        angle: the mean angle, in degrees, between a principal direction and that of the neighbour along it.
+        angle: the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it.
         errors: by how many standard errors that is less than with the axes in which the file was read.
     """
 
@@ -43,7 +43,7 @@ class Coherence(NamedTuple):
 
     Attributes:
         frame: in which the file was read.
-        angle: the mean angle, in degrees, between a principal direction and that of the neighbour along it.
+        angle: the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it.
         others: the same along other axes.
     """
 
@@ -57,7 +57,7 @@ class Coherence(NamedTuple):
 
         A frame comes before a reversed axis that gains hardly more: the two may differ by a small turn only.
         """
-        clear = [a for a in self.others if a.errors > CLEAR and a.angle < _BY * self.angle]
+        clear = [a for a in self.others if a.errors > CLEAR and self.angle > _SMOOTH]
         best = min(clear, key=lambda a: a.angle, default=None)
         frames = [a for a in clear if a.is_frame and best and self.angle - a.angle > 0.8 * (self.angle - best.angle)]
         return min(frames, key=lambda a: a.angle, default=best)
@@ -70,9 +70,9 @@ class Coherence(NamedTuple):
 def coherence(volume: TensorVolume) -> Coherence | None:
     """Measure whether fibres continue along their own direction, along the axes of the file and along others.
 
-    A principal direction v is compared with those of the two neighbours nearest to ±v, where they are anisotropic too.
-    Tensors along the right axes agree best. The axes compared are the frames of `hks_jax.io.read_tensors`, and the
-    file's own with one axis of the voxels reversed.
+    A principal direction v is compared with the mean of those of the two neighbours nearest to ±v, where both are
+    anisotropic, too. Tensors along the right axes agree best. The axes compared are the frames of
+    `hks_jax.io.read_tensors`, and the file's own with one axis of the voxels reversed.
 
     Returns:
         The angles; None for a slice, and where fewer than a thousand voxels have such neighbours.
@@ -113,8 +113,8 @@ def frame_question(found: Coherence | None, option: str = "frame") -> str:
         return ""
     best = found.better
     said = (
-        f"Wrong frame? Principal directions of neighbours along them differ by {found.angle:.1f}° in the mean along "
-        f"the {found.frame} axes"
+        "Wrong frame? Principal directions and those of the two neighbours along them differ by "
+        f"{found.angle:.1f}° in the mean along the {found.frame} axes"
     )
     if best.is_frame:
         return f'{said}, and by {best.angle:.1f}° along the {best.name} axes: try {option} "{best.name}"'
@@ -140,19 +140,23 @@ def _angles(
     index: Int[np.ndarray, "nx ny nz"],
     spacing: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, " n"]:
-    """Return the mean angle, in degrees, to the directions of the neighbours along a voxel's own; NaN without any."""
+    """Return the angle, in degrees, to the mean direction of the two neighbours along a voxel's own; NaN without both.
+
+    A fibre that bends turns one way before a voxel and the other way behind it: their mean does not feel that. Each
+    neighbour by itself would, and circles around a heart would seem to go on best along their radii.
+    """
     steps = directions / spacing
     steps = np.rint(steps / np.abs(steps).max(axis=1, keepdims=True)).astype(int)
-    total, count = np.zeros(len(voxels)), np.zeros(len(voxels))
+    mean, both = np.zeros_like(directions), np.full(len(voxels), True)
     for sign in (1, -1):
         beside = voxels + sign * steps
         there = ((beside >= 0) & (beside < index.shape)).all(axis=1)
         neighbour = np.where(there, index[tuple(np.where(there[:, None], beside, 0).T)], -1)
-        found = neighbour >= 0
-        cosine = np.abs(np.einsum("na,na->n", directions[found], directions[neighbour[found]]))
-        total[found] += np.degrees(np.arccos(np.minimum(cosine, 1.0)))
-        count[found] += 1
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        both &= neighbour >= 0
+        cosine = np.einsum("na,na->n", directions, directions[neighbour])
+        mean += np.where(cosine >= 0, 1.0, -1.0)[:, None] * directions[neighbour]
+    cosine = np.einsum("na,na->n", directions, mean) / np.maximum(np.linalg.norm(mean, axis=1), 1e-12)
+    return np.where(both, np.degrees(np.arccos(np.minimum(cosine, 1.0))), np.nan)
 
 
 def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarray, "3 3"]]]:

@@ -15,8 +15,8 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
     """Ask what the tensors of a volume give reason to: "Wrong frame?", "Wrong unit of length?", "Wrong unit?".
 
     Mirrored or turned tensors are as positive definite as right ones, but the fibres of neighbours no longer continue
-    each other: the mean angle between a principal direction and that of the neighbour along it is compared with what it
-    is along other axes. It needs a volume of some thousand anisotropic voxels; lay the mask over it first.
+    each other: the mean angle between a principal direction and those of the two neighbours along it is compared with
+    what it is along other axes. It needs a volume of some thousand anisotropic voxels; lay the mask over it first.
 
     Units are asked about where lengths are in mm and the median mean diffusivity is one that no living tissue has, or
     the voxels are of a size that no scan has.

@@ -1,0 +1,115 @@
+"""Scans as they come: signals and directions that are not numbers, b-values in other units."""
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+from hks_jax.cli import main
+from hks_jax.io import fit_dwi
+
+SHAPE = (24, 22, 6)
+D = 1e-3 * np.array([[1.5, 0.2, 0.1], [0.2, 0.8, 0.0], [0.1, 0.0, 0.6]])
+FSL = np.outer([-1, 1, 1], [-1, 1, 1])
+"""What D becomes along the voxel axes where the affine keeps orientation and directions are FSL's."""
+
+
+def head():
+    i, j, _ = (2 * a / (n - 1) - 1 for a, n in zip(np.indices(SHAPE), SHAPE, strict=True))
+    return i**2 + j**2 < 0.6
+
+
+class Scan:
+    """A noise-free scan of D in a head, whose files can be written with what is wrong in scans."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        directions = np.random.default_rng(0).normal(size=(14, 3))
+        self.directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        self.b = np.array([0.0, 0.0] + [1000.0] * 12)
+        self.directions[:2] = 0
+        exponent = self.b * np.einsum("na,ab,nb->n", self.directions, D, self.directions)
+        self.signal = np.where(head()[..., None], 1000 * np.exp(-exponent), 5.0)
+
+    def write(self):
+        nib.save(nib.Nifti1Image(self.signal, np.diag([2.0, 2.0, 2.0, 1.0])), self.folder / "d.nii.gz")
+        np.savetxt(self.folder / "b", self.b[None])
+        np.savetxt(self.folder / "g", self.directions.T)
+        return [self.folder / name for name in ("d.nii.gz", "b", "g")]
+
+    def fit(self, *mask, **options):
+        return fit_dwi(*self.write(), *mask, **options)
+
+
+@pytest.fixture
+def scan(tmp_path):
+    return Scan(tmp_path)
+
+
+def test_voxels_without_a_finite_signal_are_left_out(scan):
+    lost = np.zeros(SHAPE, bool)
+    lost[10, 9, 2] = lost[12, 9:11, 3] = True
+    scan.signal[10, 9, 2, 5] = np.nan
+    scan.signal[12, 9:11, 3, :] = np.inf
+    scan.signal[0, 0, 0, :] = np.nan  # outside
+    fit = scan.fit(head())
+    np.testing.assert_array_equal(fit.mask, head() & ~lost)
+    np.testing.assert_allclose(fit.tensors[fit.mask], np.broadcast_to(D * FSL, (fit.mask.sum(), 3, 3)), atol=1e-8)
+    assert not fit.tensors[~fit.mask].any()
+    assert f"3 of {head().sum()} voxels inside are left out: their signal is NaN or infinite" in fit.notes
+
+
+def test_a_background_of_nan_is_outside(scan):
+    expected = scan.fit().mask
+    scan.signal[~head()] = np.nan
+    fit = scan.fit()
+    assert fit.mask.sum() > 600
+    np.testing.assert_array_equal(fit.mask, expected)
+    np.testing.assert_allclose(fit.tensors[fit.mask], np.broadcast_to(D * FSL, (fit.mask.sum(), 3, 3)), atol=1e-8)
+
+
+def test_an_image_without_signal_is_named(scan):
+    scan.signal[..., 7] = np.nan
+    with pytest.raises(ValueError, match=r"d\.nii\.gz: images 7 of those used \(from 0\) have no finite signal inside"):
+        scan.fit(head())
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.3, 7.0])
+def test_directions_of_unweighted_images_mean_nothing(scan, value):
+    expected = scan.fit(head()).tensors
+    scan.directions[:2] = value
+    np.testing.assert_array_equal(scan.fit(head()).tensors, expected)
+
+
+@pytest.mark.parametrize(("value", "length"), [(np.nan, "nan"), (0.0, "0"), (0.4, "0.6928")])
+def test_directions_of_another_length_are_refused_by_name(scan, value, length):
+    scan.directions[5] = value
+    with pytest.raises(ValueError, match=rf"[/\\]g: 1 directions of .* the first that of image 5 .*length {length};"):
+        scan.fit(head())
+    scan.b[5] = 3000.0  # an image that is left out
+    assert scan.fit(head(), b_max=1000).mask.sum() == head().sum()
+
+
+def test_rounded_directions_are_divided_by_their_lengths(scan):
+    expected = scan.fit(head()).tensors
+    scan.directions[2:] *= np.linspace(0.97, 1.03, 12)[:, None]
+    fit = scan.fit(head())
+    np.testing.assert_allclose(fit.tensors, expected, atol=1e-9)
+    assert "12 directions divided by their lengths, 0.97 to 1.03" in fit.notes
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m2/s", 1e6), ("um2/ms", 1e-3)])
+def test_b_values_in_another_unit_are_refused_until_it_is_told(scan, capsys, unit, scale):
+    expected = scan.fit(head())
+    scan.b *= scale
+    with pytest.raises(ValueError, match=rf'[/\\]b: the largest b-value is .* would be 1000 s/mm².*pass unit "{unit}"'):
+        scan.fit(head())
+    told = scan.fit(head(), unit=unit, b_max=1200)
+    np.testing.assert_allclose(told.tensors, expected.tensors, atol=1e-12)
+    assert told.notes[0] == "weighted least squares on 14 of 14 images (b ≤ 1000 s/mm²)"
+    assert told.unit == "mm²/s"
+    images, b, g = map(str, scan.write())
+    arguments = ["info", images, "--bval", b, "--bvec", g]
+    assert main(arguments) == 2
+    assert f"pass --unit {unit}, that of the tensors" in capsys.readouterr().err
+    assert main([*arguments, "--unit", unit]) == 0
+    assert "(b ≤ 1000 s/mm²)" in capsys.readouterr().out
