@@ -69,7 +69,7 @@ def test_a_background_of_nan_is_outside(scan):
 
 def test_an_image_without_signal_is_named(scan):
     scan.signal[..., 7] = np.nan
-    with pytest.raises(ValueError, match=r"d\.nii\.gz: images 7 of those used \(from 0\) have no finite signal inside"):
+    with pytest.raises(ValueError, match=r"d\.nii\.gz: of the images used 7 \(from 0\) have no finite signal inside"):
         scan.fit(head())
 
 

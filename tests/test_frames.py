@@ -72,7 +72,8 @@ def test_fibres_continue_best_along_the_right_axes(tmp_path, noise, flip):
     read = read_tensors(write(tmp_path / "t.nii.gz", bundles(noise), affine(30, flip)))
     found = coherence(read)
     # In an image with x reversed FSL's axes are the voxels' own; else they are those with x reversed.
-    assert {a.name for a in found.others} == {"world", "y", "z", "x" if flip else "fsl"}
+    scanners = {f"scanner's {axis}" for axis in "xyz"}
+    assert {a.name for a in found.others} == {"world", "y", "z", "x" if flip else "fsl", *scanners}
     assert all(a.errors < -5 and a.angle > found.angle + 1 for a in found.others)
     assert found.better is None
     assert questions(read) == ()  # though NIfTI leaves the frame open
@@ -113,6 +114,18 @@ def test_smooth_fibres_that_bend_are_no_reason_to_ask(noise, axis):
     signs = np.where(np.arange(3) == (-1 if axis is None else axis), -1.0, 1.0)
     heart = TensorVolume(along(ring * signs, noise), SPACING, (0.0,) * 3, radius > 6, affine(), length_unit="mm")
     assert coherence(heart).better is None
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_measurement_frame_with_a_wrong_sign_shows(tmp_path, axis):
+    nrrd = pytest.importorskip("nrrd")
+    volume = TensorVolume(bundles(0.1), SPACING, (0.0,) * 3, affine=affine(35, True), length_unit="mm")
+    data, header = nrrd.read(str(save_tensors(tmp_path / "t.nrrd", volume)))
+    assert questions(read_tensors(tmp_path / "t.nrrd")) == ()
+    header["measurement frame"][:, axis] *= -1  # a component of each of its vectors
+    nrrd.write(str(tmp_path / "u.nrrd"), data, header)
+    (question,) = questions(read_tensors(tmp_path / "u.nrrd"))
+    assert f"along the measurement axes, and by 23.2° with the scanner's {'xyz'[axis]} axis reversed" in question
 
 
 def test_what_decides_nothing_is_no_question():

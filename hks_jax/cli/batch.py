@@ -1,6 +1,7 @@
 """``hks-jax batch SUBJECTS.tsv -o DIR``: the signatures of many subjects, and the tables of their regions."""
 
 import argparse
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -197,12 +198,13 @@ def _suitable(
 
     if args.metric == "adjugate":
         raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
-    ranges = {}
+    ranges, silent = {}, StudyProgress(1, True)
+    silent.stream = io.StringIO()  # what is to be warned of is, with the subject's name, when its turn comes
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
         try:
             assert subject.arguments is not None, subject.problem
-            volume = read_volume(subject.arguments, StudyProgress(1, True))
+            volume = read_volume(subject.arguments, silent)
             ranges[subject.name] = suitable_range(volume, subject.arguments)
         except Exception:  # said when its turn comes
             continue

@@ -26,7 +26,7 @@ class Alternative(NamedTuple):
     """Other axes that a file's components may be along.
 
     Attributes:
-        name: a frame, or an axis of the voxels that is reversed.
+        name: a frame, or an axis of the voxels or of the scanner that is reversed.
         is_frame: whether it is a frame.
         angle: the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it.
         errors: by how many standard errors that is less than with the axes in which the file was read.
@@ -72,7 +72,7 @@ def coherence(volume: TensorVolume) -> Coherence | None:
 
     A principal direction v is compared with the mean of those of the two neighbours nearest to ±v, where both are
     anisotropic, too. Tensors along the right axes agree best. The axes compared are the frames of
-    `hks_jax.io.read_tensors`, and the file's own with one axis of the voxels reversed.
+    `hks_jax.io.read_tensors`, and the file's own with one axis reversed, of the voxels or of the scanner.
 
     Returns:
         The angles; None for a slice, and where fewer than a thousand voxels have such neighbours.
@@ -174,7 +174,10 @@ def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarra
     if volume.frame in to_voxel:
         back = to_voxel[volume.frame].T
         candidates += [(name, True, turn @ back) for name, turn in to_voxel.items() if name != volume.frame]
-    candidates += [(AXES[a], False, np.diag([-1.0 if a == b else 1.0 for b in range(3)])) for a in range(3)]
+    flips = [np.diag([-1.0 if a == b else 1.0 for b in range(3)]) for a in range(3)]
+    candidates += [(AXES[a], False, flip) for a, flip in enumerate(flips)]
+    turn = to_voxel["world"]
+    candidates += [(f"scanner's {AXES[a]}", False, turn @ flip @ turn.T) for a, flip in enumerate(flips)]
     kept: list[tuple[str, bool, Float[np.ndarray, "3 3"]]] = []
     for name, is_frame, turn in candidates:
         before = [np.eye(3), *(other for _, _, other in kept)]

@@ -190,7 +190,7 @@ def _inside(
     usable = inside & finite.all(axis=-1)
     if inside.any() and not usable.any():
         whole = [str(n) for n in np.flatnonzero(~finite[inside].any(axis=0))]
-        which = f"images {', '.join(whole)} of those used (from 0) have" if whole else "in each voxel one image has"
+        which = f"of the images used {', '.join(whole)} (from 0) have" if whole else "in each voxel one image has"
         raise ValueError(f"{name}: {which} no finite signal inside; expected numbers. Leave such images out")
     if lost := int((inside & ~usable).sum()):
         notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: their signal is NaN or infinite")
