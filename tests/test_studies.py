@@ -20,6 +20,7 @@ from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.cli import build_parser, main
+from hks_jax.cli.job import Settings
 from hks_jax.cli.study import Study
 from hks_jax.cli.study_progress import StudyProgress
 from hks_jax.cli.study_times import Range, common_times, suitable_range
@@ -328,6 +329,34 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
     assert "sub-01: NIfTI does not declare" not in printed
     values = [np.load(next((study / "out" / f"sub-0{i}" / "dwi").glob("*.npz")))["hks"] for i in (1, 5)]
     np.testing.assert_allclose(values[1], values[0], rtol=1e-6)
+
+
+def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    for i, scale in enumerate((1e3, 0.8e3, 1e6)):  # two in um2/ms, one in um2/s
+        np.savez(study / f"n{i}.npz", tensors=tensors(scale), spacing=(2.0, 2.0, 3.0))
+    rows = "".join(f"0{i}\tn{i}.npz\n" for i in range(3))
+    (study / "subjects.tsv").write_text("participant_id\tfile\n" + rows)
+    arguments = ["batch", str(study / "subjects.tsv"), "-o", str(study / "out"), "-k", "8", "--metric", "inverse"]
+    arguments += ["--slice", "z=1", "--times", "10"]
+    assert main(arguments) == 1
+    assert "1 of 3 subjects failed (sub-02)" in capsys.readouterr().err
+    summary = table(study / "out" / "group_summary.tsv")
+    assert [row["status"] for row in summary] == ["done", "done", "failed"]
+    assert "expected the same unit of all subjects" in summary[2]["problem"]
+    told = rows.replace("npz", "npz\tum2/ms").replace("n2.npz\tum2/ms", "n2.npz\tum2/s")
+    (study / "subjects.tsv").write_text("participant_id\tfile\tunit\n" + told)
+    assert main([*arguments[:-1], "1e4", "-q", "--replace"]) == 0
+
+
+def test_a_subject_is_done_again_when_its_sidecar_changes(study):
+    rows = read_subjects(study / "subjects.tsv", build_parser().parse_args(command(study, "out")))
+    whole = Study(study / "out", Settings("inverse"), "scanner", {})
+    before = [whole.fingerprint(row) for row in rows]
+    for name in ("t1", "sub-2_param-txx"):
+        (study / f"{name}.json").write_text(json.dumps({"OrientationEncoding": {"Reference": "xyz"}}))
+    after = [whole.fingerprint(row) for row in rows]
+    assert [a == b for a, b in zip(before, after, strict=True)] == [False, False, True]
 
 
 @pytest.mark.parametrize(

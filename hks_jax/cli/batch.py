@@ -3,9 +3,12 @@
 import argparse
 import io
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from hks_jax.cli.arguments import Times, parse_times
 from hks_jax.cli.boundary import MEAN, recorded_boundary
@@ -22,6 +25,7 @@ from hks_jax.cli.study_progress import StudyProgress
 from hks_jax.cli.subjects import FILES, OPTIONS, Subject, read_subjects
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.tables import read_json
+from hks_jax.io.units import LIVING_TISSUE
 
 if TYPE_CHECKING:
     from hks_jax.cli.study import Study
@@ -129,6 +133,7 @@ def run(args: argparse.Namespace) -> None:
         problems |= run_all(study, chosen, progress, args.debug)
         if args.only:  # what others have done in the meantime
             problems = {name: why for name, why in problems.items() if why or not _is_there(study, subjects, name)}
+        problems |= _other_units(study, [subject for subject in subjects if subject.name not in problems])
         files = study.write_group(subjects, problems, with_regions)
     failed = [subject.name for subject in chosen if problems.get(subject.name)]
     if args.json:
@@ -140,6 +145,27 @@ def run(args: argparse.Namespace) -> None:
             f"{len(failed)} of {len(chosen)} subjects failed ({', '.join(failed[:5])}{', …' * (len(failed) > 5)}); "
             f"{args.output / 'group_summary.tsv'} says why. The others are done; the same command tries these again"
         )
+
+
+def _other_units(study: "Study", done: list[Subject]) -> dict[str, str]:
+    """Return why subjects are refused whose diffusivities are so far from the others' that the unit must be another.
+
+    Files that declare no lengths in mm, such as NumPy's, can be compared with each other alone.
+    """
+    from hks_jax.cli.study import MAP
+
+    if study.settings.metric == "tensor":  # which need not be diffusion
+        return {}
+    inputs = {subject.name: read_json(study.path(subject, f"{MAP}.json")).get("Input", {}) for subject in done}
+    medians = {name: value for name, about in inputs.items() if (value := about.get("median_mean_diffusivity"))}
+    middle = math.exp(np.median(np.log(list(medians.values())))) if medians else 1.0
+    span = LIVING_TISSUE[1] / LIVING_TISSUE[0]
+    return {
+        name: f"--unit: the median mean diffusivity is {value:.3g}, and {middle:.3g} in the middle of the study; "
+        "expected the same unit of all subjects. Say by --unit, or a column unit, which it is in each"
+        for name, value in medians.items()
+        if not 1 / span <= value / middle <= span
+    }
 
 
 def _settled_boundary(args: argparse.Namespace) -> BoundarySpec:

@@ -20,6 +20,7 @@ from hks_jax.eigen.solve import eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.heat import Normalisation
 from hks_jax.signatures.tail import truncation_map
@@ -226,6 +227,7 @@ def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, A
         "spacing": volume.spacing,
         "length_unit": volume.length_unit,
         "unit": volume.unit,
+        "median_mean_diffusivity": median_mean_diffusivity(volume),
         "order": volume.order,
         "frame": volume.frame,
         "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),

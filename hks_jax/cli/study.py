@@ -20,7 +20,7 @@ from hks_jax.cli.reading import image_suffix
 from hks_jax.cli.subjects import OPTIONS, Subject
 from hks_jax.io.components import is_one_of_six, siblings
 from hks_jax.io.labels import names_beside
-from hks_jax.io.nifti import is_nifti
+from hks_jax.io.nifti import is_nifti, sidecar_of
 from hks_jax.io.provenance import digest
 from hks_jax.io.tables import read_json, read_table, write_json, write_table
 from hks_jax.reading import existing
@@ -265,7 +265,8 @@ def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
     images = [args.file, *args.others]
     if not args.others and args.bval is None and is_nifti(args.file) and is_one_of_six(args.file):
         images = siblings(args.file)
-    given = {"file": images, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
+    sidecars = [sidecar_of(path) for path in images[:1] if args.bval is None and is_nifti(path)]
+    given = {"file": images, "sidecar": sidecars, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
     return {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
 
 

@@ -120,10 +120,16 @@ def affine_beside(name: str, image: Any, affine: np.ndarray) -> np.ndarray:
     return own if unit else scaled_beside(own, affine)
 
 
-def _sidecar(path: str) -> dict[str, Any]:
-    """Return the field OrientationEncoding of the BIDS sidecar beside an image; empty if there is none."""
-    sidecar = Path(path.removesuffix(".gz").removesuffix(".nii") + ".json")
-    if not sidecar.is_file():
+def sidecar_of(path: str | os.PathLike[str]) -> Path | None:
+    """Return the BIDS sidecar beside an image, if it is there."""
+    sidecar = Path(os.fspath(path).removesuffix(".gz").removesuffix(".nii") + ".json")
+    return sidecar if sidecar.is_file() else None
+
+
+def _encoding(path: str) -> dict[str, Any]:
+    """Return the field OrientationEncoding of the sidecar beside an image; empty if there is none."""
+    sidecar = sidecar_of(path)
+    if sidecar is None:
         return {}
     with reading(sidecar, "a BIDS sidecar in JSON"):
         content = json.loads(sidecar.read_text(encoding="utf-8"))
@@ -167,7 +173,7 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
         )
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     affine, length_unit = affine_in_mm(name, image)
-    encoding, record, notes = _sidecar(name), _own_record(image, affine) if declared else {}, list[str]()
+    encoding, record, notes = _encoding(name), _own_record(image, affine) if declared else {}, list[str]()
     if order is None and declared:
         order = "nifti"
     elif order is None and encoding.get("Type") == "tensor":

@@ -108,9 +108,7 @@ def unit_question(volume: TensorVolume) -> str:
     """
     if volume.length_unit != "mm":
         return ""
-    means = np.trace(volume.tensors[volume.inside], axis1=-2, axis2=-1) / volume.dimension
-    means = means[np.isfinite(means) & (means > 0)]
-    median = float(np.median(means)) if means.size else 0.0
+    median = median_mean_diffusivity(volume)
     if median == 0 or is_plausible(median):
         return ""
     least, largest = LIVING_TISSUE
@@ -123,6 +121,13 @@ def unit_question(volume: TensorVolume) -> str:
         if is_plausible(median * scale) and not volume.unit:
             return f'{said}. It is {median * scale:.3g} if the numbers are in {name}: try unit "{name}"'
     return f"{said}; no usual unit explains it"
+
+
+def median_mean_diffusivity(volume: TensorVolume) -> float:
+    """Return the median over the voxels inside whose mean diffusivity is positive; 0 if there are none."""
+    means = np.trace(volume.tensors[volume.inside], axis1=-2, axis2=-1) / volume.dimension
+    means = means[np.isfinite(means) & (means > 0)]
+    return float(np.median(means)) if means.size else 0.0
 
 
 def b_value_question(largest: float) -> str:
