@@ -256,9 +256,9 @@ def _lines(description: dict[str, Any]) -> list[str]:
 
 def _units(description: dict[str, Any]) -> tuple[str, str]:
     """Return how the units of diffusivities and of times in the metric D⁻¹ are written, empty where they are open."""
+    if description.get("unit"):
+        return f" {description['unit']}", " s" if description["length_unit"] == "mm" else ""
     if description.get("length_unit") != "mm":
         return "", ""
-    if description["unit"]:
-        return f" {description['unit']}", " s"
     median = description.get("median_mean_diffusivity", 0.0)
     return (f" {MM2_PER_S} (not declared)", " s") if is_plausible(median) else (" (unit not declared)", "")

@@ -18,7 +18,6 @@ from hks_jax.io import (
     erode,
     fit_dwi,
     positive_tensors,
-    questions,
     read_mask,
     read_tensors,
     repair_tensors,
@@ -26,7 +25,7 @@ from hks_jax.io import (
 from hks_jax.io.mrtrix import is_mrtrix
 from hks_jax.io.nifti import is_nifti
 from hks_jax.io.nrrd import is_nrrd
-from hks_jax.io.questions import OPEN_FRAME
+from hks_jax.io.questions import reviewed
 from hks_jax.io.read import SUFFIXES
 from hks_jax.io.repair import without_background
 from hks_jax.io.units import unit_question
@@ -147,7 +146,7 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
     volume, mask = _load(args)
     if mask is not None and mask.shape == volume.shape:
         volume, mask = volume.with_mask(mask), None
-    volume = _questioned(volume, args, progress.warn if ask is None else ask)
+    volume = _reviewed(volume, args, progress.warn if ask is None else ask)
     if args.slice is not None:
         try:
             volume = volume.slice(*args.slice)
@@ -180,11 +179,12 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
     return volume
 
 
-def _questioned(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str], None]) -> TensorVolume:
-    """Ask what the tensors give reason to; return them without the note of an open frame, which is asked or settled."""
+def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str], None]) -> TensorVolume:
+    """Ask what the tensors give reason to; return them with notes of what their fibres tell."""
     if args.positive is not None:  # of no diffusion
         return volume
-    for question in questions(without_background(volume)):
+    volume, asked = reviewed(volume)
+    for question in asked:
         spelled = as_options(question, READING)
         if getattr(args, "strict_unit", False) and not volume.unit and question == unit_question(volume):
             raise ValueError(
@@ -192,7 +192,7 @@ def _questioned(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[s
                 "have the same unit, in the table by a column unit"
             )
         ask(spelled)
-    return replace(volume, notes=tuple(note for note in volume.notes if note != OPEN_FRAME))
+    return volume
 
 
 def _count_clipped(volume: TensorVolume) -> int:

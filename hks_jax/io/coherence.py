@@ -14,12 +14,15 @@ ANISOTROPIC = 0.3
 """The fractional anisotropy from which on a tensor's principal direction is taken for a fibre's."""
 _ENOUGH = 1000
 """Fewer voxels with both neighbours along their direction decide nothing."""
-_BLOCK = 8
-"""Voxels, per axis, of the blocks whose scatter tells the error of a mean: neighbours are not independent."""
+_BLOCK, _BLOCKS = 8, 8
+"""Voxels, per axis, of the blocks whose scatter tells the error of a mean, as neighbours are not independent; and the
+least number of blocks that tells it."""
 CLEAR = 3.5
 """Standard errors by which one mean must be below another."""
 _SMOOTH = 3.0
 """Degrees below which fibres go on so well that the difference is one of the steps from voxel to voxel."""
+
+_SAID = "Principal directions and those of the two neighbours along them differ by"
 
 
 class Alternative(NamedTuple):
@@ -62,9 +65,18 @@ class Coherence(NamedTuple):
         frames = [a for a in clear if a.is_frame and best and self.angle - a.angle > 0.8 * (self.angle - best.angle)]
         return min(frames, key=lambda a: a.angle, default=best)
 
-    def rules_out(self, frame: str) -> bool:
-        """Tell whether fibres clearly continue worse along a frame's axes than along the file's."""
-        return any(a.name == frame and a.is_frame and a.errors < -CLEAR for a in self.others)
+    @property
+    def worse(self) -> tuple[Alternative, ...]:
+        """The axes along which fibres clearly continue worse than along those of the file as it was read."""
+        return tuple(a for a in self.others if a.errors < -CLEAR)
+
+    @property
+    def note(self) -> str:
+        """Say how well fibres continue, and along which axes worse; the empty text where they tell nothing."""
+        frames = [f"along the {a.name} axes" for a in self.worse if a.is_frame]
+        flips = [a.name for a in self.worse if not a.is_frame]
+        worse = [*frames, *([f"with {', '.join(flips)} reversed"] if flips else [])]
+        return f"{_SAID} {self.angle:.1f}° in the mean, and clearly more {', or '.join(worse)}" if worse else ""
 
 
 def coherence(volume: TensorVolume) -> Coherence | None:
@@ -94,7 +106,8 @@ def coherence(volume: TensorVolume) -> Coherence | None:
         angles = _angles(voxels, directions @ turn.T.astype(directions.dtype), index, spacing)
         both = np.isfinite(own) & np.isfinite(angles)
         gain = (own - angles)[both]
-        if not gain.any():  # every fibre goes on straight, whichever the axes
+        # Where every fibre goes on straight, whichever the axes, there is no gain at all.
+        if len(gain) < _ENOUGH or len(np.unique(block[both])) < _BLOCKS or not gain.any():
             continue
         scatter = math.sqrt(float((np.bincount(block[both], gain - gain.mean()) ** 2).sum()))
         errors = float(gain.sum()) / max(scatter, 1e-12)
@@ -112,10 +125,7 @@ def frame_question(found: Coherence | None, option: str = "frame") -> str:
     if found is None or found.better is None:
         return ""
     best = found.better
-    said = (
-        "Wrong frame? Principal directions and those of the two neighbours along them differ by "
-        f"{found.angle:.1f}° in the mean along the {found.frame} axes"
-    )
+    said = f"Wrong frame? {_SAID} {found.angle:.1f}° in the mean along the {found.frame} axes"
     if best.is_frame:
         return f'{said}, and by {best.angle:.1f}° along the {best.name} axes: try {option} "{best.name}"'
     return (
@@ -126,7 +136,8 @@ def frame_question(found: Coherence | None, option: str = "frame") -> str:
 
 def _fibres(volume: TensorVolume) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Return the anisotropic voxels inside, and their principal directions."""
-    usable: Bool[np.ndarray, "*shape"] = volume.inside & np.isfinite(volume.tensors).all(axis=(-2, -1))
+    traces = np.trace(volume.tensors, axis1=-2, axis2=-1)  # zero where the background is
+    usable: Bool[np.ndarray, "*shape"] = volume.inside & np.isfinite(volume.tensors).all(axis=(-2, -1)) & (traces > 0)
     tensors = volume.tensors[usable].astype(np.float64)
     values, vectors = np.linalg.eigh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)))
     spread = ((values - values.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)

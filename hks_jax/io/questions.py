@@ -1,5 +1,7 @@
 """What makes one doubt that tensors were read as they were meant, though nothing about them is invalid."""
 
+from dataclasses import replace
+
 from hks_jax.io.coherence import coherence, frame_question
 from hks_jax.io.units import length_question, unit_question
 from hks_jax.io.volume import TensorVolume
@@ -27,8 +29,21 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
     Returns:
         Sentences, with the remedy; none where nothing is to be asked.
     """
+    return reviewed(volume)[1]
+
+
+def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
+    """Return the volume with notes of what its fibres tell, and the questions.
+
+    The note of an open frame is then a question, or settled.
+    """
     found = coherence(volume) if volume.length_unit == "mm" else None
+    notes = [note for note in volume.notes if note != OPEN_FRAME]
     wrong_frame = frame_question(found, "bvec_frame" if volume.order == "fit" else "frame")
-    if not wrong_frame and OPEN_FRAME in volume.notes and not (found is not None and found.rules_out("fsl")):
+    if found is not None and not wrong_frame and found.note:
+        notes.append(found.note)
+    settled = found is not None and any(a.is_frame and a.name == "fsl" for a in found.worse)
+    if OPEN_FRAME in volume.notes and not (wrong_frame or settled):
         wrong_frame = OPEN_FRAME
-    return tuple(filter(None, (wrong_frame, length_question(volume), unit_question(volume))))
+    asked = tuple(filter(None, (wrong_frame, length_question(volume), unit_question(volume))))
+    return replace(volume, notes=tuple(notes)), asked
