@@ -625,6 +625,22 @@ def test_a_bar_and_the_time_left_on_a_terminal(monkeypatch):
     assert [duration(s) for s in (1, 42, 100, 5000)] == ["5 s", "40 s", "2 min", "1 h 20 min"]
 
 
+def test_the_help_of_a_command_is_in_groups_and_says_what_is_hard_to_guess(capsys):
+    for command, usage in (
+        ("hks", "FILE -o OUT [options]"),
+        ("info", "FILE [options]"),
+        ("convert", "FILE OUT [options]"),
+    ):
+        assert main([command, "--help"]) == 0
+        text = " ".join(capsys.readouterr().out.split())
+        assert text.startswith(f"usage: hks-jax {command} {usage} ")
+        for title in ("which voxels:", "what the numbers mean:", "diffusion-weighted images:"):
+            assert title in text
+        assert "0.7 um2/ms, 700 um2/s (TORTOISE) or 7e-10 m2/s" in text
+        assert "three rows or three columns, as dcm2niix writes them (see --bvec-frame)" in text
+        assert ("t is then the time of diffusion, in s for D in mm2/s and voxels in mm" in text) == (command == "hks")
+
+
 def test_picture_helpers():
     inside = np.zeros((40, 40), bool)
     inside[5:35, 1:38] = True

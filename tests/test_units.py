@@ -193,6 +193,12 @@ def test_commands_warn_of_a_wrong_unit(tmp_path, capsys):
     np.testing.assert_allclose(read_tensors(tmp_path / "out.nii.gz").tensors[0, 0, 0], D, rtol=1e-6)
 
 
+@pytest.mark.parametrize("option", [["--unit", "um2/s"], ["--bvec-frame", "world"]])
+def test_a_mesh_has_none_of_these_options(tmp_path, capsys, option):
+    assert main(["hks", str(tmp_path / "heart.vtu"), "-o", str(tmp_path / "out"), *option]) == 2
+    assert f"{option[0]}: it is for tensors on a grid; leave it out for a mesh" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("largest", "unit"), [(1e9, "m2/s"), (1.0, "um2/ms"), (3.0, "um2/ms"), (1000.0, None), (30.0, None), (6e4, None)]
 )
