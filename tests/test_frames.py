@@ -282,6 +282,9 @@ def test_a_sidecar_says_the_order_of_a_tensor(tmp_path):
     (tmp_path / "t.json").write_text(json.dumps({"OrientationEncoding": {**encoding, "Reference": "RAS"}}))
     with pytest.raises(ValueError, match=r"t\.json: got the Reference 'RAS'; expected one of ijk, bvec, xyz, scanner"):
         read_tensors(tmp_path / "t.nii.gz")
+    (tmp_path / "t.json").write_text(json.dumps({"OrientationEncoding": {**encoding, "Reference": ["ijk"]}}))
+    with pytest.raises(ValueError, match="got the Reference"):
+        read_tensors(tmp_path / "t.nii.gz")
     for text in ("[1, 2]", '{"OrientationEncoding": null}', '{"RepetitionTime": 2.0}'):
         (tmp_path / "t.json").write_text(text)
         with pytest.raises(ValueError, match="does not declare their order"):

@@ -137,7 +137,7 @@ def _encoding(path: str) -> dict[str, Any]:
     if not isinstance(encoding, dict):
         return {}
     reference = encoding.get("Reference")
-    if reference is not None and reference not in _REFERENCES:
+    if reference is not None and not (isinstance(reference, str) and reference in _REFERENCES):
         raise ValueError(
             f"{sidecar}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Correct it, or "
             "remove it and pass frame"
