@@ -90,8 +90,6 @@ def eigenpairs(
         pairs = _in_interval(pencil, interval, k, solver, throw, report)
     else:
         total = sum(part.size for part in pencil.parts)
-        if k is None:
-            raise ValueError(f"k: not given; expected an integer from 1 to {total}, or an interval")
         if not isinstance(k, int | float | np.number) or k != k // 1 or not 1 <= k <= total:
             raise ValueError(
                 f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "

@@ -98,8 +98,10 @@ class PatternedOperator(Operator):
     def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
         """Return the matrix with other entries at the same places."""
 
-    def plus(self, diagonal: Float[Array, " n_dof"]) -> "PatternedOperator":
-        """Return the sum with a diagonal matrix."""
+    def plus(self, diagonal: Float[Array | np.ndarray, " n"]) -> "PatternedOperator":
+        """Return the sum with a diagonal matrix, (n_dof,)."""
+        if np.shape(diagonal) != (self.size,):
+            raise ValueError(f"diagonal: got shape {np.shape(diagonal)}; expected {(self.size,)}, one number a row")
         minus = DiagonalOperator(-jnp.asarray(diagonal, self.dtype))
         return self.with_flat(shifted(self, minus, jnp.ones((), self.dtype)))
 
