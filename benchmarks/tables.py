@@ -53,6 +53,8 @@ HEADINGS = {
     "processor_ratio": "ratio, of all processors",
     "launches_before": "before",
     "waits": "waits of the host",
+    "busy_s": "device busy, s",
+    "span_s": "first to last launch, s",
     "waits_before": "before",
     "peak_GB_before": "before",
     "least_ms": "least time, ms",
