@@ -24,9 +24,9 @@ from machine import RESULTS, timed, write
 
 import hks_jax as hj
 from hks_jax.devices import Slabs, chebyshev_series
-from hks_jax.eigen.filter.coarsening import finest_level
-from hks_jax.eigen.filter.rounds import State, improve
-from hks_jax.fem.columns import stencil_product
+from hks_jax.eigen.filter.rounds import FilterState, GridFilter
+from hks_jax.fem.nodal import nodal_pencil
+from hks_jax.fem.operators import Stencil
 
 DEGREE, PAIRS, COLUMNS = 100, 90, 16
 COLLECTIVES = ("ppermute", "all_to_all", "psum")
@@ -65,12 +65,11 @@ def counts(shape: tuple[int, ...], devices: int) -> dict:
     spacing = 1 / (max(shape) - 1)
     pencil = hj.assemble(hj.TensorField(hj.Grid(shape, spacing), jnp.broadcast_to(jnp.eye(3), (*shape, 3, 3))))
     plan = hj.ChebyshevFilter(block=COLUMNS // 2, mesh=mesh).plan(PAIRS, pencil.space)
-    level, values = finest_level(pencil), struct((plan.size,))
+    grid, values = GridFilter(nodal_pencil(pencil), jnp.ones(()), plan), struct((plan.size,))
     vectors = struct((plan.size, int(np.prod(padded))))
-    state = State(values, vectors, values, values, jax.ShapeDtypeStruct((), int))
-    one_round = jax.make_jaxpr(improve, static_argnums=(1, 2))(
-        level, slabs.periodic, plan, struct(()), struct(()), state
-    )
+    count = jax.ShapeDtypeStruct((), int)
+    state = FilterState(values, vectors, values, values, count, count)
+    one_round = jax.make_jaxpr(GridFilter.improve)(grid, struct(()), state)
     exchanged = sent(one_round.jaxpr)
     return {
         "devices": devices,
@@ -101,7 +100,7 @@ def speed(dtype: Any) -> float:
     c, x = jnp.full((27, *shape), 1 / 27, dtype), jnp.ones((*shape, COLUMNS), dtype)
 
     def many(c: jax.Array, x: jax.Array) -> jax.Array:
-        return jax.lax.fori_loop(0, steps, lambda _, y: stencil_product(c, y, (False,) * 3), x)
+        return jax.lax.fori_loop(0, steps, lambda _, y: Stencil(c, (False,) * 3) @ y, x)
 
     return steps * x.size / timed(jax.jit(many), c, x, repeats=20)[0]
 

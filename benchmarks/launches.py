@@ -30,11 +30,11 @@ from compiled import Program, compile_for_chip, peak_bytes, unavailable  # noqa:
 from machine import RESULTS, write  # noqa: E402
 
 import hks_jax as hj  # noqa: E402
-from hks_jax.eigen.filter.coarsening import finest_level  # noqa: E402
-from hks_jax.eigen.filter.rounds import FilterState, improve  # noqa: E402
+from hks_jax.eigen.filter.rounds import FilterState, GridFilter  # noqa: E402
 from hks_jax.eigen.lanczos import recurrence, slicing  # noqa: E402
 from hks_jax.eigen.lanczos.block_lanczos import expected  # noqa: E402
 from hks_jax.eigen.lanczos.state import first_state, make_room  # noqa: E402
+from hks_jax.fem.nodal import nodal_pencil  # noqa: E402
 from hks_jax.fem.pencil import Pencil  # noqa: E402
 from hks_jax.inverse import optimise  # noqa: E402
 from hks_jax.inverse.gauss_newton import GaussNewton  # noqa: E402
@@ -144,15 +144,15 @@ def chebyshev_filter(n: int, k: int) -> Iterator[Task]:
     """Yield a round of the filter on n³ nodes."""
     pencil = shapes_of(n, 3, np.float32)
     plan = hj.ChebyshevFilter().plan(k, pencil.space)
-    level = jax.eval_shape(finest_level, pencil)
+    nodal = jax.eval_shape(nodal_pencil, pencil)
 
     def array(*shape: int, dtype: type = np.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, dtype)
 
     m, count = plan.size, array(dtype=np.int64)
     state = FilterState(array(m), array(m, n**3), array(m), array(m), count, count)
-    run = jax.jit(lambda *given: improve(given[0], (False,) * 3, plan, *given[1:]), donate_argnums=3)
-    yield "filter, a round", f"{n}³", k, lambda: (run, (level, array(), array(), state))
+    run = jax.jit(GridFilter.improve, donate_argnums=2)
+    yield "filter, a round", f"{n}³", k, lambda: (run, (GridFilter(nodal, array(), plan), array(), state))
 
 
 def derivatives(n: int, k: int) -> Iterator[Task]:

@@ -24,12 +24,12 @@ from hks_jax.domain.tensor_field import TensorField as TensorField
 from hks_jax.domain.tet_mesh import TetMesh as TetMesh
 from hks_jax.eigen.complement.adjoint import Adjoint as Adjoint
 from hks_jax.eigen.complement.factorised import FactorisedAdjoint as FactorisedAdjoint
-from hks_jax.eigen.complement.filtered import FilteredAdjoint as FilteredAdjoint
 from hks_jax.eigen.count import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
 from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
 from hks_jax.eigen.eigsh import eigsh as eigsh
+from hks_jax.eigen.filter.adjoint import FilteredAdjoint as FilteredAdjoint
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter as ChebyshevFilter
 from hks_jax.eigen.host.complement import HostAdjoint as HostAdjoint
 from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 import hks_jax as hj
 from hks_jax.eigen.lanczos import columns
-from hks_jax.fem.columns import stencil
+from hks_jax.fem.operators import Stencil
 from hks_jax.linear import accelerators, column_kernels, merging
 from hks_jax.linear.chebyshev import chebyshev_iteration
 from hks_jax.linear.column_kernels import orthonormal, parts_of_products, remainder
@@ -60,12 +60,12 @@ def test_a_batch_is_solved_as_its_problems_are(rng, as_on_an_accelerator):
 
 @pytest.mark.parametrize("degree", [1, 2, 5, 8])
 def test_chebyshev_iterations_are_those_of_cpus(rng, monkeypatch, degree):
-    stencil_of, w = jnp.asarray(rng.standard_normal((9, 6, 7))), jnp.asarray(rng.standard_normal((6, 7, 3)))
+    coefficients, w = jnp.asarray(rng.standard_normal((9, 6, 7))), jnp.asarray(rng.standard_normal((6, 7, 3)))
     edges = np.pad(np.ones((4, 5)), 1)[None]  # what reaches across a side is zero
     values = []
     for answer in (False, True):
         monkeypatch.setattr(accelerators, "at_hand", lambda answer=answer: answer)
-        product = stencil(0.1 * edges * stencil_of, (False, False))
+        product = Stencil(0.1 * edges * coefficients, (False, False)).of_columns()
         values.append(chebyshev_iteration(product, w, jnp.asarray(2.0), jnp.asarray(7.0), jnp.zeros(3), degree))
     np.testing.assert_allclose(*values, rtol=1e-13)
 

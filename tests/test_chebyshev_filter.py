@@ -10,10 +10,10 @@ import scipy.linalg
 from fields import flat, random_spd
 
 import hks_jax as hj
-from hks_jax.eigen.filter import chebyshev_filter, pace
-from hks_jax.eigen.filter.coarsening import coarsen, finest_level, interpolate
-from hks_jax.eigen.filter.damping import MOST_DEGREE, Band, correction, degree_for, upper_end
-from hks_jax.fem.columns import stencil_product, to_columns, to_rows
+from hks_jax.eigen.filter import chebyshev_filter
+from hks_jax.eigen.filter.coarsening import coarsen, interpolate
+from hks_jax.eigen.filter.polynomial import MOST_DEGREE, Band, correction, upper_end
+from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 
 
 def masked(shape):
@@ -52,7 +52,7 @@ def test_products_in_columns_equal_the_operators(rng, name):
     space = pencil.space
     x = rng.standard_normal((3, space.n_dof))
     columns = to_columns(space.extend(jnp.asarray(x), outside=0.0).reshape(3, -1), space.node_shape)
-    y = stencil_product(pencil.stiffness.coefficients, columns, space.periodic)
+    y = pencil.stiffness.nodal @ columns
     again = space.restrict(to_rows(y).reshape(3, *space.node_shape))
     np.testing.assert_allclose(again, pencil.stiffness.apply(jnp.asarray(x)), atol=1e-13)
 
@@ -92,21 +92,20 @@ def test_a_coarse_pencil_is_the_fine_one_between_interpolated_functions(rng, sha
     mask[2:4, 3] = False
     grid = hj.Grid(shape, 0.1, mask=mask)
     pencil = hj.assemble(hj.TensorField(grid, random_spd(rng, shape)), boundary)
-    periodic = pencil.space.periodic
-    fine = finest_level(pencil)
-    coarse = jax.jit(coarsen, static_argnums=1)(fine, periodic)
+    fine = nodal_pencil(pencil)
+    coarse = jax.jit(coarsen)(fine)
     n = coarse.free.size
-    raise_to = jax.jit(interpolate, static_argnums=2)
-    basis = raise_to(np.eye(n).reshape(*coarse.shape, n), fine, periodic)
-    product = jax.jit(stencil_product, static_argnums=2)
+    raise_to = jax.jit(interpolate)
+    basis = raise_to(fine, np.eye(n).reshape(*coarse.shape, n))
+    product = jax.jit(lambda matrix, columns: matrix @ columns)
     for of_fine, of_coarse in ((fine.stiffness, coarse.stiffness), (fine.mass, coarse.mass)):
-        image = product(of_fine, basis, periodic)
+        image = product(of_fine, basis)
         expected = np.reshape(basis, (-1, n)).T @ np.reshape(image, (-1, n))
-        found = product(of_coarse, np.eye(n).reshape(*coarse.shape, n), periodic).reshape(n, n)
+        found = product(of_coarse, np.eye(n).reshape(*coarse.shape, n)).reshape(n, n)
         np.testing.assert_allclose(found, expected, atol=1e-12)
     # Constants, where nothing is eliminated, stay constants.
     if boundary == "neumann":
-        constant = raise_to(np.ones((*coarse.shape, 1)), fine, periodic)[..., 0]
+        constant = raise_to(fine, np.ones((*coarse.shape, 1)))[..., 0]
         reached = np.asarray(constant)[np.asarray(fine.free)]
         assert np.isin(np.round(reached, 12), [0, 1]).all()
         assert (reached == 1).mean() > 0.9
@@ -116,7 +115,7 @@ def test_a_coarse_pencil_is_the_fine_one_between_interpolated_functions(rng, sha
 def test_the_compiler_computes_nothing_with_the_grid(name, masks):
     """It would fold what is computed with constants, one element at a time, and warn where that takes long."""
     pencil = problem(name)
-    traced = jax.make_jaxpr(lambda p: coarsen(finest_level(p), p.space.periodic))(pencil)
+    traced = jax.make_jaxpr(lambda p: coarsen(nodal_pencil(p)))(pencil)
     large = [var for var, value in zip(traced.jaxpr.constvars, traced.consts, strict=True) if np.size(value) > 64]
     uses = {equation.primitive.name for equation in traced.eqns if set(map(id, large)) & set(map(id, equation.invars))}
     assert (len(large), uses) == (masks, {"optimization_barrier"} if masks else set())
@@ -124,10 +123,10 @@ def test_the_compiler_computes_nothing_with_the_grid(name, masks):
 
 def test_the_correction_is_the_polynomial_it_is_derived_from(rng):
     pencil = problem("torus, lumped")
-    level, periodic = finest_level(pencil), pencil.space.periodic
+    nodal = nodal_pencil(pencil)
     K, M = dense_matrices(pencil)
     spectrum, vectors = scipy.linalg.eigh(K, M)
-    high = float(upper_end(level, periodic))
+    high = float(upper_end(nodal))
     assert spectrum[-1] <= high < 1.2 * spectrum[-1]
     low, value, degree = spectrum[60], spectrum[25], 9
     band = Band(jnp.asarray(low), jnp.asarray(high))
@@ -137,11 +136,11 @@ def test_the_correction_is_the_polynomial_it_is_derived_from(rng):
         return np.polynomial.chebyshev.chebval(s, [0] * degree + [1])
 
     x = rng.standard_normal(spectrum.size)
-    residual = to_columns(jnp.asarray(K @ x - value * (M @ x))[None], level.shape)
-    found = x + to_rows(correction(level, periodic, band, residual, jnp.full(1, value), jnp.asarray(degree)))[0]
+    residual = to_columns(jnp.asarray(K @ x - value * (M @ x))[None], nodal.shape)
+    found = x + to_rows(correction(nodal, band, residual, jnp.full(1, value), jnp.asarray(degree)))[0]
     expected = vectors @ (polynomial(spectrum) / polynomial(value) * (vectors.T @ (M @ x)))
     np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
-    gain = float(degree_for(band, jnp.asarray(value), abs(polynomial(value))))
+    gain = float(band.degree_for(jnp.asarray(value), abs(polynomial(value))))
     assert gain == pytest.approx(degree)
 
 
@@ -238,7 +237,7 @@ def test_derivatives_on_a_coarse_grid_of_many_modes(rng):
 @pytest.mark.parametrize("low", [0.0, 1e-12, 1e-3])
 def test_degrees_are_bounded_however_wide_the_band(dtype, low):
     """Without a bound a band that begins at rounding, as on a long thin domain, is filtered for hours."""
-    degree = degree_for(Band(jnp.asarray(low, dtype), jnp.asarray(1.0, dtype)), jnp.zeros((), dtype), 1e5)
+    degree = Band(jnp.asarray(low, dtype), jnp.asarray(1.0, dtype)).degree_for(jnp.zeros((), dtype), 1e5)
     exact = np.arccosh(1e5) / np.arccosh(1 + 2 * low / (1 - low)) if low else np.inf
     assert degree == pytest.approx(min(exact, MOST_DEGREE), rel=1e-4)
 
@@ -258,8 +257,8 @@ def test_rounds_in_steps_give_the_same_and_say_what_is_left(monkeypatch):
 def test_what_is_left_of_rounds_that_converge_evenly(monkeypatch):
     """Four rounds of 10 s each divide the defect by ten; the last two filter half as many pairs."""
     clock = iter([0.0, 10.0, 20.0])
-    monkeypatch.setattr(pace.time, "perf_counter", lambda: next(clock))
-    left = pace.Pace(9e3)
+    monkeypatch.setattr(chebyshev_filter.time, "perf_counter", lambda: next(clock))
+    left = chebyshev_filter.Pace(9e3)
     assert left.seconds_left() is None
     left.round_done(9e2, work=100)
     assert left.seconds_left() == pytest.approx(30.0)
@@ -267,6 +266,6 @@ def test_what_is_left_of_rounds_that_converge_evenly(monkeypatch):
     left.round_done(9e1, work=100)
     assert left.seconds_left() == pytest.approx(20.0)
     assert left.seconds_left(25, 50) == pytest.approx(7.5)  # half of this round, and one more as short
-    stuck = pace.Pace.__new__(pace.Pace)
+    stuck = chebyshev_filter.Pace.__new__(chebyshev_filter.Pace)
     stuck._excess, stuck._factor = 5.0, 0.9
     assert stuck.seconds_left() is None  # of what does not converge nothing is promised

@@ -19,7 +19,7 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.devices import Slabs, heat_columns, map_fields
-from hks_jax.fem.columns import stencil_product
+from hks_jax.fem.operators import Stencil
 from hks_jax.linear import lapack
 
 warnings.simplefilter("error")
@@ -42,14 +42,14 @@ def halo(mesh, shape, periodic, gradient):
     c, x, w = (RNG.standard_normal(s) for s in ((3 ** len(shape), *shape), (*shape, 3), (*shape, 3)))
     image = slabs.product(slabs.split(c, 1), slabs.split(x))
     assert image.sharding.is_equivalent_to(slabs.split(x).sharding, x.ndim)
-    errors = {"product": difference(slabs.join(image), stencil_product(c, jnp.asarray(x), periodic))}
+    errors = {"product": difference(slabs.join(image), Stencil(c, periodic) @ jnp.asarray(x))}
     if gradient:
 
         def cut(c, x):
             return jnp.sum(jnp.sin(slabs.join(slabs.product(slabs.split(c, 1), slabs.split(x)))) * w)
 
         def whole(c, x):
-            return jnp.sum(jnp.sin(stencil_product(c, x, periodic)) * w)
+            return jnp.sum(jnp.sin(Stencil(c, periodic) @ x) * w)
 
         got, expected = (jax.jit(jax.grad(f, (0, 1)))(jnp.asarray(c), jnp.asarray(x)) for f in (cut, whole))
         errors |= {f"d{n}": difference(a, b) for n, a, b in zip("cx", got, expected, strict=True)}

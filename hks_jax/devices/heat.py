@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.fem.halo import Slabs
+from hks_jax.fem.operators import Stencil
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 from hks_jax.linear.heat_series import heat_coefficients, least_degree
 from hks_jax.linear.spectral_bounds import gershgorin
@@ -81,16 +82,13 @@ def chebyshev_series(
     """
 
     def share(stiffness: Array, lumped: Array, x: Array, top: Array, series: Array) -> Array:
-        matrix = (2 / top) * stiffness * _inverse(lumped)
-
-        def product(y: Array) -> Array:
-            return slabs.local_product(matrix, y) - y
+        scaled = Stencil((2 / top) * stiffness * _inverse(lumped), slabs.periodic, slabs).of_columns()
 
         def add(n: Any, y: Array, total: Array) -> Array:
             return total + jnp.multiply.outer(series[:, n], y)
 
         start = jnp.multiply.outer(jnp.zeros_like(series[:, 0]), x)
-        return chebyshev_recurrence(product, x, series.shape[1] - 1, start, add)[2]
+        return chebyshev_recurrence(lambda y: scaled(y) - y, x, series.shape[1] - 1, start, add)[2]
 
     everywhere = jax.sharding.PartitionSpec()
     specs = slabs.spec(1), slabs.spec(0), slabs.spec(0), everywhere, everywhere

@@ -1,7 +1,9 @@
-"""Grids cut into slabs, one for each device: stencil products that exchange one plane of nodes with each neighbour."""
+"""The nodes beyond a nodal array: its rim, and for grids cut into slabs, one for each device, the adjacent planes."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import jax
@@ -9,8 +11,48 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from hks_jax.fem.columns import product_with_rim, side_by_side, with_rim
 from hks_jax.traced import is_traced
+
+
+def with_rim(x: Float[Array, "*shape"], periodic: tuple[bool, ...], first: int = 0) -> Float[Array, "*rimmed"]:
+    """Return x with a node more at either end of some axes, from the ``first`` on: the opposite one's, or zero."""
+    for axis, wraps in enumerate(periodic, start=first):
+        widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
+        x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
+    return x
+
+
+def neighbours(x: Float[Array, "*rimmed"], dimension: int) -> Iterator[Float[Array, "*shape"]]:
+    """Go through x shifted by each offset along its first axes, so many, which are given with their rim."""
+    after = (0,) * (x.ndim - dimension)
+    shape = [n - 2 if axis < dimension else n for axis, n in enumerate(x.shape)]
+    for start in product((0, 1, 2), repeat=dimension):
+        start = (*start, *after)
+        yield jax.lax.slice(x, start, [s + n for s, n in zip(start, shape, strict=True)])
+
+
+def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:
+    """Return the coefficients, a node's side by side in memory: read in 3^d places, a product takes twice as long.
+
+    Flat, as XLA would otherwise choose an order of the axes itself.
+    """
+    return jnp.moveaxis(coefficients, 0, -1).reshape(-1)
+
+
+def product_with_rim(
+    coefficients: Float[Array, "offsets *shape"],
+) -> Callable[[Float[Array, "*rimmed b"]], Float[Array, "*shape b"]]:
+    """Return the product of a stencil with columns whose neighbours beyond all sides are there."""
+    shape, together = coefficients.shape[1:], side_by_side(coefficients)
+
+    def apply(x: Float[Array, "*rimmed b"]) -> Float[Array, "*shape b"]:
+        of_nodes = together.reshape(*shape, -1)
+        y = jnp.zeros((), x.dtype)
+        for o, shifted in enumerate(neighbours(x, len(shape))):
+            y = y + of_nodes[..., o, None] * shifted
+        return y
+
+    return apply
 
 
 def checked_mesh(mesh: Any) -> Mesh:
@@ -87,16 +129,20 @@ class Slabs:
     def product(
         self, coefficients: Float[Array, "offsets *padded"], x: Float[Array, "*padded b"]
     ) -> Float[Array, "*padded b"]:
-        """Return the product of a stencil with columns, both from `split` (axes 1 and 0); see `stencil_product`.
+        """Return the product of a stencil's coefficients with columns, both from `split` (axes 1 and 0).
 
         Linear in both, differentiable, transposable. Each device sends two planes of the columns, and receives two.
         """
         self.check("coefficients", coefficients, 1)
         self.check("x", x, 0)
-        share = jax.shard_map(
-            self.local_product, mesh=self.mesh, in_specs=(self.spec(1), self.spec(0)), out_specs=self.spec(0)
-        )
-        return share(coefficients, x)
+
+        def share(coefficients: Float[Array, "offsets *slab"], x: Float[Array, "*slab b"]) -> Float[Array, "*slab b"]:
+            if coefficients.shape[0] == 1:
+                return coefficients[0][..., None] * x
+            return product_with_rim(coefficients)(self.with_halo(x))
+
+        specs = self.spec(1), self.spec(0)
+        return jax.shard_map(share, mesh=self.mesh, in_specs=specs, out_specs=self.spec(0))(coefficients, x)
 
     def check(self, name: str, x: Array, axis: int) -> None:
         """Raise unless the array is one that `split` returned."""
@@ -107,14 +153,6 @@ class Slabs:
             )
 
     # What follows is for the inside of shard_map, on one device's share.
-
-    def local_product(
-        self, coefficients: Float[Array, "offsets *slab"], x: Float[Array, "*slab b"]
-    ) -> Float[Array, "*slab b"]:
-        """Return the product on this device's slab."""
-        if coefficients.shape[0] == 1:
-            return coefficients[0][..., None] * x
-        return product_with_rim(side_by_side(coefficients), self.with_halo(x))
 
     def with_halo(self, x: Float[Array, "*slab b"]) -> Float[Array, "*rimmed b"]:
         """Return the slab with the neighbours' adjacent planes, and its rim along the other axes."""

@@ -1,5 +1,6 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by Chebyshev polynomials on coloured sources, and its derivative."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,45 +10,41 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.first_order import first_order_only
-from hks_jax.fem.columns import stencil_outer
+from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import chebyshev_recurrence
-from hks_jax.spectrum_free.heat_operator import HeatOperator
+from hks_jax.spectrum_free.colours import Colouring
 from hks_jax.static_array import StaticArray
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def coloured_diagonal(
-    top: float,
-    columns: int,
-    colours: StaticArray,
-    operator: HeatOperator,
-    coefficients: Float[Array, "m terms"],
+    settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Float[Array, "m terms"]
 ) -> Float[Array, "m *shape"]:
     """Return Σₙ cₙ Tₙ(2A/top − 1) P at the sources, for every row of coefficients; 0 at nodes without a colour.
 
     Args:
-        top: what bounds the spectrum of A = PK from above; below it is 0.
-        columns: how many colours are worked on at once.
+        settings: the bound ``top`` of the spectrum of A = PK, how P ≈ M⁻¹ is made, and how many columns are worked on
+            at once.
         colours: int (*shape), 0, 1, … or −1; the vector of a colour is 1 at all its nodes.
-        operator: K, M and P.
+        pencil: K and M.
         coefficients: cₙ.
     """
+    stiffness, solve_mass = pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
 
     def block(number: Array, total: Array) -> Array:
-        sources = _sources(colours, columns, number, total.dtype)
+        sources = _sources(colours, settings.columns, number, total.dtype)
 
         def product(y: Array) -> Array:
-            return _scaled(top, products.apply(y), y)
+            return _scaled(settings.top, solve_mass(stiffness(y)), y)
 
         def add(n: Any, y: Array, total: Array) -> Array:
             return total + _outer(coefficients[:, n], sources, y)
 
-        return chebyshev_recurrence(product, products.solve_mass(sources), degree, total, add)[2]
+        return chebyshev_recurrence(product, solve_mass(sources), degree, total, add)[2]
 
-    products = operator.products()
     degree = coefficients.shape[1] - 1
     start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
-    return jax.lax.fori_loop(0, _blocks(colours, columns), block, start)
+    return jax.lax.fori_loop(0, _blocks(settings, colours), block, start)
 
 
 # y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with  = 2PK/top − 1, and the result is Σₙ cₙ v∘yₙ. Taking P for M⁻¹, of
@@ -63,60 +60,59 @@ def coloured_diagonal(
 # is stored that grows with the degree.
 @partial(coloured_diagonal.defjvp, symbolic_zeros=True)
 def _coloured_diagonal_jvp(
-    top: float, columns: int, colours: StaticArray, primals: tuple, tangents: tuple
+    settings: Colouring, colours: StaticArray, primals: tuple, tangents: tuple
 ) -> tuple[Array, Array]:
-    operator, coefficients = primals
-    d_operator, d_coefficients = tangents
-    value = coloured_diagonal(top, columns, colours, operator, coefficients)
-    moved = _linked((d_operator.stiffness, d_operator.mass, d_coefficients))
+    pencil, coefficients = primals
+    d_pencil, d_coefficients = tangents
+    value = coloured_diagonal(settings, colours, pencil, coefficients)
+    moved = _linked((d_pencil.stiffness.coefficients, d_pencil.mass.coefficients, d_coefficients))
     if moved is None:
         return value, jnp.zeros_like(value)
-    operator, coefficients = first_order_only((operator, coefficients))
-    forward = partial(_tangent, top, columns, colours, operator, coefficients)
-    backward = partial(_cotangent, top, columns, colours, operator, coefficients)
+    fixed = first_order_only((pencil, coefficients))
+    forward, backward = (partial(function, settings, colours, *fixed) for function in (_tangent, _cotangent))
     return value, _linear_map(forward, backward, moved, value)
 
 
 def _tangent(
-    top: float, columns: int, colours: StaticArray, operator: HeatOperator, coefficients: Array, moved: tuple
+    settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Array, moved: tuple
 ) -> Float[Array, "m *shape"]:
     d_stiffness, d_mass, d_coefficients = moved
-    degree = coefficients.shape[1] - 1
-    products = operator.products()
-    change_of = products.changed_by(d_stiffness, d_mass)
+    degree, top = coefficients.shape[1] - 1, settings.top
+    stiffness, solve_mass = pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
+    by_stiffness = replace(pencil.stiffness, coefficients=d_stiffness).of_columns()
+    by_mass = replace(pencil.mass, coefficients=d_mass).of_columns()
 
     def block(number: Array, total: Array) -> Array:
-        sources = _sources(colours, columns, number, total.dtype)
+        sources = _sources(colours, settings.columns, number, total.dtype)
 
         def product(state: tuple[Array, Array]) -> tuple[Array, Array]:
             y, dy = state
-            image = products.apply(y)
-            change = change_of(y, image) + products.apply_stiffness(dy)
-            return _scaled(top, image, y), _scaled(top, products.solve_mass(change), dy)
+            image = solve_mass(stiffness(y))
+            change = by_stiffness(y) - by_mass(image) + stiffness(dy)
+            return _scaled(top, image, y), _scaled(top, solve_mass(change), dy)
 
         def add(n: Any, state: tuple[Array, Array], total: Array) -> Array:
             y, dy = state
             return total + _outer(d_coefficients[:, n], sources, y) + _outer(coefficients[:, n], sources, dy)
 
-        y = products.solve_mass(sources)
-        dy = products.solve_mass(change_of(jnp.zeros_like(y), y))
-        return chebyshev_recurrence(product, (y, dy), degree, total, add)[2]
+        y = solve_mass(sources)
+        return chebyshev_recurrence(product, (y, solve_mass(-by_mass(y))), degree, total, add)[2]
 
     start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
-    return jax.lax.fori_loop(0, _blocks(colours, columns), block, start)
+    return jax.lax.fori_loop(0, _blocks(settings, colours), block, start)
 
 
 def _cotangent(
-    top: float, columns: int, colours: StaticArray, operator: HeatOperator, coefficients: Array, g: Array
+    settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Array, g: Array
 ) -> tuple[Array, Array, Array]:
-    degree = coefficients.shape[1] - 1
-    products = operator.products()
+    degree, top = coefficients.shape[1] - 1, settings.top
+    stiffness, solve_mass = pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
 
     def block(number: Array, total: tuple) -> tuple:
-        sources = _sources(colours, columns, number, g.dtype)
+        sources = _sources(colours, settings.columns, number, g.dtype)
 
         def product(y: Array) -> Array:
-            return _scaled(top, products.apply(y), y)
+            return _scaled(top, solve_mass(stiffness(y)), y)
 
         def read(y: Array) -> Array:
             return _contract(g, jnp.sum(sources * y, axis=-1))
@@ -128,25 +124,25 @@ def _cotangent(
             y, after, p, p_after, (of_stiffness, of_mass, of_coefficients) = state
             n = degree - 1 - i
             factor = jnp.where(n == 0, 1, 2).astype(y.dtype)
-            image = products.apply(y)
+            image = solve_mass(stiffness(y))
             weighted = (2 * factor / top) * p
-            of_stiffness = of_stiffness + stencil_outer(weighted, y, products.periodic)
-            of_mass = of_mass - products.outer_mass(weighted, image)
+            of_stiffness = of_stiffness + pencil.stiffness.outer(weighted, y)
+            of_mass = of_mass - pencil.mass.outer(weighted, image)
             of_coefficients = of_coefficients.at[:, n].add(read(y))
-            following = products.solve_mass(source(n) + products.apply_stiffness(weighted)) - factor * p - p_after
+            following = solve_mass(source(n) + stiffness(weighted)) - factor * p - p_after
             total = of_stiffness, of_mass, of_coefficients
             return factor * _scaled(top, image, y) - after, y, following, p, total
 
-        after, y, _ = chebyshev_recurrence(product, products.solve_mass(sources), degree)
+        after, y, _ = chebyshev_recurrence(product, solve_mass(sources), degree)
         of_stiffness, of_mass, of_coefficients = total
         total = of_stiffness, of_mass, of_coefficients.at[:, degree].add(read(after))
-        p = products.solve_mass(source(degree))
+        p = solve_mass(source(degree))
         state = jax.lax.fori_loop(0, degree, down, (y, after, p, jnp.zeros_like(p), total))
         _, y, p, _, (of_stiffness, of_mass, of_coefficients) = state
-        return of_stiffness, of_mass - products.outer_mass(p, y), of_coefficients
+        return of_stiffness, of_mass - pencil.mass.outer(p, y), of_coefficients
 
-    zeros = jax.tree.map(jnp.zeros_like, (operator.stiffness, operator.mass, coefficients))
-    return jax.lax.fori_loop(0, _blocks(colours, columns), block, zeros)
+    matrices = pencil.stiffness.coefficients, pencil.mass.coefficients, coefficients
+    return jax.lax.fori_loop(0, _blocks(settings, colours), block, jax.tree.map(jnp.zeros_like, matrices))
 
 
 def _scaled(top: float, image: Array, y: Array) -> Array:
@@ -154,8 +150,8 @@ def _scaled(top: float, image: Array, y: Array) -> Array:
     return (2 / top) * image - y
 
 
-def _blocks(colours: StaticArray, columns: int) -> int:
-    return -(-(int(colours.value.max()) + 1) // columns)
+def _blocks(settings: Colouring, colours: StaticArray) -> int:
+    return -(-(int(colours.value.max()) + 1) // settings.columns)
 
 
 def _sources(colours: StaticArray, columns: int, number: Array, dtype: Any) -> Float[Array, "*shape b"]:

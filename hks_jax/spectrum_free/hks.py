@@ -12,6 +12,7 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
@@ -20,7 +21,6 @@ from hks_jax.signatures.times import checked_times
 from hks_jax.spectrum_free.chebyshev import coloured_diagonal
 from hks_jax.spectrum_free.choice import Method, choose_method, plan, require_fewer_vectors, require_grid
 from hks_jax.spectrum_free.colours import Colouring
-from hks_jax.spectrum_free.heat_operator import heat_operator
 from hks_jax.spectrum_free.selected_inversion import selected_inversion
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
 
@@ -140,9 +140,8 @@ def _diagonal(
 @partial(jax.jit, static_argnums=0)
 def _by_colours(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     assert isinstance(part.space, GridSpace)
-    operator = heat_operator(part, settings.low, settings.mass_degree)
     coefficients = heat_coefficients(times, settings.top, settings.degree)
-    return coloured_diagonal(settings.top, settings.columns, settings.colours(part.space), operator, coefficients)
+    return coloured_diagonal(settings, settings.colours(part.space), nodal_pencil(part), coefficients)
 
 
 def _fits(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Array:

@@ -1,5 +1,6 @@
 """Bounds on the spectra that polynomials are built for, and on how fast heat travels along an axis."""
 
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import NamedTuple
@@ -9,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.fem.columns import stencil
+from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.operators import DiagonalOperator
 from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
-from hks_jax.spectrum_free.heat_operator import heat_operator
 
 _STEPS, _MASS_STEPS = 50, 200
 
@@ -45,16 +45,13 @@ def mass_bound(pencil: Pencil) -> Float[Array, ""]:
     """Return a lower bound on the eigenvalues of D⁻¹M; 1 if the mass is lumped."""
     if isinstance(pencil.mass, DiagonalOperator):
         return jnp.ones((), pencil.mass.dtype)
-    operator = heat_operator(pencil)
-    scaled = operator.inverse_row_sums[..., None]
-    sums = jnp.where(scaled > 0, 1 / jnp.where(scaled > 0, scaled, 1), 0)
-
-    products = operator.products()
+    nodal = nodal_pencil(pencil)
+    lumped, sums, mass = nodal.lumped[..., None], nodal.lumped_or_zero[..., None], nodal.mass.of_columns()
 
     def remainder(x: Array) -> Array:
-        return sums * x - products.apply_mass(x)
+        return sums * x - mass(x)
 
-    greatest = lanczos_bound(remainder, lambda r: scaled * r, sums, pencil.space.n_dof, _MASS_STEPS)
+    greatest = lanczos_bound(remainder, lambda r: r / lumped, sums, pencil.space.n_dof, _MASS_STEPS)
     return jnp.clip(1 - greatest, 1e-3, 0.9)
 
 
@@ -64,29 +61,27 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
 
     The top is Gershgorin's where that is less than a Lanczos estimate with its margin.
     """
-    operator = heat_operator(pencil, low, mass_degree)
-    inverse = operator.inverse_row_sums
-    d, free = pencil.space.dimension, pencil.space.free
-    sums = jnp.where(free, 1 / jnp.where(free, inverse, 1), 0)
-    products = operator.products()
-    sizes = jnp.abs(operator.stiffness) * inverse
+    nodal, d = nodal_pencil(pencil), pencil.space.dimension
+    entries, sums = nodal.stiffness.coefficients, nodal.lumped_or_zero
+    solve_mass = nodal.mass_solve(low, mass_degree)
     offsets = np.array(list(product((-1, 0, 1), repeat=d)))
-    measured = operator.stiffness[None]
-    if not operator.lumped:
-        measured = jnp.concatenate([measured, _within_lines(operator.mass, offsets)])
+    measured = entries[None]
+    if not nodal.mass.is_diagonal:
+        measured = jnp.concatenate([measured, _within_lines(nodal.mass.coefficients, offsets)])
 
     def largest(matrix: Float[Array, "offsets *shape"]) -> Float[Array, ""]:
-        apply = stencil(matrix, operator.space.periodic)
-        return lanczos_bound(apply, products.solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
+        apply = replace(nodal.stiffness, coefficients=matrix).of_columns()
+        return lanczos_bound(apply, solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
 
     # One after the other: side by side they would be compiled as many times.
     top, *greatest = jax.lax.map(largest, measured)
-    if operator.lumped:
-        top, across = jnp.minimum(top, gershgorin(operator.stiffness, inverse)), jnp.zeros(d, sums.dtype)
+    if nodal.mass.is_diagonal:
+        top, across = jnp.minimum(top, gershgorin(entries, 1 / nodal.lumped)), jnp.zeros(d, sums.dtype)
     else:
         across = jnp.stack(greatest) - 1
+    sizes = jnp.abs(entries) / nodal.lumped
     reach = jnp.stack([jnp.max(jnp.sum(sizes[np.flatnonzero(offsets[:, a])], axis=0)) for a in range(d)])
-    return Bounds(top, low, reach, across, jnp.min(jnp.where(free, sums, jnp.inf)), jnp.max(sums))
+    return Bounds(top, low, reach, across, jnp.min(jnp.where(nodal.free, sums, jnp.inf)), jnp.max(sums))
 
 
 # M − C, the couplings within the lines of nodes that cross the axis at right angles, is a diagonal of blocks of M and

@@ -1,35 +1,27 @@
 """The matrix-free eigensolver for grids: Chebyshev-filtered subspace iteration, from coarse grids to the fine one."""
 
 import math
+import time
 from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.filtered import FilteredAdjoint
-from hks_jax.eigen.filter.coarsening import GridLevel, coarsen, finest_level
-from hks_jax.eigen.filter.damping import upper_end
-from hks_jax.eigen.filter.pace import Pace
-from hks_jax.eigen.filter.rounds import (
-    FilterState,
-    Plan,
-    excess,
-    from_coarse,
-    from_random,
-    improve,
-    unconverged,
-)
-from hks_jax.eigen.filter.sharing import replicate
-from hks_jax.eigen.filter.steps import improve_in_steps
+from hks_jax.eigen.filter.adjoint import FilteredAdjoint
+from hks_jax.eigen.filter.coarsening import coarsen
+from hks_jax.eigen.filter.polynomial import upper_end
+from hks_jax.eigen.filter.rounds import FilterState, GridFilter, Plan, excess, unconverged
+from hks_jax.eigen.filter.subspace import EVERYWHERE
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh
+from hks_jax.fem.nodal import NodalPencil, nodal_pencil
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
@@ -114,49 +106,36 @@ def _lowest(
     pencil: Pencil, plan: Plan, max_rounds: int, report: Report | None
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
     """Return the pairs; without ``report``, in one computation that can be traced."""
-    space = pencil.space
-    assert isinstance(space, GridSpace)
-    levels = _levels(pencil, plan)
-    state = None
-    for number in reversed(range(len(levels))):
-        level = levels[number]
-        level, high = replicate(plan.mesh, (level, upper_end(level, space.periodic)))
-        if state is None:
-            rounds, state = _FIRST_ROUNDS, from_random(level, space.periodic, plan, high, pencil.volume)
-        else:
-            rounds, state = _COARSE_ROUNDS, from_coarse(level, space.periodic, plan, levels[number + 1].shape, state)
-        if number:
-            for _ in range(rounds):
-                state = improve(level, space.periodic, plan, high, None, state)
-            if report:
-                report(f"grid {' × '.join(map(str, level.shape))}")
-    assert state is not None
-    rounding = indistinct(pencil, high.dtype)
+    grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in _nested(pencil, plan)]
+    grid = grids.pop()
+    state, rounds = grid.from_random(pencil.volume), _FIRST_ROUNDS
+    while grids:
+        for _ in range(rounds):
+            state = grid.improve(None, state)
+        if report:
+            report(f"grid {' × '.join(map(str, grid.pencil.shape))}")
+        coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
+        state = grid.from_coarse(coarse, state)
+    rounding = indistinct(pencil, grid.high.dtype)
     if report:
-        state = _converge(level, space.periodic, plan, high, rounding, state, max_rounds, report)
+        state = _converge(grid, rounding, state, max_rounds, report)
     else:
         state = jax.lax.while_loop(
             lambda state: (unconverged(plan, rounding, state) > 0) & (state.rounds < max_rounds),
-            lambda state: improve(level, space.periodic, plan, high, rounding, state),
+            lambda state: grid.improve(rounding, state),
             state,
         )
-    slabs, vectors = plan.slabs(level.shape, space.periodic), state.vectors[: plan.wanted]
-    vectors = vectors.reshape(plan.wanted, *(level.shape if slabs is None else slabs.padded_shape))
+    slabs, vectors = grid.slabs, state.vectors[: plan.wanted]
+    vectors = vectors.reshape(plan.wanted, *(grid.pencil.shape if slabs is None else slabs.padded_shape))
     vectors = vectors if slabs is None else slabs.join(vectors, axis=1)
-    return state.values[: plan.wanted], space.restrict(vectors)
+    return state.values[: plan.wanted], pencil.space.restrict(vectors)
 
 
 def _converge(
-    level: GridLevel,
-    periodic: tuple[bool, ...],
-    plan: Plan,
-    high: Float[Array, ""],
-    rounding: Float[Array, ""],
-    state: FilterState,
-    max_rounds: int,
-    report: Report,
+    grid: GridFilter, rounding: Float[Array, ""], state: FilterState, max_rounds: int, report: Report
 ) -> FilterState:
     """Return the state after rounds on the finest grid, each told, and of large problems the blocks of each."""
+    plan = grid.plan
     in_steps = report is not silent and plan.mesh is None and state.vectors.size >= _LARGE
     pace = Pace(float(excess(plan, rounding, state)))
     while (left := int(unconverged(plan, rounding, state))) and state.rounds < max_rounds:
@@ -170,11 +149,43 @@ def _converge(
                 work = of
                 report(Status(f"{text}, {done / of:.0%} of it filtered", pace.seconds_left(done, of)))
 
-            state = improve_in_steps(level, periodic, plan, high, rounding, state, tell)
+            state = grid.improve_in_steps(rounding, state, tell)
         else:
-            state = improve(level, periodic, plan, high, rounding, state)
+            state = grid.improve(rounding, state)
         pace.round_done(float(excess(plan, rounding, state)), work)
     return state
+
+
+class Pace:
+    """How long a subspace iteration still takes, from the convergence and the cost of the rounds so far.
+
+    The largest defect falls by about the same factor in every round, and a round takes time in proportion to the
+    products that its polynomials have. Nothing is estimated before one round is over.
+    """
+
+    def __init__(self, excess: float) -> None:
+        """Begin with the largest defect, as a multiple of what counts as converged."""
+        self._excess, self._factor = excess, math.nan
+        self._work, self._seconds = math.nan, math.nan
+        self._begin = time.perf_counter()
+
+    def round_done(self, excess: float, work: int) -> None:
+        """Remember a round of so many products, and the defect after it."""
+        now = time.perf_counter()
+        self._factor, self._excess = self._excess / excess if excess > 0 else math.inf, excess
+        self._work, self._seconds, self._begin = work, now - self._begin, now
+
+    def seconds_left(self, done: int = 0, work: int = 0) -> float | None:
+        """Return what is left, a round with so many products done of so many being under way; None where unknown.
+
+        Of a round that is not under way, nothing is done, and the work is taken for that of the last.
+        """
+        if not self._factor > 1 or not self._excess > 1:
+            return None
+        rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
+        # Later rounds have fewer pairs to filter: this one's work, where it is known, is the better guess for all.
+        per_round = self._seconds * ((work or self._work) / self._work if self._work else 1.0)
+        return (rounds - (done / work if work else 0.0)) * per_round
 
 
 @partial(jax.jit, static_argnames=("plan", "max_rounds"))
@@ -182,13 +193,16 @@ def _lowest_traced(pencil: Pencil, plan: Plan, max_rounds: int) -> tuple[Float[A
     return _lowest(pencil, plan, max_rounds, None)
 
 
-def _levels(pencil: Pencil, plan: Plan) -> list[GridLevel]:
-    """Return the grids from fine to coarse."""
-    space = pencil.space
-    assert isinstance(space, GridSpace)
-    levels, free = [finest_level(pencil)], space.free
+def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:
+    """Return the pencils from the fine grid to the coarsest."""
+    grids, free = [nodal_pencil(pencil)], pencil.space.free
     while True:
         free = free[(slice(None, None, 2),) * free.ndim]
-        if min(levels[-1].shape) < _LEAST_NODES or free.sum() < _ROOM * plan.size:
-            return levels
-        levels.append(coarsen(levels[-1], space.periodic))
+        if min(grids[-1].shape) < _LEAST_NODES or free.sum() < _ROOM * plan.size:
+            return grids
+        grids.append(coarsen(grids[-1]))
+
+
+def _replicated(mesh: Mesh | None, grid: GridFilter) -> GridFilter:
+    """Return the arrays with a copy on every device."""
+    return grid if mesh is None else jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, EVERYWHERE))(grid)

@@ -5,8 +5,9 @@ The eigenfunctions of the coarse problem, interpolated, are where an iteration o
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,98 +15,49 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.colouring import axis_colours
-from hks_jax.fem.columns import stencil_product, to_columns, to_rows
-from hks_jax.fem.masks import mask_for
-from hks_jax.fem.operators import StencilOperator
-from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import GridSpace
-from hks_jax.linear.operators import DiagonalOperator
+from hks_jax.fem.nodal import NodalPencil, lump, to_columns, to_rows
+from hks_jax.fem.operators import Stencil
 from hks_jax.traced import is_traced
 
 _COLUMNS = 16
 """Columns in one product."""
 
 
-class GridLevel(NamedTuple):
-    """A pencil on one grid, in nodal arrays.
-
-    Attributes:
-        stiffness: (3^d, *shape).
-        mass: (3^d, *shape), or (1, *shape) for a diagonal.
-        lumped: (*shape,) the row sums of the mass; 1 at nodes that are not free.
-        free: (*shape,) nodes that carry a degree of freedom.
-        domain: (*shape,) nodes of the domain: free ones, and those where functions vanish.
-    """
-
-    stiffness: Float[Array, "offsets *shape"]
-    mass: Float[Array, "mass_offsets *shape"]
-    lumped: Float[Array, "*shape"]
-    free: Bool[Array, "*shape"]
-    domain: Bool[Array, "*shape"]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The shape of nodal arrays."""
-        return self.lumped.shape
-
-
-def finest_level(pencil: Pencil) -> GridLevel:
-    """Return the level of a grid's pencil itself."""
-    space, stiffness, mass = pencil.space, pencil.stiffness, pencil.mass
-    assert isinstance(space, GridSpace)
-    assert isinstance(stiffness, StencilOperator)
-    if isinstance(mass, DiagonalOperator):
-        coefficients = space.extend(mass.entries, outside=0.0)[None]
-    else:
-        assert isinstance(mass, StencilOperator)
-        coefficients = mass.coefficients
-    # Under `jit` they are known, and without the barrier the compiler would compute with them, node by node.
-    masks = (jnp.asarray(mask_for(pencil, mask)) for mask in (space.free, space.domain))
-    free, domain = jax.lax.optimization_barrier(tuple(masks))
-    return _level(stiffness.coefficients, coefficients, free, domain)
-
-
-def coarsen(level: GridLevel, periodic: tuple[bool, ...]) -> GridLevel:
-    """Return the level on every second node of each axis, its matrices PᵀKP and PᵀMP, P the interpolation."""
-    every_second = (slice(None, None, 2),) * len(periodic)
-    free, domain = level.free[every_second], level.domain[every_second]
+def coarsen(fine: NodalPencil) -> NodalPencil:
+    """Return the pencil on every second node of each axis, its matrices PᵀKP and PᵀMP, P the interpolation."""
+    every_second = (slice(None, None, 2),) * len(fine.shape)
+    free, domain = fine.free[every_second], fine.domain[every_second]
     shape = free.shape
-    axes = [_axis_colours(n, wraps) for n, wraps in zip(shape, periodic, strict=True)]
+    axes = [_axis_colours(n, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
     padded = -(-math.prod(int(own.max()) + 1 for _, own, _ in axes) // _COLUMNS) * _COLUMNS
-    # Where the level is traced, what is along axes is all that the program has for constants.
-    known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes]) if is_traced(level) else axes
+    # Where the pencil is traced, what is along axes is all that the program has for constants.
+    known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes]) if is_traced(fine) else axes
     colours, of_neighbour = _colouring(known, [int(own.max()) + 1 for _, own, _ in axes])
     indicators = (colours.ravel() == np.arange(padded, dtype=np.int32)[:, None]).reshape(-1, _COLUMNS, colours.size)
     indicators, of_neighbour = jax.lax.optimization_barrier((jnp.asarray(indicators), jnp.asarray(of_neighbour)))
 
-    def galerkin(coefficients: Array) -> Array:
+    coarse = jax.ShapeDtypeStruct((*shape, _COLUMNS), fine.lumped.dtype)
+    restrict = jax.linear_transpose(partial(interpolate, fine), coarse)
+
+    def galerkin(matrix: Stencil) -> Stencil:
         def images(rows: Bool[Array, "b coarse"]) -> Float[Array, "b coarse"]:
-            x = interpolate(to_columns(rows.astype(level.lumped.dtype), shape), level, periodic)
-            y = stencil_product(coefficients, x, periodic)
-            return to_rows(_restrict(y, level, shape, periodic))
+            x = interpolate(fine, to_columns(rows.astype(coarse.dtype), shape))
+            return to_rows(restrict(matrix @ x)[0])
 
         products = jax.lax.map(images, indicators).reshape(padded, *shape)
         # A node's image under the sum of a colour's basis functions is its coupling to the one of them near by.
         coupled = jnp.take_along_axis(products, jnp.maximum(of_neighbour, 0), axis=0)
-        return jnp.where(of_neighbour >= 0, coupled, 0)
+        return replace(matrix, coefficients=jnp.where(of_neighbour >= 0, coupled, 0))
 
-    return _level(galerkin(level.stiffness), galerkin(level.mass), free, domain)
+    return lump(galerkin(fine.stiffness), galerkin(fine.mass), free, domain)
 
 
-def interpolate(x: Float[Array, "*coarse b"], fine: GridLevel, periodic: tuple[bool, ...]) -> Float[Array, "*shape b"]:
+def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array, "*shape b"]:
     """Interpolate from every second node multilinearly; beyond a rim, constantly; zero at nodes that are not free."""
-    every_second = (slice(None, None, 2),) * len(periodic)
-    weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, periodic)
-    x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, periodic)
+    every_second = (slice(None, None, 2),) * len(fine.shape)
+    weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, fine.periodic)
+    x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, fine.periodic)
     return jnp.where(fine.free[..., None], x / jnp.where(weights > 0, weights, 1), 0)
-
-
-def _restrict(
-    y: Float[Array, "*shape b"], fine: GridLevel, shape: tuple[int, ...], periodic: tuple[bool, ...]
-) -> Float[Array, "*coarse b"]:
-    """Apply the transpose of the interpolation."""
-    coarse = jax.ShapeDtypeStruct((*shape, y.shape[-1]), y.dtype)
-    return jax.linear_transpose(partial(interpolate, fine=fine, periodic=periodic), coarse)(y)[0]
 
 
 def _interpolate(x: Float[Array, "*coarse b"], shape: tuple[int, ...], periodic: tuple[bool, ...]) -> Array:
@@ -121,10 +73,6 @@ def _interpolate(x: Float[Array, "*coarse b"], shape: tuple[int, ...], periodic:
         merged = both.reshape(*x.shape[:axis], -1, *x.shape[axis + 1 :])
         x = jax.lax.slice_in_dim(merged, 0, n, axis=axis)
     return x
-
-
-def _level(stiffness: Array, mass: Array, free: Array, domain: Array) -> GridLevel:
-    return GridLevel(stiffness, mass, jnp.where(free, jnp.sum(mass, axis=0), 1), free, domain)
 
 
 def _axis_colours(n: int, wraps: bool) -> Int[np.ndarray, "3 n"]:

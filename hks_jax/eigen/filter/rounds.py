@@ -1,21 +1,32 @@
 """Rounds of filtering: what a subspace gains from Chebyshev polynomials, and Rayleigh–Ritz after each."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.eigen.filter.coarsening import GridLevel, interpolate
-from hks_jax.eigen.filter.damping import Band, correction, degree_for
-from hks_jax.eigen.filter.sharing import EVERYWHERE, own_blocks, shared, to_own_rows, to_slabs
-from hks_jax.eigen.filter.subspace import block_of, local_level, measure, rayleigh_ritz
+from hks_jax.eigen.filter.coarsening import interpolate
+from hks_jax.eigen.filter.polynomial import Band, correction
+from hks_jax.eigen.filter.subspace import (
+    EVERYWHERE,
+    block_of,
+    measured,
+    own_blocks,
+    rayleigh_ritz,
+    shared,
+    to_own_rows,
+    to_slabs,
+)
 from hks_jax.eigen.quality import allowed_defects
 from hks_jax.eigen.weyl import weyl
-from hks_jax.fem.columns import stencil, stencil_product, to_columns, to_rows
 from hks_jax.fem.halo import Slabs
+from hks_jax.fem.nodal import NodalPencil, to_columns, to_rows
 from hks_jax.linear.accelerators import row_by_row
 
 _GAIN = 40.0
@@ -52,10 +63,6 @@ class Plan(NamedTuple):
     tolerance: float
     single_precision: bool
     mesh: Mesh | None
-
-    def slabs(self, shape: tuple[int, ...], periodic: tuple[bool, ...]) -> Slabs | None:
-        """Return how a grid of this shape is cut between rounds."""
-        return None if self.mesh is None else Slabs(self.mesh, shape, periodic)
 
 
 class FilterState(NamedTuple):
@@ -115,140 +122,158 @@ def _allowed(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Floa
     return allowed_defects(jnp.maximum(state.values, state.values[plan.n_null]), rounding, plan.tolerance)
 
 
-@partial(jax.jit, static_argnames=("periodic", "plan"))
-def from_random(
-    level: GridLevel, periodic: tuple[bool, ...], plan: Plan, high: Float[Array, ""], volume: Float[Array, ""]
-) -> FilterState:
-    """Return the state after filtering random functions."""
-    low = jnp.minimum(1.3 * weyl(plan.size, volume, len(level.shape)).astype(high.dtype), high / 3)
-    slabs = plan.slabs(level.shape, periodic)
+class GridFilter(eqx.Module):
+    """Subspace iteration on one grid. What is compiled for one serves all grids of its shape.
 
-    def run(level: GridLevel, low: Float[Array, ""], high: Float[Array, ""]) -> FilterState:
+    Attributes:
+        pencil: K and M.
+        high: a bound of the spectrum of D⁻¹K.
+        plan: static.
+    """
+
+    pencil: NodalPencil
+    high: Float[Array, ""]
+    plan: Plan = eqx.field(static=True)
+
+    @property
+    def slabs(self) -> Slabs | None:
+        """How the grid is cut between rounds; None on one device."""
+        return self.pencil.cut(self.plan.mesh)
+
+    @jax.jit
+    def from_random(self, volume: Float[Array, ""]) -> FilterState:
+        """Return the state after filtering random functions."""
+        plan, shape, dtype = self.plan, self.pencil.shape, self.high.dtype
+        low = jnp.minimum(1.3 * weyl(plan.size, volume, len(shape)).astype(dtype), self.high / 3)
+
+        def run(grid: GridFilter, low: Float[Array, ""]) -> FilterState:
+            pencil, band = grid.pencil, Band(low, grid.high)
+            degree = jnp.ceil(band.degree_for(jnp.zeros_like(low), _SPREAD)).astype(int)
+
+            def damped(key: Array) -> Float[Array, "b nodes"]:
+                x = jnp.where(pencil.free[..., None], jax.random.normal(key, (*shape, plan.block), dtype), 0)
+                image = pencil.stiffness @ x
+                return to_rows(x + correction(pencil, band, image, jnp.full(plan.block, low), degree, x))
+
+            numbers = own_blocks(grid.slabs, plan.size // plan.block)
+            keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
+            return grid._begin(jax.lax.map(damped, keys).reshape(-1, pencil.free.size))
+
+        return shared(self.slabs, run, EVERYWHERE, _layout(self.slabs))(self, low)
+
+    @jax.jit
+    def from_coarse(self, coarse: "GridFilter", state: FilterState) -> FilterState:
+        """Return the state that interpolation from the next coarser grid gives."""
+        slabs, shape, block = coarse.slabs, coarse.pencil.shape, self.plan.block
+
+        def run(grid: GridFilter, vectors: Float[Array, "m coarse_nodes"]) -> FilterState:
+            rows = to_own_rows(slabs, block, vectors)
+
+            def of_block(number: Array) -> Float[Array, "b nodes"]:
+                return to_rows(interpolate(grid.pencil, block_of(rows, number, block, shape)))
+
+            return grid._begin(jax.lax.map(of_block, jnp.arange(len(rows) // block)).reshape(len(rows), -1))
+
+        layout = _layout(self.slabs)
+        return shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
+
+    @partial(jax.jit, donate_argnames="state")
+    def improve(self, rounding: Float[Array, ""] | None, state: FilterState) -> FilterState:
+        """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz."""
+        slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
+
+        def run(grid: GridFilter, rounding: Float[Array, ""] | None, state: FilterState) -> FilterState:
+            numbers = own_blocks(slabs, plan.size // plan.block)
+            chosen = grid.choose(rounding, state)
+            step = partial(grid.filter_block, chosen, state.values)
+            rows = to_own_rows(slabs, plan.block, state.vectors)
+            filtered = jax.lax.fori_loop(0, numbers.size, lambda own, rows: step(numbers[own], own, rows), rows)
+            return grid.ritz(to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
+
+        return shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
+
+    def improve_in_steps(
+        self, rounding: Float[Array, ""], state: FilterState, done: Callable[[int, int], Any]
+    ) -> FilterState:
+        """Do what `improve` does on one device, so that it can be interrupted between two blocks.
+
+        Tell after each block how many products are done of all.
+        """
+        chosen = self.choose(rounding, state)
+        degrees, vectors = np.asarray(chosen.degrees), state.vectors
+        for number in np.flatnonzero(degrees):
+            at = jnp.asarray(number)
+            vectors = self.filter_block(chosen, state.values, at, at, vectors)
+            jax.block_until_ready(vectors)
+            done(int(degrees[: number + 1].sum()), int(degrees.sum()))
+        return self.ritz(vectors, chosen.terms, state.rounds + 1)
+
+    @jax.jit
+    def choose(self, rounding: Float[Array, ""] | None, state: FilterState) -> Filtering:
+        """Return the polynomials of a round: the band that they damp, and their degrees."""
+        plan = self.plan
+        spare = jnp.arange(plan.size) >= plan.wanted
+        terms, filtered_values, factor = _lumping(plan, state)
+        high = (1 + terms).astype(self.high.dtype) * self.high
+        # Where the vectors beyond the wanted ones are no eigenvectors yet, the band begins where Weyl's law has the
+        # last.
+        edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
+        low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
-        degree = jnp.ceil(degree_for(band, jnp.zeros_like(low), _SPREAD)).astype(int)
+        left = spare | (True if rounding is None else ~_converged(plan, rounding, state))
+        # The spare vectors need no more than the last wanted one.
+        goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
+        most = band.degree_for(jnp.zeros_like(low), _SPREAD)
+        degrees = jnp.ceil(jnp.clip(band.degree_for(goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
+        degrees = jnp.max(jnp.where(left, degrees, 0).reshape(-1, plan.block), axis=1).astype(int)
+        return Filtering(band, terms, degrees, filtered_values, factor)
 
-        def damped(key: Array) -> Float[Array, "b nodes"]:
-            x = jnp.where(level.free[..., None], jax.random.normal(key, (*level.shape, plan.block), high.dtype), 0)
-            image = stencil_product(level.stiffness, x, periodic)
-            return to_rows(x + correction(level, periodic, band, image, jnp.full(plan.block, low), degree, x))
+    @partial(jax.jit, donate_argnames="vectors")
+    def filter_block(
+        self,
+        chosen: Filtering,
+        values: Float[Array, " m"],
+        number: Int[Array, ""],
+        own: Int[Array, ""],
+        vectors: Float[Array, "own nodes"],
+    ) -> Float[Array, "own nodes"]:
+        """Return the rows with a block filtered: the one of this number among all, the `own`th among these rows."""
+        pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
+        dtype = jnp.float32 if self.plan.single_precision else values.dtype
+        band, degree = chosen.band, chosen.degrees[number]
 
-        numbers = own_blocks(slabs, plan.size // plan.block)
-        keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
-        rows = jax.lax.map(damped, keys).reshape(-1, level.lumped.size)
-        return ritz(level, periodic, plan, to_slabs(slabs, plan.block, rows), jnp.zeros((), int), jnp.zeros((), int))
+        def filtered(rows: Float[Array, "b nodes"]) -> Float[Array, "b nodes"]:
+            x = to_columns(rows, pencil.shape)
+            theta, zeta, scale = (
+                jax.lax.dynamic_slice_in_dim(v, number * block, block) for v in (values, chosen.values, chosen.factor)
+            )
+            # What is in the band itself has no residual worth the name: it is damped as it is.
+            inside = zeta > band.low
+            image, moved = products(x)
+            residual = image - jnp.where(inside, 0, theta * moved)
+            whole = jnp.where(inside, x, 0).astype(dtype)
+            z = correction(pencil, band, residual.astype(dtype), zeta, degree, whole, chosen.terms)
+            z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
+            return rows + row_by_row(to_rows(z))
 
-    return shared(slabs, run, EVERYWHERE, _layout(slabs))(level, low, high)
+        # The condition has nothing but the block: what goes through one is copied.
+        rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block))
+        rows = jax.lax.cond(degree > 0, filtered, lambda unchanged: unchanged, rows)
+        return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
 
+    @partial(jax.jit, donate_argnames="vectors")
+    def ritz(self, vectors: Float[Array, "m nodes"], terms: Int[Array, ""], rounds: Int[Array, ""]) -> FilterState:
+        """Return the state whose vectors are the Ritz vectors of the rows."""
+        slabs, block = self.slabs, self.plan.block
+        own = self.pencil.own(slabs)
+        values, vectors = rayleigh_ritz(own, slabs, block, vectors)
+        defects, lumped_values = measured(own, slabs, block, values, vectors)
+        return FilterState(values, vectors, defects, lumped_values, terms, rounds)
 
-@partial(jax.jit, static_argnames=("periodic", "plan", "coarse_shape"))
-def from_coarse(
-    level: GridLevel, periodic: tuple[bool, ...], plan: Plan, coarse_shape: tuple[int, ...], coarse: FilterState
-) -> FilterState:
-    """Return the state that interpolation from the next coarser grid gives."""
-    slabs, coarse_slabs = plan.slabs(level.shape, periodic), plan.slabs(coarse_shape, periodic)
-
-    def run(level: GridLevel, coarse: Float[Array, "m coarse_nodes"]) -> FilterState:
-        rows = to_own_rows(coarse_slabs, plan.block, coarse)
-
-        def of_block(number: Array) -> Float[Array, "b nodes"]:
-            return to_rows(interpolate(block_of(rows, number, plan.block, coarse_shape), level, periodic))
-
-        fine = jax.lax.map(of_block, jnp.arange(rows.shape[0] // plan.block)).reshape(rows.shape[0], -1)
-        return ritz(level, periodic, plan, to_slabs(slabs, plan.block, fine), jnp.zeros((), int), jnp.zeros((), int))
-
-    layout = _layout(slabs)
-    return shared(slabs, run, (EVERYWHERE, layout.vectors), layout)(level, coarse.vectors)
-
-
-@partial(jax.jit, static_argnames=("periodic", "plan"), donate_argnames="state")
-def improve(
-    level: GridLevel,
-    periodic: tuple[bool, ...],
-    plan: Plan,
-    high: Float[Array, ""],
-    rounding: Float[Array, ""] | None,
-    state: FilterState,
-) -> FilterState:
-    """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz."""
-    slabs = plan.slabs(level.shape, periodic)
-    layout = _layout(slabs)
-    run = partial(_improve, periodic, plan, slabs)
-    return shared(slabs, run, (EVERYWHERE, EVERYWHERE, EVERYWHERE, layout), layout)(level, high, rounding, state)
-
-
-def _improve(
-    periodic: tuple[bool, ...],
-    plan: Plan,
-    slabs: Slabs | None,
-    level: GridLevel,
-    high: Float[Array, ""],
-    rounding: Float[Array, ""] | None,
-    state: FilterState,
-) -> FilterState:
-    numbers = own_blocks(slabs, plan.size // plan.block)
-    chosen = plan_round(plan, level, high, rounding, state)
-    step = partial(filter_block, level, periodic, plan, chosen, state.values)
-    rows = to_own_rows(slabs, plan.block, state.vectors)
-    filtered = jax.lax.fori_loop(0, numbers.size, lambda own, rows: step(numbers[own], own, rows), rows)
-    vectors = to_slabs(slabs, plan.block, filtered)
-    return ritz(level, periodic, plan, vectors, chosen.terms, state.rounds + 1)
-
-
-@partial(jax.jit, static_argnames="plan")
-def plan_round(
-    plan: Plan, level: GridLevel, high: Float[Array, ""], rounding: Float[Array, ""] | None, state: FilterState
-) -> Filtering:
-    """Return the polynomials of a round: the band that they damp, and their degrees."""
-    spare = jnp.arange(plan.size) >= plan.wanted
-    terms, filtered_values, factor = _lumping(plan, state)
-    high = (1 + terms).astype(high.dtype) * high
-    # Where the vectors beyond the wanted ones are no eigenvectors yet, the band begins where Weyl's law has the last.
-    edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(level.shape))
-    low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
-    band = Band(low, high)
-    left = spare | (True if rounding is None else ~_converged(plan, rounding, state))
-    # The spare vectors need no more than the last wanted one.
-    goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
-    most = degree_for(band, jnp.zeros_like(low), _SPREAD)
-    degrees = jnp.ceil(jnp.clip(degree_for(band, goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
-    degrees = jnp.max(jnp.where(left, degrees, 0).reshape(-1, plan.block), axis=1).astype(int)
-    return Filtering(band, terms, degrees, filtered_values, factor)
-
-
-def filter_block(
-    level: GridLevel,
-    periodic: tuple[bool, ...],
-    plan: Plan,
-    chosen: Filtering,
-    values: Float[Array, " m"],
-    number: Int[Array, ""],
-    own: Int[Array, ""],
-    vectors: Float[Array, "own nodes"],
-) -> Float[Array, "own nodes"]:
-    """Return the rows with a block filtered: the one of this number among all, the `own`th among these rows."""
-    stiffness, mass = stencil(level.stiffness, periodic), stencil(level.mass, periodic)
-    dtype = jnp.float32 if plan.single_precision else values.dtype
-    band, degree = chosen.band, chosen.degrees[number]
-
-    def filtered(rows: Float[Array, "b nodes"]) -> Float[Array, "b nodes"]:
-        x = to_columns(rows, level.shape)
-        theta, zeta, scale = (
-            jax.lax.dynamic_slice_in_dim(v, number * plan.block, plan.block)
-            for v in (values, chosen.values, chosen.factor)
-        )
-        # What is in the band itself has no residual worth the name: it is damped as it is.
-        inside = zeta > band.low
-        moved = jnp.where(inside, 0, theta * mass(x))
-        residual = stiffness(x) - moved
-        whole = jnp.where(inside, x, 0).astype(dtype)
-        z = correction(level, periodic, band, residual.astype(dtype), zeta, degree, whole, chosen.terms)
-        z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
-        return rows + row_by_row(to_rows(z))
-
-    # The condition has nothing but the block: what goes through one is copied.
-    rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * plan.block, plan.block))
-    rows = jax.lax.cond(degree > 0, filtered, lambda unchanged: unchanged, rows)
-    return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * plan.block, axis=0)
+    def _begin(self, rows: Float[Array, "own nodes"]) -> FilterState:
+        """Return the first state on this grid, from this device's rows."""
+        zero = jnp.zeros((), int)
+        return self.ritz(to_slabs(self.slabs, self.plan.block, rows), zero, zero)
 
 
 def _lumping(plan: Plan, state: FilterState) -> tuple[Int[Array, ""], Float[Array, " m"], Float[Array, " m"]]:
@@ -265,22 +290,6 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Int[Array, ""], Float[Arra
     # Never fewer than before: what they keep away would come back.
     terms = jnp.maximum(state.terms, jnp.where(jnp.any(enough), jnp.argmax(enough), _MOST_TERMS))
     return terms, (1 - lost[terms]) * values, 1 - (terms + 1).astype(values.dtype) * lost[terms]
-
-
-def ritz(
-    level: GridLevel,
-    periodic: tuple[bool, ...],
-    plan: Plan,
-    vectors: Float[Array, "m nodes"],
-    terms: Int[Array, ""],
-    rounds: Int[Array, ""],
-) -> FilterState:
-    """Return the state whose vectors are the Ritz vectors of the rows."""
-    slabs = plan.slabs(level.shape, periodic)
-    level = local_level(level, slabs)
-    values, vectors = rayleigh_ritz(level, periodic, plan.block, vectors, slabs)
-    measured = measure(level, periodic, plan.block, values, vectors, slabs)
-    return FilterState(values, vectors, measured.defects, measured.lumped_values, terms, rounds)
 
 
 def _layout(slabs: Slabs | None) -> FilterState:

@@ -1,30 +1,65 @@
-"""Rayleigh–Ritz in a subspace of nodal functions kept as rows, block by block, so that memory is bounded."""
+"""A subspace of nodal functions kept as rows, on one device or several, and Rayleigh–Ritz in it, block by block.
 
+Filters want whole functions, a few on each device; Rayleigh–Ritz wants all functions on a part of the grid. Between
+rounds vectors lie in slabs, (m, nodes of the slab) on each device. For the filters, blocks of rows are dealt out in
+turn, since the low ones converge first: device i of p has the blocks i, i + p, i + 2p, ….
+
+``slabs`` is None on a single device: then nothing is exchanged.
+"""
+
+import math
 from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.sharding import PartitionSpec
+from jaxtyping import Array, Float, Int
 
-from hks_jax.eigen.filter.coarsening import GridLevel
-from hks_jax.eigen.filter.sharing import first_of, total
-from hks_jax.fem.columns import product_with_rim, side_by_side, stencil, to_columns
 from hks_jax.fem.halo import Slabs
+from hks_jax.fem.nodal import NodalPencil, to_columns
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.products import combine
 from hks_jax.linear.standard_form import pencil_eigh
 
+EVERYWHERE = PartitionSpec()
 _CHUNK = 1 << 14
 """Nodes rotated at once."""
 
 
-class Measured(NamedTuple):
-    """What the rows of a subspace are, each (m,): ‖Kx − θMx‖/‖Mx‖ and the lumped quotient xᵀKx / xᵀDx."""
+def shared(slabs: Slabs | None, function: Callable, in_specs: Any, out_specs: Any) -> Callable:
+    """Return the function as run by every device on its share."""
+    if slabs is None:
+        return function
+    # Loops of different lengths, and results that are the same on all devices, are more than the check can follow.
+    return jax.shard_map(function, mesh=slabs.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
-    defects: Float[Array, " m"]
-    lumped_values: Float[Array, " m"]
+
+def own_blocks(slabs: Slabs | None, count: int) -> Int[Array, " own"]:
+    """Return the numbers of the blocks of rows, of ``count``, that this device filters."""
+    if slabs is None:
+        return jnp.arange(count)
+    return jax.lax.axis_index(slabs.name) + slabs.mesh.size * jnp.arange(count // slabs.mesh.size)
+
+
+def to_own_rows(slabs: Slabs | None, block: int, x: Float[Array, "m slab"]) -> Float[Array, "own nodes"]:
+    """Return this device's blocks of rows, whole, of the vectors in slabs."""
+    if slabs is None:
+        return x
+    m, width = x.shape
+    dealt = x.reshape(-1, slabs.mesh.size, block, width)
+    whole = jax.lax.all_to_all(dealt, slabs.name, 1, 3, tiled=True)
+    return whole.reshape(m // slabs.mesh.size, -1)[:, : math.prod(slabs.shape)]
+
+
+def to_slabs(slabs: Slabs | None, block: int, rows: Float[Array, "own nodes"]) -> Float[Array, "m slab"]:
+    """Return all vectors on this device's slab."""
+    if slabs is None:
+        return rows
+    missing = math.prod(slabs.padded_shape) - rows.shape[1]
+    whole = jnp.pad(rows, ((0, 0), (0, missing))).reshape(-1, 1, block, rows.shape[1] + missing)
+    dealt = jax.lax.all_to_all(whole, slabs.name, 3, 1, tiled=True)
+    return dealt.reshape(rows.shape[0] * slabs.mesh.size, -1)
 
 
 def block_of(x: Float[Array, "m nodes"], number: Array, block: int, shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
@@ -32,35 +67,25 @@ def block_of(x: Float[Array, "m nodes"], number: Array, block: int, shape: tuple
     return to_columns(row_by_row(jax.lax.dynamic_slice_in_dim(x, number * block, block)), shape)
 
 
-def local_level(level: GridLevel, slabs: Slabs | None) -> GridLevel:
-    """Return the level on this device's slab."""
-    if slabs is None:
-        return level
-    d = len(slabs.shape)
-    return GridLevel(*(slabs.own(a, a.ndim - d) for a in level))
-
-
-@partial(jax.jit, static_argnames=("periodic", "block", "slabs"), donate_argnames="x")
 def rayleigh_ritz(
-    level: GridLevel, periodic: tuple[bool, ...], block: int, x: Float[Array, "m nodes"], slabs: Slabs | None = None
+    pencil: NodalPencil, slabs: Slabs | None, block: int, x: Float[Array, "m nodes"]
 ) -> tuple[Float[Array, " m"], Float[Array, "m nodes"]]:
     """Return the Ritz values, ascending, and the M-orthonormal Ritz vectors in place of the rows.
 
-    With ``slabs``, level and rows are those of this device's slab.
+    With ``slabs``, pencil and rows are this device's share.
     """
     m, nodes = x.shape
+    products = pencil.products()
 
-    images_of = _images(level, periodic, slabs)
-
-    def products(number: Array) -> tuple[Array, ...]:
-        images = images_of(block_of(x, number, block, level.shape))
+    def among_rows(number: Array) -> tuple[Array, ...]:
+        images = products(block_of(x, number, block, pencil.shape))
         # As columns: were they turned into rows, XLA would compute the stencils in that order, seven times slower.
         return tuple(combine(x, image.reshape(nodes, block)) for image in images)
 
-    both = total(slabs, jax.lax.map(products, jnp.arange(m // block)))
+    both = _total(slabs, jax.lax.map(among_rows, jnp.arange(m // block)))
     stiffness, mass = (jnp.moveaxis(p, 0, 1).reshape(m, m) for p in both)
     values, vectors = pencil_eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
-    values, mix = first_of(slabs, values), first_of(slabs, vectors.T)
+    values, mix = (_of_first(slabs, found) for found in (values, vectors.T))
 
     def rotate(number: Array, x: Array) -> Array:
         rotated = combine(mix, jax.lax.dynamic_slice_in_dim(x, number * _CHUNK, _CHUNK, axis=1))
@@ -74,44 +99,29 @@ def rayleigh_ritz(
     return values, x
 
 
-@partial(jax.jit, static_argnames=("periodic", "block", "slabs"))
-def measure(
-    level: GridLevel,
-    periodic: tuple[bool, ...],
-    block: int,
-    values: Float[Array, " m"],
-    x: Float[Array, "m nodes"],
-    slabs: Slabs | None = None,
-) -> Measured:
-    """Return how good the pairs are."""
-    images_of = _images(level, periodic, slabs)
+def measured(
+    pencil: NodalPencil, slabs: Slabs | None, block: int, values: Float[Array, " m"], x: Float[Array, "m nodes"]
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Return ‖Kx − θMx‖/‖Mx‖ and the lumped quotient xᵀKx / xᵀDx of each row; see `rayleigh_ritz`."""
+    products = pencil.products()
 
     def of_block(number: Array) -> tuple[Array, ...]:
-        columns = block_of(x, number, block, level.shape)
+        columns = block_of(x, number, block, pencil.shape)
         theta = jax.lax.dynamic_slice_in_dim(values, number * block, block)
-        image, moved = images_of(columns)
-        products = (image - theta * moved) ** 2, moved**2, columns * image, level.lumped[..., None] * columns**2
-        return tuple(jnp.sum(p, tuple(range(columns.ndim - 1))) for p in products)
+        image, moved = products(columns)
+        terms = (image - theta * moved) ** 2, moved**2, columns * image, pencil.lumped[..., None] * columns**2
+        return tuple(jnp.sum(term, tuple(range(columns.ndim - 1))) for term in terms)
 
-    sums = total(slabs, jax.lax.map(of_block, jnp.arange(values.size // block)))
+    sums = _total(slabs, jax.lax.map(of_block, jnp.arange(values.size // block)))
     defect, moved, energy, lumped = (s.ravel() for s in sums)
-    return Measured(jnp.sqrt(defect / moved), energy / lumped)
+    return jnp.sqrt(defect / moved), energy / lumped
 
 
-def _images(
-    level: GridLevel, periodic: tuple[bool, ...], slabs: Slabs | None
-) -> Callable[[Float[Array, "*shape b"]], tuple[Float[Array, "*shape b"], Float[Array, "*shape b"]]]:
-    """Return the function from columns to their products with K and M: to be made outside the loop it is for."""
-    if slabs is None:
-        stiffness, mass = stencil(level.stiffness, periodic), stencil(level.mass, periodic)
-        return lambda columns: (stiffness(columns), mass(columns))
-    coefficients, diagonal = side_by_side(level.stiffness), level.mass.shape[0] == 1
-    of_mass = level.mass[0][..., None] if diagonal else side_by_side(level.mass)
+def _total(slabs: Slabs | None, tree: Any) -> Any:
+    """Return sums over all devices."""
+    return tree if slabs is None else slabs.total(tree)
 
-    def images(columns: Float[Array, "*shape b"]) -> tuple[Float[Array, "*shape b"], Float[Array, "*shape b"]]:
-        rimmed = slabs.with_halo(columns)
-        return product_with_rim(coefficients, rimmed), of_mass * columns if diagonal else product_with_rim(
-            of_mass, rimmed
-        )
 
-    return images
+def _of_first(slabs: Slabs | None, x: Array) -> Array:
+    """Return what the first device has: devices of different kinds need not round alike."""
+    return x if slabs is None else slabs.total(jnp.where(jax.lax.axis_index(slabs.name) == 0, x, 0))

@@ -1,6 +1,6 @@
 """Solves with K − λᵢM on the complement of known eigenvectors, matrix-free: conjugate gradients with a polynomial.
 
-The filter of `hks_jax.eigen.filter.damping`, with its sign changed, is the preconditioner, in single precision;
+The polynomial of the filter, with its sign changed, is the preconditioner, in single precision;
 residuals and steps are computed in the rows' own. The known eigenvectors are taken out after each step, by products of
 matrices for a block of right-hand sides at once.
 """
@@ -16,15 +16,12 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import amplification, attainable, definite_product, first_beyond
-from hks_jax.eigen.complement.in_blocks import projected, solve_in_blocks
-from hks_jax.eigen.filter.coarsening import finest_level
-from hks_jax.eigen.filter.damping import Band, correction, degree_for, upper_end
-from hks_jax.fem.columns import to_columns, to_rows
+from hks_jax.eigen.complement.in_blocks import projected, solve_in_blocks, without_known
+from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
+from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import GridSpace
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
-from hks_jax.linear.products import combine, inner_products
 
 _GAIN = 20.0
 """What the preconditioner's polynomial is at λ: more costs more products with K, less more projections."""
@@ -52,8 +49,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         """Return the upper end of the spectrum of D⁻¹K."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("adjoint: FilteredAdjoint needs a grid; use FactorisedAdjoint for a mesh")
-        assert isinstance(pencil.space, GridSpace)
-        return upper_end(finest_level(pencil), pencil.space.periodic)
+        return upper_end(nodal_pencil(pencil))
 
     def solve(
         self,
@@ -76,29 +72,24 @@ def _solve(
     tolerance: float,
     block: int,
 ) -> Float[Array, "k n_dof"]:
-    space = pencil.space
-    assert isinstance(space, GridSpace)
-    level, periodic = finest_level(pencil), space.periodic
+    space, nodal = pencil.space, nodal_pencil(pencil)
     k, tolerance, beyond = rhs.shape[0], attainable(tolerance, rhs.dtype), first_beyond(values)
     # The polynomial is one of D⁻¹K, whose values are the lumped quotients φᵀKφ / φᵀDφ: on coarse grids a fraction of λ.
-    mass = space.restrict(level.lumped)
+    mass = space.restrict(nodal.lumped)
     quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=block)
     band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
     # Nearer to the band it does not reach its gain, and would no longer be definite.
     nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
     quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
-    images = jax.lax.map(pencil.mass.apply, vectors, batch_size=block)
-
-    def without_known(x: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
-        return x - combine(inner_products(images, x), vectors)
+    clean = without_known(pencil, vectors)
 
     def one_block(_: None, b: Array, wanted: Array, shifts: Array, references: Array) -> Float[Array, "n_dof b"]:
-        degree = jnp.ceil(jnp.clip(degree_for(band, jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
+        degree = jnp.ceil(jnp.clip(band.degree_for(jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
         def precondition(r: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
-            columns = to_columns(space.extend(r.T, outside=0.0).reshape(r.shape[1], -1), level.shape)
-            z = correction(level, periodic, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
-            return without_known(-space.restrict(to_rows(z).reshape(-1, *level.shape))).T
+            columns = to_columns(space.extend(r.T, outside=0.0).reshape(r.shape[1], -1), nodal.shape)
+            z = correction(nodal, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
+            return clean(-space.restrict(to_rows(z).reshape(-1, *nodal.shape)).T)
 
         return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
 

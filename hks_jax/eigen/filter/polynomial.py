@@ -1,15 +1,14 @@
 """Chebyshev polynomials of a pencil that damp the upper part of its spectrum."""
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hks_jax.eigen.filter.coarsening import GridLevel
-from hks_jax.fem.columns import stencil
+from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import chebyshev_iteration
 from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
 
@@ -24,6 +23,15 @@ class Band(NamedTuple):
 
     low: Float[Array, ""]
     high: Float[Array, ""]
+
+    def degree_for(self, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:
+        """Return the degree at which the polynomial is ``gain`` at a value below the band: gain = cosh(degree · a).
+
+        At most `MOST_DEGREE`: where the band is so wide that more is needed, pairs do not converge, which is told.
+        """
+        below = jnp.maximum(self.low - value, 0)
+        degree = jnp.arccosh(jnp.asarray(gain, value.dtype)) / jnp.arccosh(1 + 2 * below / (self.high - self.low))
+        return jnp.fmin(degree, MOST_DEGREE)  # not NaN either, where the band is empty
 
 
 # Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx, and p the Chebyshev polynomial
@@ -47,8 +55,7 @@ class Band(NamedTuple):
 # D⁻¹ may be W throughout. q < 0 on both sides of ζ, so that −q(D⁻¹K)D⁻¹ is also a symmetric positive definite
 # preconditioner for K − λM.
 def correction(
-    level: GridLevel,
-    periodic: tuple[bool, ...],
+    pencil: NodalPencil,
     band: Band,
     residual: Float[Array, "*shape b"],
     value: Float[Array, " b"],
@@ -62,43 +69,30 @@ def correction(
     zero it is x, the residual's is Kx, and p(D⁻¹K)/p(ζ) damps x as it is: D⁻¹Kx − ζx takes the place of D⁻¹r.
     """
     dtype = residual.dtype
-    stiffness = stencil((level.stiffness / level.lumped).astype(dtype), periodic)
-    mass = stencil((level.mass / level.lumped).astype(dtype), periodic)
+    stiffness, mass = (
+        replace(matrix, coefficients=(matrix.coefficients / pencil.lumped).astype(dtype)).of_columns()
+        for matrix in (pencil.stiffness, pencil.mass)
+    )
 
     def further(y: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-        if level.mass.shape[0] == 1:
+        if pencil.mass.is_diagonal:
             return y
         return jax.lax.fori_loop(0, terms, lambda _, sum_: y + (sum_ - mass(sum_)), y)
 
     reference = jnp.minimum(value, band.low)
 
     def run(inverse: Callable[[Array], Array]) -> Float[Array, "*shape b"]:
-        w = inverse(residual / level.lumped[..., None].astype(dtype)) - reference.astype(dtype) * whole
-
-        def product(z: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-            return inverse(stiffness(z))
-
-        return chebyshev_iteration(product, w, band.low, band.high, reference, degree)
+        w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - reference.astype(dtype) * whole
+        return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
     # Apart, so that without further terms all of a step is one computation.
     return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
 
 
-def degree_for(band: Band, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:
-    """Return the degree at which the polynomial is ``gain`` at a value below the band: gain = cosh(degree · a).
-
-    At most `MOST_DEGREE`: where the band is so wide that more is needed, pairs do not converge, which is told.
-    """
-    below = jnp.maximum(band.low - value, 0)
-    degree = jnp.arccosh(jnp.asarray(gain, value.dtype)) / jnp.arccosh(1 + 2 * below / (band.high - band.low))
-    return jnp.fmin(degree, MOST_DEGREE)  # not NaN either, where the band is empty
-
-
-@partial(jax.jit, static_argnames="periodic")
-def upper_end(level: GridLevel, periodic: tuple[bool, ...]) -> Float[Array, ""]:
+@jax.jit
+def upper_end(pencil: NodalPencil) -> Float[Array, ""]:
     """Return a bound of the spectrum of D⁻¹K."""
-    lumped = level.lumped[..., None]
-    sums = jnp.where(level.free[..., None], lumped, 0)
-    bound = lanczos_bound(stencil(level.stiffness, periodic), lambda r: r / lumped, sums, level.free.size, _STEPS)
+    lumped, sums = pencil.lumped[..., None], pencil.lumped_or_zero[..., None]
+    bound = lanczos_bound(pencil.stiffness.of_columns(), lambda r: r / lumped, sums, sums.size, _STEPS)
     # Gershgorin's discs never fail, but are twice too large where tensors vary.
-    return jnp.minimum(bound, gershgorin(level.stiffness, 1 / level.lumped))
+    return jnp.minimum(bound, gershgorin(pencil.stiffness.coefficients, 1 / pencil.lumped))
