@@ -36,13 +36,13 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
     indicators = (colours.ravel() == np.arange(padded, dtype=np.int32)[:, None]).reshape(-1, _COLUMNS, colours.size)
     indicators, of_neighbour = jax.lax.optimization_barrier((jnp.asarray(indicators), jnp.asarray(of_neighbour)))
 
-    coarse = jax.ShapeDtypeStruct((*shape, _COLUMNS), fine.lumped.dtype)
-    restrict = jax.linear_transpose(partial(interpolate, fine), coarse)
+    raised = partial(interpolate, fine)
 
     def galerkin(matrix: Stencil) -> Stencil:
         def images(rows: Bool[Array, "b coarse"]) -> Float[Array, "b coarse"]:
-            x = interpolate(fine, to_columns(rows.astype(coarse.dtype), shape))
-            return to_rows(restrict(matrix @ x)[0])
+            x = to_columns(rows.astype(fine.lumped.dtype), shape)
+            (restricted,) = jax.linear_transpose(raised, x)(matrix @ raised(x))
+            return to_rows(restricted)
 
         products = jax.lax.map(images, indicators).reshape(padded, *shape)
         # A node's image under the sum of a colour's basis functions is its coupling to the one of them near by.
