@@ -1,19 +1,22 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by Chebyshev polynomials on coloured sources, and its derivative."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import chebyshev_recurrence
+from hks_jax.linear.linear_map import with_transpose
 from hks_jax.spectrum_free.colours import Colouring
 from hks_jax.static_array import StaticArray
+
+T = TypeVar("T")
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -29,22 +32,19 @@ def coloured_diagonal(
         pencil: K and M.
         coefficients: cₙ.
     """
-    stiffness, solve_mass = pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
+    stiffness, solve_mass = _products(settings, pencil)
 
-    def block(number: Array, total: Array) -> Array:
-        sources = _sources(colours, settings.columns, number, total.dtype)
+    def product(y: Array) -> Array:
+        return _scaled(settings.top, solve_mass(stiffness(y)), y)
 
-        def product(y: Array) -> Array:
-            return _scaled(settings.top, solve_mass(stiffness(y)), y)
-
+    def term(sources: Array, total: Array) -> Array:
         def add(n: Any, y: Array, total: Array) -> Array:
             return total + _outer(coefficients[:, n], sources, y)
 
-        return chebyshev_recurrence(product, solve_mass(sources), degree, total, add)[2]
+        return chebyshev_recurrence(product, solve_mass(sources), coefficients.shape[1] - 1, total, add)[2]
 
-    degree = coefficients.shape[1] - 1
     start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
-    return jax.lax.fori_loop(0, _blocks(settings, colours), block, start)
+    return _sum_of_blocks(settings, colours, term, start)
 
 
 # y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with  = 2PK/top − 1, and the result is Σₙ cₙ v∘yₙ. Taking P for M⁻¹, of
@@ -58,19 +58,15 @@ def coloured_diagonal(
 # The yₙ are wanted in the order n = N − 1 … 0, and yₙ₋₁ = 2Âyₙ − yₙ₊₁ gives them in that order from the last two:
 # three-term recurrences run as well backwards as forwards, rounding grows like |Uₙ| ≤ n + 1 either way. So nothing
 # is stored that grows with the degree.
-@partial(coloured_diagonal.defjvp, symbolic_zeros=True)
+@coloured_diagonal.defjvp
 def _coloured_diagonal_jvp(
     settings: Colouring, colours: StaticArray, primals: tuple, tangents: tuple
 ) -> tuple[Array, Array]:
-    pencil, coefficients = primals
     d_pencil, d_coefficients = tangents
-    value = coloured_diagonal(settings, colours, pencil, coefficients)
-    moved = _linked((d_pencil.stiffness.coefficients, d_pencil.mass.coefficients, d_coefficients))
-    if moved is None:
-        return value, jnp.zeros_like(value)
-    fixed = first_order_only((pencil, coefficients))
+    moved = d_pencil.stiffness.coefficients, d_pencil.mass.coefficients, d_coefficients
+    fixed = first_order_only(primals)
     forward, backward = (partial(function, settings, colours, *fixed) for function in (_tangent, _cotangent))
-    return value, _linear_map(forward, backward, moved, value)
+    return coloured_diagonal(settings, colours, *primals), with_transpose(forward, backward, moved)
 
 
 def _tangent(
@@ -78,13 +74,11 @@ def _tangent(
 ) -> Float[Array, "m *shape"]:
     d_stiffness, d_mass, d_coefficients = moved
     degree, top = coefficients.shape[1] - 1, settings.top
-    stiffness, solve_mass = pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
+    stiffness, solve_mass = _products(settings, pencil)
     by_stiffness = replace(pencil.stiffness, coefficients=d_stiffness).of_columns()
     by_mass = replace(pencil.mass, coefficients=d_mass).of_columns()
 
-    def block(number: Array, total: Array) -> Array:
-        sources = _sources(colours, settings.columns, number, total.dtype)
-
+    def term(sources: Array, total: Array) -> Array:
         def product(state: tuple[Array, Array]) -> tuple[Array, Array]:
             y, dy = state
             image = solve_mass(stiffness(y))
@@ -99,18 +93,19 @@ def _tangent(
         return chebyshev_recurrence(product, (y, solve_mass(-by_mass(y))), degree, total, add)[2]
 
     start = jnp.zeros((coefficients.shape[0], *colours.value.shape), coefficients.dtype)
-    return jax.lax.fori_loop(0, _blocks(settings, colours), block, start)
+    return _sum_of_blocks(settings, colours, term, start)
 
 
 def _cotangent(
     settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Array, g: Array
 ) -> tuple[Array, Array, Array]:
     degree, top = coefficients.shape[1] - 1, settings.top
-    stiffness, solve_mass = pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
+    stiffness, solve_mass = _products(settings, pencil)
 
-    def block(number: Array, total: tuple) -> tuple:
-        sources = _sources(colours, settings.columns, number, g.dtype)
+    def product(y: Array) -> Array:
+        return _scaled(top, solve_mass(stiffness(y)), y)
 
+    def term(sources: Array, total: tuple) -> tuple:
         def product(y: Array) -> Array:
             return _scaled(top, solve_mass(stiffness(y)), y)
 
@@ -142,7 +137,7 @@ def _cotangent(
         return of_stiffness, of_mass - pencil.mass.outer(p, y), of_coefficients
 
     matrices = pencil.stiffness.coefficients, pencil.mass.coefficients, coefficients
-    return jax.lax.fori_loop(0, _blocks(settings, colours), block, jax.tree.map(jnp.zeros_like, matrices))
+    return _sum_of_blocks(settings, colours, term, jax.tree.map(jnp.zeros_like, matrices))
 
 
 def _scaled(top: float, image: Array, y: Array) -> Array:
@@ -150,14 +145,22 @@ def _scaled(top: float, image: Array, y: Array) -> Array:
     return (2 / top) * image - y
 
 
-def _blocks(settings: Colouring, colours: StaticArray) -> int:
-    return -(-(int(colours.value.max()) + 1) // settings.columns)
+def _products(settings: Colouring, pencil: NodalPencil) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Return the products with K and P."""
+    return pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
 
 
-def _sources(colours: StaticArray, columns: int, number: Array, dtype: Any) -> Float[Array, "*shape b"]:
-    """Return the vectors of one block of colours."""
-    numbers: Int[Array, " b"] = number * columns + jnp.arange(columns, dtype=jnp.int32)
-    return (jnp.asarray(colours.value, jnp.int32)[..., None] == numbers).astype(dtype)
+def _sum_of_blocks(
+    settings: Colouring, colours: StaticArray, term: Callable[[Float[Array, "*shape b"], T], T], total: T
+) -> T:
+    """Return the total after the terms of all blocks of colours, each told the vectors of its colours."""
+    numbers, dtype = jnp.arange(settings.columns, dtype=jnp.int32), jax.tree.leaves(total)[0].dtype
+
+    def step(number: Array, total: T) -> T:
+        own = number * settings.columns + numbers
+        return term((jnp.asarray(colours.value, jnp.int32)[..., None] == own).astype(dtype), total)
+
+    return jax.lax.fori_loop(0, -(-(int(colours.value.max()) + 1) // settings.columns), step, total)
 
 
 def _outer(row: Float[Array, " m"], sources: Array, y: Array) -> Float[Array, "m *shape"]:
@@ -166,34 +169,3 @@ def _outer(row: Float[Array, " m"], sources: Array, y: Array) -> Float[Array, "m
 
 def _contract(g: Float[Array, "m *shape"], moment: Float[Array, "*shape"]) -> Float[Array, " m"]:
     return jnp.matmul(g.reshape(g.shape[0], -1), moment.ravel(), precision="highest")
-
-
-def _linked(tangents: tuple) -> tuple | None:
-    """Return tangents with symbolic zeros as arrays, or None if all are zero.
-
-    The zeros are made to depend on the others: transposition then finds nothing constant among linear inputs.
-    """
-    moving = [leaf for leaf in tangents if not isinstance(leaf, SymbolicZero)]
-    if not moving:
-        return None
-    zero = sum(jnp.sum(0 * leaf) for leaf in moving)
-    return tuple(
-        jnp.zeros(leaf.shape, leaf.dtype) + zero if isinstance(leaf, SymbolicZero) else leaf for leaf in tangents
-    )
-
-
-def _linear_map(forward: Any, backward: Any, x: tuple, like: Array) -> Array:
-    """Return forward(x), a linear map whose transpose is backward.
-
-    As the second part of the solution of x = u, h − forward(x) = 0: JAX lets linear solves say how their transpose is
-    solved, under every transformation. The system itself would matter to second derivatives alone, which are refused.
-    """
-    nothing = jnp.zeros_like(like) + sum(jnp.sum(0 * leaf) for leaf in x)
-
-    def solve(_: Any, b: tuple) -> tuple:
-        return b[0], b[1] + forward(b[0])
-
-    def transpose_solve(_: Any, b: tuple) -> tuple:
-        return jax.tree.map(jnp.add, b[0], backward(b[1])), b[1]
-
-    return jax.lax.custom_linear_solve(lambda v: v, (x, nothing), solve, transpose_solve)[1]

@@ -60,39 +60,29 @@ class FilteredAdjoint(Adjoint[Pencil]):
         rhs: Float[Array, "k n_dof"],
     ) -> Float[Array, "k n_dof"]:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
-        return _solve(prepared, pencil, values, vectors, rhs, self.tolerance, self.block)
+        space, nodal, high = pencil.space, nodal_pencil(pencil), prepared
+        k, tolerance, beyond = rhs.shape[0], attainable(self.tolerance, rhs.dtype), first_beyond(values)
+        # The polynomial is one of D⁻¹K, whose values are the quotients φᵀKφ / φᵀDφ: on coarse grids a fraction of λ.
+        mass = space.restrict(nodal.lumped)
+        quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
+        band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
+        # Nearer to the band it does not reach its gain, and would no longer be definite.
+        nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
+        quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
+        clean = without_known(pencil, vectors)
 
+        def one_block(_: None, b: Array, wanted: Array, shifts: Array, references: Array) -> Float[Array, "n_dof b"]:
+            degree = jnp.ceil(jnp.clip(band.degree_for(jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
-def _solve(
-    high: Float[Array, ""],
-    pencil: Pencil,
-    values: Float[Array, " p"],
-    vectors: Float[Array, "p n_dof"],
-    rhs: Float[Array, "k n_dof"],
-    tolerance: float,
-    block: int,
-) -> Float[Array, "k n_dof"]:
-    space, nodal = pencil.space, nodal_pencil(pencil)
-    k, tolerance, beyond = rhs.shape[0], attainable(tolerance, rhs.dtype), first_beyond(values)
-    # The polynomial is one of D⁻¹K, whose values are the lumped quotients φᵀKφ / φᵀDφ: on coarse grids a fraction of λ.
-    mass = space.restrict(nodal.lumped)
-    quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=block)
-    band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-    # Nearer to the band it does not reach its gain, and would no longer be definite.
-    nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
-    quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
-    clean = without_known(pencil, vectors)
+            def precondition(r: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+                columns = to_columns(space.extend(r.T, outside=0.0).reshape(r.shape[1], -1), nodal.shape)
+                z = correction(nodal, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
+                return clean(-space.restrict(to_rows(z).reshape(-1, *nodal.shape)).T)
 
-    def one_block(_: None, b: Array, wanted: Array, shifts: Array, references: Array) -> Float[Array, "n_dof b"]:
-        degree = jnp.ceil(jnp.clip(band.degree_for(jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
+            return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
 
-        def precondition(r: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
-            columns = to_columns(space.extend(r.T, outside=0.0).reshape(r.shape[1], -1), nodal.shape)
-            z = correction(nodal, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
-            return clean(-space.restrict(to_rows(z).reshape(-1, *nodal.shape)).T)
-
-        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
-
-    left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
-    one_group = np.zeros(1, int)
-    return solve_in_blocks(lambda _: None, one_block, block, one_group, left, wanted, values[:k], quotients[:k])
+        left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
+        one_group = np.zeros(1, int)
+        return solve_in_blocks(
+            lambda _: None, one_block, self.block, one_group, left, wanted, values[:k], quotients[:k]
+        )

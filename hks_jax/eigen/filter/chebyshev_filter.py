@@ -2,7 +2,6 @@
 
 import math
 import time
-from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -16,7 +15,7 @@ from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.filter.adjoint import FilteredAdjoint
 from hks_jax.eigen.filter.coarsening import coarsen
 from hks_jax.eigen.filter.polynomial import upper_end
-from hks_jax.eigen.filter.rounds import FilterState, GridFilter, Plan, excess, unconverged
+from hks_jax.eigen.filter.rounds import FilterState, GridFilter, Plan
 from hks_jax.eigen.filter.subspace import EVERYWHERE
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
@@ -81,7 +80,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         assert isinstance(pencil.space, GridSpace)
         plan = self.plan(k, pencil.space)
         if is_traced(pencil):
-            values, vectors = _lowest_traced(pencil, plan, self.max_rounds)
+            values, vectors = _lowest_traced(pencil, plan, self.max_rounds, None)
         else:
             values, vectors = _lowest(pencil, plan, self.max_rounds, report)
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
@@ -121,7 +120,7 @@ def _lowest(
         state = _converge(grid, rounding, state, max_rounds, report)
     else:
         state = jax.lax.while_loop(
-            lambda state: (unconverged(plan, rounding, state) > 0) & (state.rounds < max_rounds),
+            lambda state: (grid.unconverged(rounding, state) > 0) & (state.rounds < max_rounds),
             lambda state: grid.improve(rounding, state),
             state,
         )
@@ -131,14 +130,17 @@ def _lowest(
     return state.values[: plan.wanted], pencil.space.restrict(vectors)
 
 
+_lowest_traced = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
+
+
 def _converge(
     grid: GridFilter, rounding: Float[Array, ""], state: FilterState, max_rounds: int, report: Report
 ) -> FilterState:
     """Return the state after rounds on the finest grid, each told, and of large problems the blocks of each."""
     plan = grid.plan
     in_steps = report is not silent and plan.mesh is None and state.vectors.size >= _LARGE
-    pace = Pace(float(excess(plan, rounding, state)))
-    while (left := int(unconverged(plan, rounding, state))) and state.rounds < max_rounds:
+    pace = Pace(float(grid.excess(rounding, state)))
+    while (left := int(grid.unconverged(rounding, state))) and state.rounds < max_rounds:
         text = f"{plan.wanted - left} of {plan.wanted} pairs, round {int(state.rounds) + 1}"
         report(Status(text, pace.seconds_left()))
         work = 1
@@ -152,7 +154,7 @@ def _converge(
             state = grid.improve_in_steps(rounding, state, tell)
         else:
             state = grid.improve(rounding, state)
-        pace.round_done(float(excess(plan, rounding, state)), work)
+        pace.round_done(float(grid.excess(rounding, state)), work)
     return state
 
 
@@ -186,11 +188,6 @@ class Pace:
         # Later rounds have fewer pairs to filter: this one's work, where it is known, is the better guess for all.
         per_round = self._seconds * ((work or self._work) / self._work if self._work else 1.0)
         return (rounds - (done / work if work else 0.0)) * per_round
-
-
-@partial(jax.jit, static_argnames=("plan", "max_rounds"))
-def _lowest_traced(pencil: Pencil, plan: Plan, max_rounds: int) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    return _lowest(pencil, plan, max_rounds, None)
 
 
 def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.filter.coarsening import interpolate
 from hks_jax.eigen.filter.polynomial import Band, correction
@@ -103,25 +103,6 @@ class Filtering(NamedTuple):
     factor: Float[Array, " m"]
 
 
-def unconverged(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Int[Array, ""]:
-    """Return how many of the wanted pairs have not converged."""
-    return jnp.sum(~_converged(plan, rounding, state)[: plan.wanted])
-
-
-@partial(jax.jit, static_argnames="plan")
-def excess(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Float[Array, ""]:
-    """Return the largest defect of the wanted pairs, as a multiple of what counts as converged."""
-    return jnp.max((state.defects / _allowed(plan, rounding, state))[: plan.wanted])
-
-
-def _converged(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Bool[Array, " m"]:
-    return state.defects <= _allowed(plan, rounding, state)
-
-
-def _allowed(plan: Plan, rounding: Float[Array, ""], state: FilterState) -> Float[Array, " m"]:
-    return allowed_defects(jnp.maximum(state.values, state.values[plan.n_null]), rounding, plan.tolerance)
-
-
 class GridFilter(eqx.Module):
     """Subspace iteration on one grid. What is compiled for one serves all grids of its shape.
 
@@ -139,6 +120,20 @@ class GridFilter(eqx.Module):
     def slabs(self) -> Slabs | None:
         """How the grid is cut between rounds; None on one device."""
         return self.pencil.cut(self.plan.mesh)
+
+    def allowed(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, " m"]:
+        """Return the defects up to which pairs count as converged."""
+        scale = jnp.maximum(state.values, state.values[self.plan.n_null])
+        return allowed_defects(scale, rounding, self.plan.tolerance)
+
+    def unconverged(self, rounding: Float[Array, ""], state: FilterState) -> Int[Array, ""]:
+        """Return how many of the wanted pairs have not converged."""
+        return jnp.sum(~(state.defects <= self.allowed(rounding, state))[: self.plan.wanted])
+
+    @jax.jit
+    def excess(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, ""]:
+        """Return the largest defect of the wanted pairs, as a multiple of what counts as converged."""
+        return jnp.max((state.defects / self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
     def from_random(self, volume: Float[Array, ""]) -> FilterState:
@@ -220,7 +215,7 @@ class GridFilter(eqx.Module):
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
-        left = spare | (True if rounding is None else ~_converged(plan, rounding, state))
+        left = spare | (True if rounding is None else ~(state.defects <= self.allowed(rounding, state)))
         # The spare vectors need no more than the last wanted one.
         goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)
