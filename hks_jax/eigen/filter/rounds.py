@@ -210,8 +210,7 @@ class GridFilter(eqx.Module):
         spare = jnp.arange(plan.size) >= plan.wanted
         terms, filtered_values, factor = _lumping(plan, state)
         high = (1 + terms).astype(self.high.dtype) * self.high
-        # Where the vectors beyond the wanted ones are no eigenvectors yet, the band begins where Weyl's law has the
-        # last.
+        # Where the vectors beyond the wanted ones are no eigenvectors yet, the band begins where Weyl's law says.
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
