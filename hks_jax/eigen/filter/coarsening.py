@@ -5,7 +5,6 @@ The eigenfunctions of the coarse problem, interpolated, are where an iteration o
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,39 +16,37 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.fem.colouring import axis_colours
 from hks_jax.fem.nodal import NodalPencil, lump, to_columns, to_rows
 from hks_jax.fem.operators import Stencil
-from hks_jax.traced import is_traced
 
 _COLUMNS = 16
 """Columns in one product."""
 
 
+@jax.jit
 def coarsen(fine: NodalPencil) -> NodalPencil:
     """Return the pencil on every second node of each axis, its matrices PᵀKP and PᵀMP, P the interpolation."""
     every_second = (slice(None, None, 2),) * len(fine.shape)
     free, domain = fine.free[every_second], fine.domain[every_second]
     shape = free.shape
     axes = [_axis_colours(n, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
-    padded = -(-math.prod(int(own.max()) + 1 for _, own, _ in axes) // _COLUMNS) * _COLUMNS
-    # Where the pencil is traced, what is along axes is all that the program has for constants.
-    known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes]) if is_traced(fine) else axes
-    colours, of_neighbour = _colouring(known, [int(own.max()) + 1 for _, own, _ in axes])
+    counts = [int(own.max()) + 1 for _, own, _ in axes]
+    padded = -(-math.prod(counts) // _COLUMNS) * _COLUMNS
+    # What is along axes is all that the program has for constants; behind the barrier the compiler leaves them alone.
+    colours, of_neighbour = _colouring(jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes]), counts)
     indicators = (colours.ravel() == np.arange(padded, dtype=np.int32)[:, None]).reshape(-1, _COLUMNS, colours.size)
-    indicators, of_neighbour = jax.lax.optimization_barrier((jnp.asarray(indicators), jnp.asarray(of_neighbour)))
+    indicators, of_neighbour = jax.lax.optimization_barrier((indicators, of_neighbour))
 
-    raised = partial(interpolate, fine)
+    def images(rows: Bool[Array, "b coarse"]) -> tuple[Float[Array, "b coarse"], ...]:
+        x = to_columns(rows.astype(fine.lumped.dtype), shape)
+        raised, restrict = interpolate(fine, x), jax.linear_transpose(partial(interpolate, fine), x)
+        return tuple(to_rows(*restrict(image)) for image in fine.products()(raised))
 
-    def galerkin(matrix: Stencil) -> Stencil:
-        def images(rows: Bool[Array, "b coarse"]) -> Float[Array, "b coarse"]:
-            x = to_columns(rows.astype(fine.lumped.dtype), shape)
-            (restricted,) = jax.linear_transpose(raised, x)(matrix @ raised(x))
-            return to_rows(restricted)
-
-        products = jax.lax.map(images, indicators).reshape(padded, *shape)
+    def coupled(images: Float[Array, "blocks b coarse"]) -> Stencil:
         # A node's image under the sum of a colour's basis functions is its coupling to the one of them near by.
-        coupled = jnp.take_along_axis(products, jnp.maximum(of_neighbour, 0), axis=0)
-        return replace(matrix, coefficients=jnp.where(of_neighbour >= 0, coupled, 0))
+        entries = jnp.take_along_axis(images.reshape(padded, *shape), jnp.maximum(of_neighbour, 0), axis=0)
+        return Stencil(jnp.where(of_neighbour >= 0, entries, 0), fine.periodic)
 
-    return lump(galerkin(fine.stiffness), galerkin(fine.mass), free, domain)
+    stiffness, mass = map(coupled, jax.lax.map(images, indicators))
+    return lump(stiffness, mass, free, domain)
 
 
 def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array, "*shape b"]:
@@ -83,12 +80,9 @@ def _axis_colours(n: int, wraps: bool) -> Int[np.ndarray, "3 n"]:
 
 
 def _colouring(
-    axes: Sequence[Int[np.ndarray | Array, "3 _n"]], counts: Sequence[int]
-) -> tuple[Int[np.ndarray | Array, "*shape"], Int[np.ndarray | Array, "offsets *shape"]]:
-    """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none.
-
-    Computed with what arrays the axes are: those of the host, or of a program.
-    """
+    axes: Sequence[Int[Array, "3 _n"]], counts: Sequence[int]
+) -> tuple[Int[Array, "*shape"], Int[Array, "offsets *shape"]]:
+    """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none."""
     d = len(axes)
     number: Any = np.zeros((1,) * (2 * d), np.int32)
     exists: Any = np.ones((1,) * (2 * d), bool)
