@@ -26,7 +26,7 @@ import hks_jax as hj
 from hks_jax.devices import Slabs, chebyshev_series
 from hks_jax.eigen.filter.rounds import FilterState, GridFilter
 from hks_jax.fem.nodal import nodal_pencil
-from hks_jax.fem.operators import Stencil
+from hks_jax.fem.stencil import Stencil
 
 DEGREE, PAIRS, COLUMNS = 100, 90, 16
 COLLECTIVES = ("ppermute", "all_to_all", "psum")

@@ -29,8 +29,8 @@ from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
 from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
 from hks_jax.eigen.eigsh import eigsh as eigsh
-from hks_jax.eigen.filter.adjoint import FilteredAdjoint as FilteredAdjoint
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter as ChebyshevFilter
+from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint as FilteredAdjoint
 from hks_jax.eigen.host.complement import HostAdjoint as HostAdjoint
 from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos as BlockLanczos

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 import hks_jax as hj
 from hks_jax.eigen.lanczos import columns
-from hks_jax.fem.operators import Stencil
+from hks_jax.fem.stencil import Stencil
 from hks_jax.linear import accelerators, column_kernels, merging
 from hks_jax.linear.chebyshev import chebyshev_iteration
 from hks_jax.linear.column_kernels import orthonormal, parts_of_products, remainder

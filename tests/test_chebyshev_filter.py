@@ -52,9 +52,13 @@ def test_products_in_columns_equal_the_operators(rng, name):
     space = pencil.space
     x = rng.standard_normal((3, space.n_dof))
     columns = to_columns(space.extend(jnp.asarray(x), outside=0.0).reshape(3, -1), space.node_shape)
-    y = pencil.stiffness.nodal @ columns
-    again = space.restrict(to_rows(y).reshape(3, *space.node_shape))
-    np.testing.assert_allclose(again, pencil.stiffness.apply(jnp.asarray(x)), atol=1e-13)
+    nodal = nodal_pencil(pencil)
+    for matrix, of_nodal, y in zip(
+        (pencil.stiffness, pencil.mass), (nodal.stiffness, nodal.mass), nodal.products()(columns), strict=True
+    ):
+        again = space.restrict(to_rows(y).reshape(3, *space.node_shape))
+        np.testing.assert_allclose(again, matrix.apply(jnp.asarray(x)), atol=1e-13)
+        np.testing.assert_array_equal(of_nodal @ columns, y)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.devices import Slabs, heat_columns, map_fields
-from hks_jax.fem.operators import Stencil
+from hks_jax.fem.stencil import Stencil
 from hks_jax.linear import lapack
 
 warnings.simplefilter("error")

@@ -11,8 +11,8 @@ from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos, known_by_weyl
 from hks_jax.eigen.solver import Eigensolver
-from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.stencil import StencilOperator
 from hks_jax.traced import is_traced
 
 SOLVERS: dict[str, Callable[[], Eigensolver]] = {

@@ -4,8 +4,8 @@ The derivatives of a truncated spectrum need them. On the M-orthogonal complemen
 is positive definite, and so is K − σM for *every* σ below the next eigenvalue Λ, whatever its sign elsewhere.
 Preconditioned with it, the spectrum of conjugate gradients lies between 1 and (Λ − λᵢ)/(Λ − σ). So the rows are grouped
 by their λᵢ, each group has its own shift σ among them, and a few factorisations bring every row to convergence in a few
-steps. `eigen.host` does so with SciPy's factorisations, `factorised` with those in JAX; `eigen.filter.adjoint` has
-a polynomial instead.
+steps. `eigen.host` does so with SciPy's factorisations, `factorised` with those in JAX; the filter's adjoint has a
+polynomial instead.
 """
 
 from collections.abc import Callable

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.filter.adjoint import FilteredAdjoint
 from hks_jax.eigen.filter.coarsening import coarsen
+from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint
 from hks_jax.eigen.filter.polynomial import upper_end
 from hks_jax.eigen.filter.rounds import FilterState, GridFilter, Plan
 from hks_jax.eigen.filter.subspace import EVERYWHERE
@@ -21,9 +21,9 @@ from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh
 from hks_jax.fem.nodal import NodalPencil, nodal_pencil
-from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
+from hks_jax.fem.stencil import StencilOperator
 from hks_jax.traced import is_traced
 
 _FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.fem.colouring import axis_colours
 from hks_jax.fem.nodal import NodalPencil, lump, to_columns, to_rows
-from hks_jax.fem.operators import Stencil
+from hks_jax.fem.stencil import Stencil
 
 _COLUMNS = 16
 """Columns in one product."""

@@ -19,8 +19,8 @@ from hks_jax.eigen.complement.common import amplification, attainable, definite_
 from hks_jax.eigen.complement.in_blocks import projected, solve_in_blocks, without_known
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
-from hks_jax.fem.operators import StencilOperator
 from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 _GAIN = 20.0
