@@ -17,6 +17,7 @@ from hks_jax.cli.inputs import (
     add_eigenpair_arguments,
     add_json_argument,
     add_tensor_options,
+    add_view_argument,
     read_volume,
     require_metric,
 )
@@ -78,6 +79,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add_tensor_options(parser)
     add_eigenpair_arguments(parser, "that of the study in DIR, else mean, for all subjects alike")
     add_signature_arguments(parser)
+    add_view_argument(parser)
     add(
         "--time-unit",
         choices=("scanner", "lambda1"),

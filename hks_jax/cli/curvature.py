@@ -2,15 +2,24 @@
 
 import argparse
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.cli.inputs import add_json_argument, add_tensor_arguments, read_volume, require_metric
+from hks_jax.cli.inputs import (
+    add_json_argument,
+    add_tensor_arguments,
+    add_view_argument,
+    read_volume,
+    require_metric,
+)
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume, atomic_folder, save
+
+if TYPE_CHECKING:
+    from hks_jax.plot.orientation import View
 
 DESCRIPTION = """\
 Compute the Gaussian curvature of a two-dimensional field of diffusion tensors, or of a slice. FILE is read as by
@@ -43,6 +52,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--periodic", choices=("x", "y", "xy"), default="", help="axes of which node n is node 0 (default none)"
     )
+    add_view_argument(parser)
     add_json_argument(parser)
     return parser
 
@@ -97,22 +107,23 @@ def run(args: argparse.Namespace) -> None:
             save(folder / "curvature.npz", curvature, volume, name="curvature")
             if image := image_suffix(args.file):
                 save(folder / f"curvature{image}", curvature, volume, name="curvature")
-            save_figure(draw(curvature, volume), folder / "curvature.png")
+            save_figure(draw(curvature, volume, args.view), folder / "curvature.png")
             write_report(folder / "report.json", report, progress, sys.argv)
             names = sorted(file.name for file in folder.iterdir())
     show_files([args.output / name for name in names], args.quiet, args.json)
 
 
-def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume) -> Any:
+def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume, view: "View") -> Any:
     """Return the picture: colours on either side of zero, as many as the values reach but for a few."""
-    from hks_jax.cli.picture import cropped
+    from hks_jax.cli.picture import cropped, placed, proportion
     from hks_jax.plot import new_figure, scalar_image
 
     grid, box = cropped(volume, np.isfinite(curvature))
     limit = float(np.nanquantile(np.abs(curvature), COLOURED)) or 1.0
-    aspect = min(max(grid.shape[1] * grid.spacing[1] / (grid.shape[0] * grid.spacing[0]), 0.3), 3.0)
-    figure = new_figure(4.8, 3.6 * aspect + 0.6)
+    orientation = placed(volume, box, view)
+    figure = new_figure(4.8, 3.6 * proportion(grid, orientation) + 0.6)
     ax = figure.subplots()
-    scalar_image(ax, curvature[box], grid, cmap="RdBu_r", vmin=-limit, vmax=limit, label="in 1/length² of the metric")
+    colours: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "label": "in 1/length² of the metric"}
+    scalar_image(ax, curvature[box], grid, orientation=orientation, **colours)
     ax.set_title("Gaussian curvature", fontsize="medium")
     return figure

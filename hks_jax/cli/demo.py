@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.inputs import add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
 
@@ -47,6 +47,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="folder for the results (demo)")
     add("--phantom", action="store_true", help="use the phantom in any case")
+    add_view_argument(parser)
     add_json_argument(parser)
     return parser
 
@@ -90,6 +91,7 @@ def run(args: argparse.Namespace) -> None:
                 first=("mean diffusivity, mm²/s", mean),
                 title=rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹: "
                 "1 is flat, above is positive curvature, that of the rim included",
+                view=args.view,
             ),
             image="" if brain is None else ".nii.gz",
             command=sys.argv,

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from hks_jax.cli.arguments import parse_boundary
 from hks_jax.cli.boundary import NATURAL, recorded_boundary, unreached_sides
 from hks_jax.cli.explore import About
-from hks_jax.cli.inputs import add_interpolation_argument, add_json_argument
+from hks_jax.cli.inputs import add_interpolation_argument, add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
 from hks_jax.fem.boundary import BoundarySpec
@@ -124,6 +124,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--optimiser", choices=OPTIMISERS, default="gauss-newton", help="default gauss-newton")
     add("--checkpoint", type=Path, metavar="FILE", help="written after each step; if it is there, go on from it")
     add("--dtype", choices=("float32", "float64"), default="float64", help="precision (default float64)")
+    add_view_argument(parser)
     add_json_argument(parser)
     return parser
 
@@ -276,6 +277,7 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
 def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress: Progress) -> list[Path]:
     """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json; return their paths."""
     from hks_jax.cli.outputs import write_report
+    from hks_jax.cli.picture import placed
     from hks_jax.plot import fit_panels, save_figure
 
     volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors))
@@ -292,7 +294,8 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
         extra = {"times": target.times, **{name: np.asarray(array) for name, array in history.items()}}
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
         if volume.dimension == 2:
-            save_figure(fit_panels(fit, target.values, target.times), folder / "fit.png")
+            orientation = placed(volume, [slice(0, n) for n in volume.shape], args.view)
+            save_figure(fit_panels(fit, target.values, target.times, orientation=orientation), folder / "fit.png")
         write_report(folder / "report.json", report, progress, sys.argv)
         names = sorted(file.name for file in folder.iterdir())
     return [args.output / name for name in names]

@@ -14,6 +14,7 @@ from hks_jax.cli.inputs import (
     add_eigenpair_arguments,
     add_json_argument,
     add_tensor_arguments,
+    add_view_argument,
     read_volume,
     require_metric,
 )
@@ -68,6 +69,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
     )
     add_signature_arguments(parser)
+    add_view_argument(parser)
     add(
         "--save-pairs",
         action="store_true",
@@ -166,7 +168,7 @@ def run(args: argparse.Namespace) -> None:
                     )
             result = signature_of(volume, field, pairs, settings, progress)
             flat = volume.dimension == 2
-            draw_to = partial(draw, result) if flat else partial(draw_volume, result, through=args.through)
+            draw_to = partial(draw if flat else partial(draw_volume, through=args.through), result, view=args.view)
         files = write_outputs(args.output, result, progress, draw=draw_to, image=image, command=sys.argv)
     show_files(files, args.quiet, args.json)
 

@@ -81,6 +81,17 @@ def add_eigenpair_arguments(parser: argparse.ArgumentParser, unless_given: str, 
     add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
 
 
+def add_view_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that says which side of a picture is left."""
+    parser.add_argument(
+        "--view",
+        choices=("neurological", "radiological"),
+        default="neurological",
+        help="of pictures of a volume that lies in space: neurological, left on the left (default), or radiological, "
+        "left on the right. Front and head are on top or on the right, however the voxels are stored",
+    )
+
+
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """Add the argument that asks for a machine-readable summary."""
     parser.add_argument("--json", action="store_true", help="print a summary as JSON, not the names of the files")

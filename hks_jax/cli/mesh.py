@@ -33,6 +33,7 @@ _OF_GRIDS = {
     "bvec_frame": None,
     "b_max": None,
     "through": None,
+    "view": "neurological",
     "save_pairs": False,
     "components": "raise",
     "method": "spectral",

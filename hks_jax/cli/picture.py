@@ -12,8 +12,9 @@ from hks_jax.cli.job import Result
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io.volume import TensorVolume
-from hks_jax.plot import middle_node, new_figure, number_text, save_figure, scalar_image, volume_panels
+from hks_jax.plot import Orientation, new_figure, number_text, save_figure, scalar_image, volume_panels
 from hks_jax.plot.images import colour_range
+from hks_jax.plot.orientation import View
 
 SPAN = (0.002, 0.998)
 """The quantiles, away from the boundary, that the colours span."""
@@ -35,6 +36,7 @@ def draw(
     titles: Sequence[str] | None = None,
     first: tuple[str, Float[np.ndarray, "*shape"]] | None = None,
     title: str = "",
+    view: View = "neurological",
 ) -> None:
     """Draw the signature of a slice, one image per time with its own colours.
 
@@ -47,6 +49,7 @@ def draw(
         titles: one per time; None: “t = …”.
         first: a title and a scalar (*shape,), drawn before the signature in grey.
         title: of the whole picture.
+        view: what is on the left, see `placed`.
     """
     values, inside, volume = result.values, np.isfinite(result.values[0]), result.volume
     assert isinstance(volume, TensorVolume)
@@ -57,12 +60,11 @@ def draw(
     if first is not None:
         titles, values = [first[0], *titles], np.concatenate([first[1][None], values])
     grid, box = cropped(volume, inside)
-    values, inside, spacing = values[:, *box], inside[box], grid.spacing
+    values, inside, orientation = values[:, *box], inside[box], placed(volume, box, view)
 
     rows = math.ceil(len(values) / 4)
     columns = math.ceil(len(values) / rows)
-    aspect = min(max(inside.shape[1] * spacing[1] / (inside.shape[0] * spacing[0]), 0.3), 3.0)
-    figure = new_figure(columns * 3.3, rows * (2.4 * aspect + 0.4) + 0.4 * bool(title))
+    figure = new_figure(columns * 3.3, rows * (2.4 * proportion(grid, orientation) + 0.4) + 0.4 * bool(title))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     deep, span = _coloured(result, inside)
     for i, (ax, image, text) in enumerate(zip(panels, values, titles, strict=False)):
@@ -73,7 +75,8 @@ def draw(
         constant = high - low <= 2e-6 * abs(high)  # the colours of rounding errors would say nothing
         vmin, vmax = (None, None) if constant else (low, high)
         image = np.where(inside, image, np.nan)
-        scalar_image(ax, image, grid, cmap="gray" if grey else _colours(result), vmin=vmin, vmax=vmax)
+        colours = "gray" if grey else _colours(result)
+        scalar_image(ax, image, grid, cmap=colours, vmin=vmin, vmax=vmax, orientation=orientation)
         ax.set_title(text, fontsize="medium")
         ax.set_axis_off()
     for ax in panels[len(values) :]:
@@ -83,28 +86,32 @@ def draw(
     save_figure(figure, path)
 
 
-def draw_volume(result: Result, path: Path, through: tuple[int, int, int] | None = None) -> None:
+def draw_volume(
+    result: Result, path: Path, through: tuple[int, int, int] | None = None, view: View = "neurological"
+) -> None:
     """Draw the signature of a volume: for each time, with its own colours, three orthogonal slices.
 
     Args:
         result: what to draw.
         path: the picture's file.
         through: the voxel that the slices run through, or the nearest one in the domain; None: one in the middle.
+        view: what is on the left, see `placed`.
     """
     inside, volume = np.isfinite(result.values[0]), result.volume
     assert isinstance(volume, TensorVolume)
-    node = middle_node(inside) if through is None else _nearest(inside, through)
+    node = None if through is None else _nearest(inside, through)
     grid, box = cropped(volume, inside)
     deep, span = _coloured(result, inside)
     volume_panels(
         result.values[:, *box],
         result.times,
         grid,
-        node=[i - part.start for i, part in zip(node, box, strict=True)],
+        node=node and [i - part.start for i, part in zip(node, box, strict=True)],
         limits=[colour_range(values[deep], span, centre=_centre(result)) for values in result.values],
         cmap=_colours(result),
         length_unit="mm" if volume.affine is not None else "",
         label=LABELS[result.report["settings"]["normalisation"]],
+        orientation=placed(volume, box, view),
         path=path,
     )
 
@@ -140,6 +147,34 @@ def cropped(volume: TensorVolume, inside: Bool[np.ndarray, "*shape"]) -> tuple[G
     box = bounding_box(inside)
     origin = [o + h * part.start for o, h, part in zip(volume.origin, volume.spacing, box, strict=True)]
     return Grid(inside[box].shape, volume.spacing, origin), box
+
+
+def placed(volume: TensorVolume, box: Sequence[slice], view: View) -> Orientation | None:
+    """Return how a box of a volume or slice lies in space; None where that is not known.
+
+    Args:
+        volume: what the box is cut out of.
+        box: the box, a slice along each axis.
+        view: whether left is on the left (``"neurological"``) or on the right (``"radiological"``).
+    """
+    thin = volume.thin_axis if volume.dimension == 2 else None
+    return None if volume.affine is None else orientation_of(volume.affine, thin, box, view)
+
+
+def orientation_of(affine: Float[np.ndarray, "4 4"], thin: int | None, box: Sequence[slice], view: View) -> Orientation:
+    """Return how a box lies in space that is cut out of a volume, or of the slice of it across the axis `thin`."""
+    first = np.zeros(4)
+    first[[a for a in range(3) if a != thin]] = [part.start for part in box]
+    affine = affine.copy()
+    affine[:, 3] += affine @ first
+    return Orientation.of(affine, thin, view=view)
+
+
+def proportion(grid: Grid, orientation: Orientation | None) -> float:
+    """Return the height of a slice's picture relative to its width, within bounds that suit a figure."""
+    shown = grid if orientation is None else orientation.grid(grid)
+    width, height = np.multiply(shown.shape, shown.spacing)
+    return float(np.clip(height / width, 0.3, 3.0))
 
 
 def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[slice, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
-from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.inputs import add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
 from hks_jax.npz import load_npz
@@ -39,12 +39,17 @@ class Saved(NamedTuple):
         times: (n_times,), or None for a result without.
         grid: the grid, with the mask.
         eigenvalues: (k,), where they were saved.
+        affine: (4, 4), from the nodes' indices to space, where that was saved; of a slice that of a volume one voxel
+            thick.
+        slice_axis: the axis of the volume that a slice cuts; None for a volume.
     """
 
     values: Float[np.ndarray, "n_times *shape"]
     times: Float[np.ndarray, " n_times"] | None
     grid: Grid
     eigenvalues: Float[np.ndarray, " k"] | None
+    affine: Float[np.ndarray, "4 4"] | None
+    slice_axis: int | None
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -67,7 +72,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="some of the saved times, or auto:N for N of them, evenly spaced (default: all, or 12 of more)",
     )
     add("--slice", type=parse_slice, metavar="AXIS=N", help="of a volume, such as z=14 (default: the middle along z)")
-    add("--points", nargs="+", type=_point, metavar="X,Y", help="curves at these coordinates, not images")
+    add(
+        "--points",
+        nargs="+",
+        type=_point,
+        metavar="X,Y",
+        help="curves at these coordinates, as the images show them, not images",
+    )
     add(
         "--range",
         default="own",
@@ -81,6 +92,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--unit", default="", help="the unit of t")
     add("--title", default="", help="a title for the whole picture")
     add("--dpi", type=float, default=150, help="pixels per inch (default 150)")
+    add_view_argument(parser)
     add_json_argument(parser)
     return parser
 
@@ -157,7 +169,8 @@ def read_saved(path: Path, name: str | None = None) -> Saved:
     shape = values.shape[values.ndim - spacing.size :]
     grid = Grid(shape, spacing.tolist(), arrays["origin"].tolist(), arrays.get("mask"), "all")
     values = values.reshape(-1, *grid.shape).astype(np.float64)
-    return Saved(values, times, grid, arrays.get("eigenvalues"))
+    cut = None if grid.dimension == 3 else int(arrays.get("slice_axis", 2))
+    return Saved(values, times, grid, arrays.get("eigenvalues"), arrays.get("affine"), cut)
 
 
 def _choose_times(saved: Saved, args: argparse.Namespace) -> np.ndarray:
@@ -185,13 +198,13 @@ def _choose_times(saved: Saved, args: argparse.Namespace) -> np.ndarray:
 
 
 def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] | None) -> Any:
-    from hks_jax.cli.picture import bounding_box
+    from hks_jax.cli.picture import bounding_box, orientation_of
     from hks_jax.plot import hks_panels, middle_node
 
-    values, grid, title = saved.values, saved.grid, args.title
+    values, grid, title, thin = saved.values, saved.grid, args.title, saved.slice_axis
     if grid.dimension == 3:
         axis, index = args.slice or ("z", middle_node(grid.inside)[2])
-        a = "xyz".index(axis)
+        a = thin = "xyz".index(axis)
         if index >= grid.shape[a]:
             raise ValueError(f"--slice: got {axis}={index}; expected {axis}=0 … {axis}={grid.shape[a] - 1}")
         values, inside = values.take(index, 1 + a), grid.inside.take(index, a)
@@ -220,14 +233,19 @@ def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] 
         vmax=vmax,
         quantiles=args.quantiles,
         suptitle=title,
+        orientation=None if saved.affine is None else orientation_of(saved.affine, thin, box, args.view),
     )
 
 
 def _curves(saved: Saved, args: argparse.Namespace) -> Any:
-    from hks_jax.plot import hks_curves, new_figure
+    from hks_jax.plot import Orientation, hks_curves, new_figure
 
     assert saved.times is not None
-    d, limit = saved.grid.dimension, None
+    values, grid = saved.values, saved.grid
+    if saved.affine is not None:  # points have the coordinates that the images show
+        orientation = Orientation.of(saved.affine, saved.slice_axis)
+        values, grid = orientation.array(values), orientation.grid(grid)
+    d, limit = grid.dimension, None
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates each")
     if saved.eigenvalues is not None:
@@ -235,9 +253,9 @@ def _curves(saved: Saved, args: argparse.Namespace) -> Any:
     figure = new_figure(5.4, 4.0)
     hks_curves(
         figure.subplots(),
-        saved.values,
+        values,
         saved.times,
-        saved.grid,
+        grid,
         args.points,
         limit=limit,
         scaled=args.scaled,

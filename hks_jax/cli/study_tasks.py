@@ -114,7 +114,8 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
         own = np.array(scaled) / float(positive_range(pairs)[0])
         settings = replace(settings, times=Times(tuple(own.tolist()), 0))
     result = signature_of(volume, field, pairs, settings, progress)
-    drawn = partial(draw if volume.dimension == 2 else draw_volume, result)
+    assert subject.arguments is not None
+    drawn = partial(draw if volume.dimension == 2 else draw_volume, result, view=subject.arguments.view)
     with progress.stage("writing"):
         study.write_signature(subject, fingerprint, result, progress.warnings, drawn, scaled)
 

@@ -18,6 +18,7 @@ from hks_jax.plot.images import hks_panels as hks_panels
 from hks_jax.plot.images import scalar_image as scalar_image
 from hks_jax.plot.isosurfaces import isosurfaces as isosurfaces
 from hks_jax.plot.lines import integral_lines as integral_lines
+from hks_jax.plot.orientation import Orientation as Orientation
 from hks_jax.plot.rows import influence_map as influence_map
 from hks_jax.plot.rows import time_rows as time_rows
 from hks_jax.plot.sensitivity import sensitivity as sensitivity

@@ -10,9 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.ellipses import ellipses
 from hks_jax.plot.figure import SMALL, cell_extent, new_figure, number_text, require_plane
 from hks_jax.plot.images import scalar_image
+from hks_jax.plot.orientation import Orientation
 
 if TYPE_CHECKING:  # slow to import
     from hks_jax.inverse.metric_fit import MetricFit, Step
@@ -28,6 +30,7 @@ def fit_panels(
     *,
     max_times: int = 3,
     title: str | None = None,
+    orientation: Orientation | None = None,
 ) -> Figure:
     """Return a figure of a fit in 2D: signatures, the metric, and the way there.
 
@@ -41,6 +44,7 @@ def fit_panels(
         times: (n_times,), or energies; None: those of the fit.
         max_times: the most rows.
         title: the figure's title.
+        orientation: how the grid lies in space, as for `scalar_image`.
 
     Raises:
         ValueError: a 3D grid; a target or a signature that is not one image per time; no times.
@@ -60,6 +64,10 @@ def fit_panels(
             raise ValueError(
                 f"{name}: got shape {array.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}"
             )
+    field = fit.field
+    if orientation is not None:
+        wanted, fitted, grid = orientation.array(wanted), orientation.array(fitted), orientation.grid(grid)
+        field = TensorField(grid, orientation.tensors(field.tensors), field.interpolation)
     with np.errstate(divide="ignore", invalid="ignore"):
         difference = np.where(wanted != 0, (fitted - wanted) / np.abs(wanted), np.nan)
 
@@ -86,12 +94,17 @@ def fit_panels(
             scalar_image(ax, values, grid, vmin=low, vmax=high)
         scalar_image(third, difference[index], grid, cmap="RdBu_r", vmin=-limit, vmax=limit)
         first.set_ylabel(f"${symbol}$ = {number_text(t[index])}")
+        if orientation is not None:
+            for ax in (first, second, third):
+                orientation.letter(ax)
         for ax, text in ((first, "target"), (second, "fitted"), (third, "fitted / target − 1")):
             ax.tick_params(labelleft=ax is first, labelbottom=row == len(rows) - 1)
             if row == 0:
                 ax.set_title(text, fontsize="medium")
     ax = figure.add_subplot(last[0])
-    ellipses(ax, fit.field)
+    ellipses(ax, field)
+    if orientation is not None:
+        orientation.letter(ax)
     ax.set_title("fitted metric, unit circles", fontsize="medium")
     _draw_loss(figure.add_subplot(last[1]), fit)
     if title:

@@ -15,6 +15,7 @@ from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import cell_extent, colour_bar, frame, new_figure, number_text, require_plane, save_figure
+from hks_jax.plot.orientation import Orientation
 
 
 def scalar_image(
@@ -30,6 +31,7 @@ def scalar_image(
     least_range: float = 1e-6,
     colorbar: bool = True,
     label: str = "",
+    orientation: Orientation | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw node values as an image: array axis 0 horizontal, one cell per node, transparent outside the mask.
@@ -49,6 +51,8 @@ def scalar_image(
             A constant then looks constant, whatever its rounding or discretisation errors are.
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
+        orientation: how the grid lies in space. The picture is then turned, has coordinates of space, and letters at
+            its edges.
         **kwargs: passed to `Axes.imshow`.
 
     Raises:
@@ -56,6 +60,8 @@ def scalar_image(
     """
     require_plane("grid", grid)
     array = masked("values", values, grid)
+    if orientation is not None:
+        array, grid = orientation.array(array), orientation.grid(grid)
     low, high = colour_range(array.compressed(), quantiles, least_range, centre)
     low, high = low if vmin is None else vmin, high if vmax is None else vmax
     image = ax.imshow(
@@ -68,6 +74,8 @@ def scalar_image(
         **{"interpolation": "nearest", **kwargs},
     )
     frame(ax, grid)
+    if orientation is not None:
+        orientation.letter(ax)
     if colorbar:
         colour_bar(ax, image, label, extend=beyond(array, low, high))
     return image
@@ -89,6 +97,7 @@ def hks_panels(
     quantiles: tuple[float, float] = (0.0, 1.0),
     label: str = "",
     suptitle: str = "",
+    orientation: Orientation | None = None,
 ) -> Figure:
     """Return a figure with one image of the HKS per time, each with its own colour map unless `shared_range`.
 
@@ -107,6 +116,7 @@ def hks_panels(
         quantiles: as for `scalar_image`.
         label: the colour bars' label.
         suptitle: the figure's title.
+        orientation: as for `scalar_image`.
 
     Raises:
         ValueError: shapes that do not agree; no time at all.
@@ -120,14 +130,14 @@ def hks_panels(
         vmin, vmax = low if vmin is None else vmin, high if vmax is None else vmax
 
     rows, columns = _layout(t.size)
-    fig = _panel_figure(grid, rows, columns, bool(suptitle))
+    fig = _panel_figure(grid if orientation is None else orientation.grid(grid), rows, columns, bool(suptitle))
     panels = fig.subplots(rows, columns, squeeze=False)
     for index, ax in enumerate(panels.flat):
         if index >= t.size:
             ax.remove()
             continue
         colours: dict[str, Any] = {"cmap": cmap, "vmin": vmin, "vmax": vmax, "centre": centre, "quantiles": quantiles}
-        scalar_image(ax, images[index], grid, label=label, **colours)
+        scalar_image(ax, images[index], grid, label=label, orientation=orientation, **colours)
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
     if suptitle:

@@ -16,6 +16,7 @@ from matplotlib.image import AxesImage
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, new_figure, save_figure
 from hks_jax.plot.images import beyond, colour_range, masked, panel_titles, scalar_image
+from hks_jax.plot.orientation import Orientation
 
 AXES = "xyz"
 NORMALS = (2, 1, 0)
@@ -49,6 +50,7 @@ def orthogonal_slices(
     vmin: float | None = None,
     vmax: float | None = None,
     quantiles: tuple[float, float] = (0.0, 1.0),
+    orientation: Orientation | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the slices xy, xz and yz of a volume through a node, in the same colours, and return the last image.
@@ -64,6 +66,8 @@ def orthogonal_slices(
         vmax: value of the last colour; None: from `quantiles`.
         quantiles: the quantiles of the whole volume that take the first and the last colour where vmin and vmax do
             not say.
+        orientation: how the grid lies in space. The slices are then turned, have coordinates of space, and letters at
+            their edges.
         **kwargs: passed to `Axes.imshow`.
 
     Raises:
@@ -72,17 +76,31 @@ def orthogonal_slices(
     """
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
-    array = _volume(values, grid)
-    chosen = _checked_node(node, array, grid)
+    array, grid, node = _turned(_volume(values, grid), grid, node, orientation)
     low, high = colour_range(array.compressed(), quantiles)
     low, high = low if vmin is None else vmin, high if vmax is None else vmax
+    colours: dict[str, Any] = {"cmap": cmap, "vmin": low, "vmax": high}
+    return _slices(axes, array, grid, node, orientation, cross=cross, **colours, **kwargs)
+
+
+def _slices(
+    axes: Sequence[Axes] | np.ndarray,
+    array: np.ma.MaskedArray,
+    grid: Grid,
+    chosen: tuple[int, int, int],
+    orientation: Orientation | None,
+    *,
+    cross: bool = True,
+    **kwargs: Any,
+) -> AxesImage:
+    """Draw the slices of values that are turned already, and return the last image."""
     for ax, normal in zip(axes, NORMALS, strict=True):
         first, second = keep = [a for a in range(3) if a != normal]
         shape, spacing, origin = (np.take(of, keep).tolist() for of in (grid.shape, grid.spacing, grid.origin))
         slab = np.take(array, chosen[normal], axis=normal)
-        image = scalar_image(
-            ax, slab, Grid(shape, spacing, origin), cmap=cmap, vmin=low, vmax=high, colorbar=False, **kwargs
-        )
+        image = scalar_image(ax, slab, Grid(shape, spacing, origin), colorbar=False, **kwargs)
+        if orientation is not None:
+            orientation.letter(ax, (first, second))
         if cross:
             style: dict[str, Any] = {"color": "0.5", "linewidth": 0.6, "linestyle": (0, (4, 3))}
             ax.axvline(grid.axes[first][chosen[first]], **style)
@@ -105,6 +123,7 @@ def volume_panels(
     quantiles: tuple[float, float] = (0.0, 1.0),
     label: str = "",
     suptitle: str = "",
+    orientation: Orientation | None = None,
 ) -> Figure:
     """Return a figure with one column per time: three orthogonal slices of the HKS, and their colour bar.
 
@@ -122,6 +141,7 @@ def volume_panels(
         quantiles: as for `orthogonal_slices`.
         label: the colour bars' label.
         suptitle: the figure's title.
+        orientation: as for `orthogonal_slices`.
 
     Raises:
         ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
@@ -133,11 +153,13 @@ def volume_panels(
         limits = [colour_range(volume.compressed(), quantiles) for volume in volumes]
     elif len(limits) != t.size:
         raise ValueError(f"limits: got {len(limits)}; expected {t.size}, one pair per time")
-    chosen = _checked_node(node, volumes[0], grid)
+    _, shown, chosen = _turned(volumes[0], grid, node, orientation)
+    if orientation is not None:
+        volumes = [orientation.array(volume) for volume in volumes]
 
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
-    heights = _heights(grid)
+    heights = _heights(shown)
     fig = new_figure(
         columns * (_COLUMN + 0.2) + 0.6, rows * (sum(heights) + 1.35 + 0.15 * bool(label)) + 0.3 * bool(suptitle)
     )
@@ -151,11 +173,10 @@ def volume_panels(
                     ax.remove()
                 continue
             low, high = limits[index]
-            image = orthogonal_slices(
-                panels[:3, column], volumes[index], grid, node=chosen, cmap=cmap, vmin=low, vmax=high
-            )
+            colours: dict[str, Any] = {"cmap": cmap, "vmin": low, "vmax": high}
+            image = _slices(panels[:3, column], volumes[index], shown, chosen, orientation, **colours)
             panels[0, column].set_title(titles[index], fontsize="medium")
-            _label_slices(panels[:3, column], grid, chosen, length_unit, leftmost=column == 0)
+            _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
             extend = beyond(volumes[index], low, high)
             colour_bar_in(panels[3, column], image, label, orientation="horizontal", extend=extend)
     if suptitle:
@@ -197,6 +218,18 @@ def require_volume(grid: Grid) -> None:
         raise ValueError(
             f"grid: got shape {grid.shape}; expected a grid of three dimensions. Use hks_panels in the plane"
         )
+
+
+def _turned(
+    array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
+) -> tuple[np.ma.MaskedArray, Grid, tuple[int, int, int]]:
+    """Return values, grid and node as the picture has them, the node being one with a value."""
+    if orientation is None:
+        return array, grid, _checked_node(node, array, grid)
+    chosen = None if node is None else orientation.node(_checked_node(node, array, grid), grid.shape)
+    array, grid = orientation.array(array), orientation.grid(grid)
+    # One in the middle is sought in the picture: of two that are as near, the order of storage chooses none.
+    return array, grid, _checked_node(chosen, array, grid)
 
 
 def _checked_node(node: Sequence[int] | None, array: np.ma.MaskedArray, grid: Grid) -> tuple[int, int, int]:

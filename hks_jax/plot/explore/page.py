@@ -20,13 +20,12 @@ from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
+from hks_jax.plot.orientation import LETTERS
 from hks_jax.signatures.heat import Normalisation
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
 """The page's scripts, in the order in which they need one another."""
 COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_r", "grey": "gray"}
-LETTERS = ("LR", "PA", "IS")
-"""What lies at the low and the high end of the world's axes."""
 LIMIT = 256 * 1024**2
 """Bytes of numbers in a page at most. They are a text a third longer, and browsers hold no text of over 512 MiB."""
 
