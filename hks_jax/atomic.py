@@ -3,7 +3,7 @@
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -26,11 +26,16 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Path]] = tuple) -> Iterator[Path]:
     """Yield a temporary folder beside `path`; move the files written there into `path` at the end.
 
     Files of the same names in `path` are replaced, each in one step; others stay. If the body raises, everything it
     wrote is removed and `path` stays as it was, or does not come into being.
+
+    Args:
+        path: the folder.
+        stale: returns the files that belong to what is replaced. They are removed before the new ones are moved, so
+            that never two results are mixed.
 
     Raises:
         NotADirectoryError: `path` is a file.
@@ -46,6 +51,8 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.mkdir()
         yield temporary
         target.mkdir(exist_ok=True)
+        for file in stale():
+            file.unlink(missing_ok=True)
         for file in sorted(temporary.iterdir()):
             os.replace(file, target / file.name)
         done = True

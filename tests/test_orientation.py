@@ -157,13 +157,13 @@ def brains(tmp_path_factory):
     ):
         array, affine = stored(tensors(), RAS, order, turned)
         volume = TensorVolume(array, tuple(np.linalg.norm(affine[:3, :3], axis=0)), (0.0,) * 3, affine=affine)
-        found[name] = save_tensors(folder / f"{name}.nii.gz", volume), array, affine, order
+        found[name] = save_tensors(folder / f"{name}.nii.gz", volume), order
     return found
 
 
 def test_a_brain_stored_in_another_order_is_the_same_picture(brains, tmp_path):
     pictures = {}
-    for name, (path, _, affine, order) in brains.items():
+    for name, (path, order) in brains.items():
         options = ["--metric", "inverse", "-k", "20", "--times", "3000", "20000", "--frame", "voxel", "-q"]
         assert main(["hks", str(path), "-o", str(tmp_path / name), *options]) == 0
         pictures[name] = [pixels(tmp_path / name / "hks.png")]
@@ -195,7 +195,9 @@ def test_without_a_place_in_space_nothing_is_turned(tmp_path):
     path = save(tmp_path / "hks.npz", values, flat, name="hks", extra={"times": [1.0]})
     for view in ("neurological", "radiological"):
         assert main(["plot", str(path), "-o", str(tmp_path / f"{view}.png"), "--view", view, "-q"]) == 0
-    save_figure(hks_panels(values, [1.0], hj.Grid((6, 5), (0.5, 1.0), (1.0, 2.0)), cmap="viridis"), tmp_path / "own.png")
+    save_figure(
+        hks_panels(values, [1.0], hj.Grid((6, 5), (0.5, 1.0), (1.0, 2.0)), cmap="viridis"), tmp_path / "own.png"
+    )
     own = pixels(tmp_path / "own.png")
     for view in ("neurological", "radiological"):
         np.testing.assert_array_equal(pixels(tmp_path / f"{view}.png"), own)

@@ -1,6 +1,7 @@
 """Studies: regions' statistics, six images of components, and many subjects that are computed, killed and resumed."""
 
 import argparse
+import contextlib
 import csv
 import importlib.util
 import io
@@ -19,6 +20,7 @@ import pytest
 from annotations import unchecked
 
 import hks_jax as hj
+from hks_jax.claim import claim
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.job import Settings
 from hks_jax.cli.study import Study
@@ -218,7 +220,7 @@ LAMBDA1 = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "vo
 
 
 def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
     assert main(command(study, "whole", *LAMBDA1, "-q")) == 0
     write, count = Study.write_signature, []
 
@@ -267,7 +269,7 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
 
 
 def test_a_study_is_a_bids_derivative(study, monkeypatch):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
     assert main([*command(study, "out", "--times", "3e3", "--only", "sub-01"), "-q"]) == 0
     out = study / "out"
     about = json.loads((out / "dataset_description.json").read_text())
@@ -291,7 +293,7 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
 
 
 def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
     lines = (study / "subjects.tsv").read_text().splitlines()
     bad = ["04\tabsent.nii.gz\tx", "05\tt1.nii.gz\tx\tz=99", "06\tt1.nii.gz\tx\tz=1\tmoved.nii.gz"]
     (study / "subjects.tsv").write_text("\n".join([lines[0] + "\tslice\tatlas", *bad, lines[3]]) + "\n")
@@ -460,6 +462,69 @@ def test_on_a_terminal_the_bar_stays_in_its_line():
     assert "\r[....................] 0 of 2: sub-01: eigenpairs, 3 of 8 pairs\x1b[K" in text
 
 
+def test_processes_share_a_study(study, capsys):
+    """Two at once: each subject is computed by one of them, and both end with the whole study, as one alone does."""
+    given = command(study, "shared", *LAMBDA1)
+    start = [sys.executable, "-m", "hks_jax", *given]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    both = [subprocess.Popen(start, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    printed = [process.communicate(timeout=300)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], printed
+    begun = [name for text in printed for name in re.findall(r"\d of \d(?:, [^:]*)?: (sub-0\d)$", text, re.M)]
+    assert sorted(begun) == ["sub-01", "sub-02", "sub-03"], printed
+    assert all("3 of 3 subjects are done" in text for text in printed)
+    assert main(command(study, "alone", *LAMBDA1, "-q")) == 0
+    assert contents(study / "shared") == contents(study / "alone")
+
+
+def test_a_process_waits_for_what_another_computes(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    other = study / "out" / "sub-02" / ".attempt"
+    with contextlib.ExitStack() as stack:
+        assert stack.enter_context(claim(other))
+
+        def end_of_the_other(seconds):
+            stack.close()  # it did not come to an end: the subject is ours
+
+        monkeypatch.setattr("hks_jax.cli.study_tasks.time.sleep", end_of_the_other)
+        assert main(command(study, "out", *LAMBDA1)) == 0
+    printed = capsys.readouterr().err
+    assert printed.index(": sub-03") < printed.index("waiting for other processes, which compute 1 of the subjects")
+    assert printed.index("waiting for") < printed.index(": sub-02")
+    assert not other.exists()
+
+
+def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    write = Study.write_signature
+
+    def write_and_lose(self, *rest):
+        write(self, *rest)
+        record = json.loads((self.folder / "study.json").read_text())
+        (self.folder / "study.json").write_text(json.dumps({**record, "times": [7.0]}))
+
+    monkeypatch.setattr(Study, "write_signature", write_and_lose)
+    assert main(command(study, "out", *LAMBDA1)) == 2
+    printed = capsys.readouterr().err
+    assert "another process has given the study" in printed
+    assert "sub-02" not in printed
+
+
+def test_a_claim_is_free_again_when_its_process_dies(tmp_path):
+    file = tmp_path / "deep" / "claim"
+    code = f"from hks_jax.claim import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
+        assert process.stdout.readline() == "mine\n"
+        with claim(file) as ours:
+            assert not ours
+        process.kill()
+    assert file.exists()
+    with claim(file) as ours, claim(file) as again:
+        assert (ours, again) == (True, False)
+    assert not file.parent.exists()
+
+
 @pytest.mark.slow
 def test_a_killed_study_is_resumed_with_the_same_result(study):
     """Three volumes in processes of their own, killed once a subject is there; the times are automatic."""
@@ -523,7 +588,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
 
 @pytest.mark.slow
 def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit(study, monkeypatch):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
     other = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume", "--only", "02", "-q")
     assert main(command(study, "kept", "--times", "3e3", "--only", "02", "--save-pairs", "-q")) == 0
     assert main(command(study, "direct", *other)) == 0
@@ -585,3 +650,53 @@ def test_pairs_of_another_pencil_are_refused(tmp_path):
         pairs_of("p.npz", {name: a for name, a in fewer.items() if name != "part"}, pencil(plane))
     with pytest.raises(ValueError, match=r"ends in \.npz"):
         hj.io.save_pairs(tmp_path / "p.npy", pairs)
+
+
+def test_a_folder_that_is_used_again_holds_one_result(tmp_path, monkeypatch, capsys):
+    """What was made of an earlier signature goes with it; eigenpairs stay where they are those of the new one."""
+    monkeypatch.setattr("hks_jax.cli.picture.draw", lambda result, path, **_: path.write_text("picture"))
+    save_tensors(tmp_path / "one.nii.gz", volume())
+    save_tensors(tmp_path / "two.nii.gz", volume(1.5))
+    np.savez(tmp_path / "three.npz", tensors=1e3 * tensors()[:, :, 1, :2, :2])
+    out, options = tmp_path / "out", ["--times", "1e4", "-k", "8", "--boundary", "neumann"]
+    of_slice = ["--metric", "inverse", "--slice", "z=1"]
+
+    def run(source, *more):
+        assert main(["hks", str(tmp_path / source), "-o", str(out), *options, *more]) == 0
+        return sorted(path.name for path in out.iterdir())
+
+    own = ["hks.json", "hks.nii.gz", "hks.npz", "hks.png", "report.json"]
+    assert run("one.nii.gz", *of_slice, "--save-pairs") == sorted([*own, "pairs.npz"])
+    np.save(tmp_path / "labels.npy", np.ones(SHAPE[:2], int))
+    for name in ("explore.html", "regions.json", "mine.txt"):
+        (out / name).write_text("of the first")
+    assert main(["stats", str(out), "--atlas", str(tmp_path / "labels.npy"), "-q"]) == 0
+    first = np.load(out / "pairs.npz")["eigenvalues"]
+    capsys.readouterr()
+    # The same eigenpairs, at another time: they stay.
+    assert main(["hks", str(out / "pairs.npz"), "-o", str(out), "--times", "3e4"]) == 0
+    assert "removed explore.html, regions.json, regions.tsv of an earlier signature" in capsys.readouterr().err
+    assert run("one.nii.gz", *of_slice) == sorted([*own, "mine.txt", "pairs.npz"])
+    # Other tensors: they go, or are replaced.
+    assert run("two.nii.gz", *of_slice) == sorted([*own, "mine.txt"])
+    assert "removed pairs.npz of an earlier signature" in capsys.readouterr().err
+    run("one.nii.gz", *of_slice, "--save-pairs")
+    run("two.nii.gz", *of_slice, "--save-pairs")
+    np.testing.assert_allclose(np.load(out / "pairs.npz")["eigenvalues"], first * 1.5, rtol=1e-5, atol=1e-12)
+    # Of a file without a place for images: no image of the one before.
+    assert run("three.npz", "--metric", "tensor") == ["hks.npz", "hks.png", "mine.txt", "report.json"]
+
+
+def test_pairs_that_were_kept_do_not_stand_beside_an_older_signature(tmp_path, monkeypatch):
+    """What comes after the eigenpairs fails: the folder has them alone, and what is not ours."""
+    save_tensors(tmp_path / "one.nii.gz", volume())
+    save_tensors(tmp_path / "two.nii.gz", volume(1.5))
+    options = ["--times", "1e4", "-k", "8", "--boundary", "neumann", "--metric", "inverse", "--slice", "z=1", "-q"]
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "regions.tsv").write_text("not made of a signature")
+    monkeypatch.setattr("hks_jax.cli.picture.draw", lambda result, path, **_: path.write_text("picture"))
+    assert main(["hks", str(tmp_path / "one.nii.gz"), "-o", str(out), *options]) == 0
+    monkeypatch.setattr("hks_jax.cli.job.signature_of", None)
+    assert main(["hks", str(tmp_path / "two.nii.gz"), "-o", str(out), *options, "--save-pairs"]) == 1
+    assert sorted(path.name for path in out.iterdir()) == ["pairs.npz", "regions.tsv"]

@@ -17,6 +17,7 @@ from hks_jax.cli.inputs import (
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume, atomic_folder, save
+from hks_jax.io.save import SUFFIXES
 
 if TYPE_CHECKING:
     from hks_jax.plot.orientation import View
@@ -103,7 +104,8 @@ def run(args: argparse.Namespace) -> None:
             },
         }
         volume = volume.with_mask(field.grid.mask)
-        with progress.stage("writing", str(args.output)), atomic_folder(args.output) as folder:
+        stale = [args.output / f"curvature{suffix}" for suffix in SUFFIXES]
+        with progress.stage("writing", str(args.output)), atomic_folder(args.output, lambda: stale) as folder:
             save(folder / "curvature.npz", curvature, volume, name="curvature")
             if image := image_suffix(args.file):
                 save(folder / f"curvature{image}", curvature, volume, name="curvature")

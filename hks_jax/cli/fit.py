@@ -287,7 +287,8 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
         "stages": [step.stage for step in fit.history],
         "starts": [step.start for step in fit.history],
     }
-    with progress.stage("writing", str(args.output)), atomic_folder(args.output) as folder:
+    stale = [args.output / "fit.png"]
+    with progress.stage("writing", str(args.output)), atomic_folder(args.output, lambda: stale) as folder:
         report = _report(args, fit, target)
         origin = {"command": sys.argv, "settings": report["settings"]}
         save_tensors(folder / "tensors.npz", volume, provenance=origin)

@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> None:
     from hks_jax.cli import mesh as meshes
     from hks_jax.cli import saved_pairs
     from hks_jax.cli.job import compute_on_mesh, compute_pairs, signature_of
-    from hks_jax.cli.outputs import check_folder, show_files, write_outputs
+    from hks_jax.cli.outputs import PAIRS, check_folder, of_earlier, show_files, write_outputs
     from hks_jax.cli.picture import draw, draw_volume
 
     if on_mesh:
@@ -161,11 +161,11 @@ def run(args: argparse.Namespace) -> None:
             if not saved:
                 field, pairs, settings = compute_pairs(volume, settings, progress)
             if args.save_pairs:  # at once: what comes after may fail, or be interrupted
-                with progress.stage("writing", str(args.output / saved_pairs.NAME)):
+                with progress.stage("writing", str(args.output / PAIRS)):
+                    for file in of_earlier(args.output, np.asarray(pairs.eigenvalues), progress):
+                        file.unlink(missing_ok=True)
                     domain = volume.with_mask(field.grid.mask)
-                    saved_pairs.write_pairs(
-                        args.output / saved_pairs.NAME, domain, pairs, settings, image, progress.warnings
-                    )
+                    saved_pairs.write_pairs(args.output / PAIRS, domain, pairs, settings, image, progress.warnings)
             result = signature_of(volume, field, pairs, settings, progress)
             flat = volume.dimension == 2
             draw_to = partial(draw if flat else partial(draw_volume, through=args.through), result, view=args.view)

@@ -5,7 +5,9 @@ import json
 import math
 import os
 import platform
+import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,9 @@ from hks_jax.io.volume import TensorVolume
 
 SIGNATURE = "hks"
 """How the names of a signature's files begin."""
+REPORT = "report.json"
+PAIRS = "pairs.npz"
+"""The file of eigenpairs that were kept."""
 
 
 def check_folder(path: Path) -> None:
@@ -40,15 +45,41 @@ def signature_file(result: Path) -> Path:
     return result / f"{SIGNATURE}.npz" if result.is_dir() else result
 
 
+def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> list[Path]:
+    """Return the files of an earlier signature in a folder and all that was made of it, which a new one takes away.
+
+    Eigenpairs stay where they are those of the new signature, whose eigenvalues are given.
+    """
+    found, own = [], []
+    if signature_file(folder).is_file():  # else what has these names is not ours
+        regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
+        own = [*folder.glob(f"{SIGNATURE}.*"), folder / REPORT]
+        found = [*own, *(folder / name for name in ("explore.html", *regions) if (folder / name).is_file())]
+    if not _are_pairs(folder / PAIRS, eigenvalues):
+        found.append(folder / PAIRS)
+    if derived := [file.name for file in found if file not in own]:
+        progress.note(f"removed {', '.join(derived)} of an earlier signature in {folder}")
+    return found
+
+
+def _are_pairs(path: Path, eigenvalues: np.ndarray) -> bool:
+    """Tell whether a file holds eigenpairs with just these eigenvalues, or is none of ours."""
+    if not zipfile.is_zipfile(path):
+        return True
+    with np.load(path) as arrays:  # of which only the one is read
+        return "eigenvalues" not in arrays or np.array_equal(arrays["eigenvalues"], eigenvalues)
+
+
 def write_outputs(
     folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], image: str, command: list[str]
 ) -> list[Path]:
     """Write hks.npz, hks.png (by `draw`), report.json and, unless its suffix is empty, an image; return their paths."""
-    with progress.stage("writing", str(folder)), atomic_folder(folder) as temporary:
+    stale = partial(of_earlier, folder, result.eigenvalues, progress)
+    with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
         origin = {"command": command, "settings": plain(result.report["settings"]), "times": result.times}
         save_result(temporary / SIGNATURE, result, image, origin)
         draw(temporary / f"{SIGNATURE}.png")
-        write_report(temporary / "report.json", result.report, progress, command)
+        write_report(temporary / REPORT, result.report, progress, command)
         names = sorted(file.name for file in temporary.iterdir())
     return [folder / name for name in names]
 
@@ -92,7 +123,7 @@ def write_report(path: Path, report: dict[str, Any], progress: Progress, command
 def show_files(files: list[Path], quiet: bool, as_json: bool) -> None:
     """Print the files' names, or the report among them as JSON together with the names."""
     if as_json:
-        (report,) = (file for file in files if file.name == "report.json")
+        (report,) = (file for file in files if file.name == REPORT)
         print(
             json.dumps({**json.loads(report.read_text()), "files": [str(file) for file in files]}, ensure_ascii=False)
         )

@@ -21,7 +21,6 @@ from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npz
 
-NAME = "pairs.npz"
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that belong to the pairs."""

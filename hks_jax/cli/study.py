@@ -101,7 +101,7 @@ class Study:
         return _is_done(self.path(subject, f"{REGIONS}.json"), fingerprint, self.path(subject, f"{REGIONS}.tsv"))
 
     def attempt(self, subject: Subject) -> Path:
-        """Return the path of the file that is there while a subject is computed, and after a crash amid it."""
+        """Return the path of the file that a process holds while it computes a subject, and leaves if it dies."""
         return self.folder / subject.folder / ".attempt"
 
     def write_signature(
@@ -160,7 +160,7 @@ class Study:
         sidecar = self.path(subject, f"{MAP}.json")
         sidecar.unlink(missing_ok=True)  # first: what it stands for is complete as long as it is there
         ours = [*sidecar.parent.glob(f"{subject.name}{MAP}.*"), *sidecar.parent.glob(f"{subject.name}{REGIONS}.*")]
-        for path in [*ours, self.picture(subject)]:
+        for path in [*ours, self.picture(subject), sidecar.with_name("explore.html")]:
             path.unlink(missing_ok=True)
         for folder in (sidecar.parent.parent, sidecar.parent, self.picture(subject).parent):
             for left in folder.glob(".*") if folder.is_dir() else ():
@@ -178,6 +178,15 @@ class Study:
         settings = {name: value for name, value in asdict(self.settings).items() if name != "times"}
         times: dict[str, Any] = plain({"times": self.settings.times.explicit, "time-unit": self.time_unit})
         return {**times, "settings": plain(settings), "reading": plain(dict(self.reading))}
+
+    def require_settings(self) -> None:
+        """Raise ValueError where another process has begun the study anew."""
+        now = read_json(self.folder / "study.json")
+        if any(now.get(name) != value for name, value in self.record.items()):
+            raise ValueError(
+                f"--output: another process has given the study {self.folder} other settings or times meanwhile; "
+                "choose another folder for one of them"
+            )
 
     def write_description(self, subjects: list[Subject], chosen: str) -> None:
         """Write what the study is: the files of a BIDS derivative, and the times."""
@@ -250,10 +259,9 @@ def times_text(unit: str) -> str:
 
 
 def _summary(sidecar: Path, problem: str | None) -> tuple[Any, ...]:
-    if problem is not None:
-        pending = not problem
-        return ("pending" if pending else "failed", *(None,) * 6, None if pending else problem)
-    report = read_json(sidecar)
+    report = {} if problem is not None else read_json(sidecar)
+    if not report:
+        return ("failed" if problem else "pending", *(None,) * 6, problem or None)
     pairs, times = report["Eigenpairs"], report["Truncation"]
     worst = [max((t[name] or 0.0 for t in times), default=0.0) for name in ("truncation", "resolution_bias")]
     inside, warnings = report["Input"]["voxels_inside"], len(report["Warnings"])

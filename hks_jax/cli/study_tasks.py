@@ -1,8 +1,8 @@
 """The computations of a study: what is to be done of each subject, and doing it."""
 
 import sys
+import time
 import traceback
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from hks_jax.claim import claim
 from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.arguments import Times
 from hks_jax.cli.bar import duration
@@ -30,9 +31,18 @@ from hks_jax.signatures.times import positive_range
 FORGETFUL = 8
 """After so many subjects what was compiled is forgotten: domains differ, and each leaves 70 MiB that no other uses."""
 
+PATIENCE = 0.5
+"""Seconds between two looks at what other processes compute."""
+
 
 def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> dict[str, str]:
-    """Compute what is not there yet; return why some subjects failed, by their names."""
+    """Compute what is not there yet; return why some subjects failed, by their names.
+
+    Other processes with the same study share the work: each subject is computed by the one that comes to it first.
+
+    Raises:
+        ValueError: another process has begun the study anew, with other settings.
+    """
     problems: dict[str, str] = {}
     plan = []
     for subject in subjects:
@@ -48,17 +58,33 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
     pending.sort(key=lambda task: study.attempt(task.subject).exists())
     if len(pending) < len(plan):
         progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are done already")
-    progress.total = len(pending)
-    for number, task in enumerate(pending, 1):
-        name = task.subject.name
-        try:
-            with progress.subject(name):
-                task.run(study, progress)
-        except Exception as error:
-            problems[name] = _said(error, debug)
-            progress.end(f"{name} failed: {problems[name]}")
-        if number % FORGETFUL == 0:
-            jax.clear_caches()
+    progress.total, number, waiting = len(pending), 0, False
+    while pending:
+        elsewhere = []
+        for task in pending:
+            name = task.subject.name
+            study.require_settings()
+            try:
+                with claim(study.attempt(task.subject)) as ours:
+                    if not ours:
+                        elsewhere.append(task)
+                    elif (left := task.left(study)) is None:
+                        progress.total -= 1
+                    else:
+                        if number and number % FORGETFUL == 0:
+                            jax.clear_caches()
+                        number += 1
+                        with progress.subject(name):
+                            left.run(study, progress)
+            except Exception as error:
+                problems[name] = _said(error, debug)
+                progress.end(f"{name} failed: {problems[name]}")
+        if len(elsewhere) == len(pending):
+            if not waiting:
+                progress.end(f"waiting for other processes, which compute {len(elsewhere)} of the subjects")
+            waiting = True
+            time.sleep(PATIENCE)
+        pending = elsewhere
     done = len(subjects) - len(problems)
     progress.end(f"{progress.line()}: {done} of {len(subjects)} subjects are done, in {duration(progress.elapsed)}")
     return problems
@@ -84,19 +110,19 @@ class _Task(NamedTuple):
             regions = "" if not missing and study.has_regions(subject, regions) else regions
         return cls(subject, fingerprint, missing, regions)
 
+    def left(self, study: Study) -> "_Task | None":
+        """Return what another process has not done meanwhile."""
+        missing = self.signature and not study.is_done(self.subject, self.fingerprint)
+        known = not missing and study.has_regions(self.subject, self.regions)
+        left = self._replace(signature=missing, regions="" if known else self.regions)
+        return left if left.signature or left.regions else None
+
     def run(self, study: Study, progress: StudyProgress) -> None:
         """Do it."""
-        args, attempt = self.subject.arguments, study.attempt(self.subject)
+        args = self.subject.arguments
         assert args is not None
         if self.signature:
-            attempt.parent.mkdir(parents=True, exist_ok=True)
-            attempt.touch()
-            try:
-                _compute(study, self.subject, self.fingerprint, progress)
-            finally:
-                attempt.unlink()
-                with suppress(OSError):  # it has files
-                    attempt.parent.rmdir()
+            _compute(study, self.subject, self.fingerprint, progress)
         if self.regions:
             study.forget_regions(self.subject)
             with progress.stage("regions"):
