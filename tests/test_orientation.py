@@ -1,16 +1,20 @@
 """Pictures of what lies in space: left is left, however the voxels are stored."""
 
+import json
 from itertools import permutations, product
 
 import matplotlib.image
+import nibabel as nib
 import numpy as np
 import pytest
 from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.cli import main
-from hks_jax.io import TensorVolume, save, save_tensors
+from hks_jax.io import TensorVolume, read_tensors, save, save_tensors
+from hks_jax.io.repair import find_background
 from hks_jax.plot import Orientation, hks_panels, new_figure, orthogonal_slices, save_figure, scalar_image
+from hks_jax.plot.images import colours_of
 
 SHAPE, SPACING, ORIGIN = (10, 9, 5), (2.0, 2.5, 3.0), (-5.0, -4.0, -3.0)
 STORAGES = [(order, turned) for order in permutations(range(3)) for turned in product((False, True), repeat=3)]
@@ -201,3 +205,127 @@ def test_without_a_place_in_space_nothing_is_turned(tmp_path):
     own = pixels(tmp_path / "own.png")
     for view in ("neurological", "radiological"):
         np.testing.assert_array_equal(pixels(tmp_path / f"{view}.png"), own)
+
+
+# ---------------------------------------------------------------------------------------------- where the file lies
+
+
+def nifti_of(path, sform=None, qform=None):
+    tensors_and_place = save_tensors(
+        path, TensorVolume(tensors() + np.eye(3) * 1e-4, SPACING, (0.0,) * 3, affine=np.diag([*SPACING, 1.0]))
+    )
+    image = nib.load(tensors_and_place)
+    image = nib.Nifti1Image(np.asarray(image.dataobj), None, image.header)
+    image.set_sform(sform, code=0 if sform is None else 2)
+    image.set_qform(qform, code=0 if qform is None else 1)
+    nib.save(image, path)
+    return read_tensors(path)
+
+
+def test_of_two_places_the_sform_wins_and_both_are_named(tmp_path):
+    mirrored = RAS @ np.array([[-1.0, 0, 0, 9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    volume = nifti_of(tmp_path / "t.nii.gz", RAS, mirrored)
+    np.testing.assert_array_equal(volume.affine, RAS)
+    (note,) = (note for note in volume.notes if "qform" in note)
+    assert "sform (code 2) and its qform (code 1), up to 18 apart, and one mirrors the other: the sform is used" in note
+    shifted = RAS.copy()
+    shifted[2, 3] += 7
+    (note,) = (note for note in nifti_of(tmp_path / "t.nii.gz", RAS, shifted).notes if "qform" in note)
+    assert "up to 7 apart: the sform" in note
+    for sform, qform in ((RAS, RAS), (RAS, None), (None, RAS)):
+        volume = nifti_of(tmp_path / "t.nii.gz", sform, qform)
+        np.testing.assert_allclose(volume.affine, RAS, atol=1e-6)
+        assert not any("qform" in note for note in volume.notes)
+    assert any("which side is left is a guess" in note for note in nifti_of(tmp_path / "t.nii.gz").notes)
+
+
+# ---------------------------------------------------------------------------------------------- what is background
+
+
+def filled(value):
+    """A quarter of the voxels hold tensors that differ; the others hold what a program filled in."""
+    x = np.indices((12, 10, 4))
+    inside = (np.abs(x[0] - 5.5) < 3) & (np.abs(x[1] - 4.5) < 3)
+    field = np.broadcast_to(value * np.eye(3), (12, 10, 4, 3, 3)).copy()
+    rng = np.random.default_rng(0)
+    field[inside] = 1e-3 * (np.eye(3) + 0.2 * np.cos(rng.standard_normal((int(inside.sum()), 1, 1))) * np.ones((3, 3)))
+    return field, inside
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(7e-4, "have the same isotropic tensor, 0.0007·I"), (1e-12, "have the same isotropic tensor, 1e-12·I")],
+)
+def test_a_background_that_is_filled_in_is_named_and_left_out_if_asked(value, words, tmp_path, capsys):
+    field, inside = filled(value)
+    path = save_tensors(
+        tmp_path / "ants.nii.gz", TensorVolume(field, (2.0,) * 3, (0.0,) * 3, affine=np.diag([2.0, 2, 2, 1]))
+    )
+    assert main(["info", str(path), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert f"no mask: {int((~inside).sum())} of 480 voxels {words}" in captured.err
+    assert "Pass --mask, or --background outside, or inside" in captured.err
+    assert json.loads(captured.out)["inside"] == 480
+    for said, count in (("outside", int(inside.sum())), ("inside", 480)):
+        assert main(["info", str(path), "--json", "--background", said]) == 0
+        captured = capsys.readouterr()
+        assert captured.err == ""
+        assert json.loads(captured.out)["inside"] == count
+
+
+def test_what_is_no_background():
+    field, inside = filled(7e-4)
+    volume = TensorVolume(field, (2.0,) * 3, (0.0,) * 3)
+    np.testing.assert_array_equal(find_background(volume)[0], ~inside)
+    noise = field * np.where(inside, 1, 1e-9 * (1 + np.random.default_rng(1).random(inside.shape)))[..., None, None]
+    noise[~inside, 0, 0] *= 1.5
+    found, text = find_background(TensorVolume(noise, (2.0,) * 3, (0.0,) * 3))
+    np.testing.assert_array_equal(found, ~inside)
+    assert "have tensors near zero" in text
+    assert find_background(volume.with_mask(inside)) is None  # there is a mask
+    flat = np.broadcast_to(np.eye(2), (9, 9, 2, 2))
+    assert find_background(TensorVolume(flat, (1.0,) * 2, (0.0,) * 2)) is None  # alike everywhere
+    smooth = TensorVolume(tensors()[2:] + 1e-4 * np.eye(3), SPACING, (0.0,) * 3)
+    assert find_background(smooth) is None
+
+
+# ---------------------------------------------------------------------------------------------- what colours mean
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([0.7, 0.9, 1.2], (0.7, 1.3, "RdBu_r")),  # as far above 1 as below
+        ([0.7, 0.9, 1.5, 3.0], (0.0, 2.0, "RdBu_r")),  # not −1 to 3 of what is never negative
+        ([30.0, 38.0, 41.0], (30.0, 41.0, "viridis")),  # nothing near 1: not −39 to 41, all dark red
+        ([-1.0, 3.0], (-1.0, 3.0, "RdBu_r")),
+    ],
+)
+def test_colours_of_what_is_positive_are_not_negative(values, expected):
+    assert colours_of(np.array(values), (0, 1), centre=1.0) == pytest.approx(expected)
+
+
+def test_a_centre_of_zero_is_one_of_either_sign():
+    assert colours_of(np.array([0.0, 2.0]), (0, 1), centre=0.0) == (-2.0, 2.0, "RdBu_r")
+
+
+def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "hks_jax.cli.picture.scalar_image", lambda ax, values, grid, **more: drawn.append((values, more))
+    )
+    field = hj.examples.torus_field((16, 16))
+    np.savez(tmp_path / "t.npz", tensors=field.tensors, spacing=field.grid.spacing)
+    options = ["-k", "30", "--boundary", "neumann", "--normalisation", "flat", "-q"]
+    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", "auto:5"]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    last = report["times"][-1]["t"]
+    assert last * report["eigenpairs"]["first_positive"] == pytest.approx(2 * np.log(10))
+    values, more = drawn[-1]
+    assert np.ptp(values) > 0.01 * values.max()
+    assert more["vmin"] > 0  # far from 1, and positive
+    # Where nothing is left, nothing is shown.
+    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", str(3 * last)]) == 0
+    values, more = drawn[-1]
+    assert np.ptp(values) < 1e-3 * values.max()
+    assert more["vmax"] - more["vmin"] == pytest.approx(0.01 * values.max(), rel=1e-2)

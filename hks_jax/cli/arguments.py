@@ -21,6 +21,8 @@ DEFAULT_K = {2: 200, 3: 100}
 """Eigenpairs by dimension. A volume's factorisations cost so much more that fewer pairs take as long."""
 RESOLVED = {2: 4.6, 3: 5.7}
 """λ_k·t, by dimension, from which on the pairs beyond k are 1 % of the signature (see `hks_jax.truncation`)."""
+LAST = 2 * math.log(10.0)
+"""λ₁·t at the last of the automatic times: all but the constant has decayed to 1 %, and a picture still shows it."""
 
 
 def parse_slice(text: str) -> tuple[str, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from hks_jax.cli.arguments import DEFAULT_K, RESOLVED
+from hks_jax.cli.arguments import DEFAULT_K, LAST, RESOLVED
 from hks_jax.cli.boundary import MEAN, default_boundary, n_problems
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
@@ -185,7 +185,7 @@ def _times(d: int, volume: float, width2: float, size: float, nodes: int, proble
         "k": k,
         "unknowns": unknowns,
         "least_time_of_k": RESOLVED[d] / weyl(k, problems * volume, d),
-        "largest_time": 4 * np.log(10) * (size / np.pi) ** 2,  # 4 ln 10 / λ₁ of an interval of this length
+        "largest_time": LAST * (size / np.pi) ** 2,  # λ₁ is that of an interval of this length
     }
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, Times
+from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, LAST, Times
 from hks_jax.cli.boundary import NATURAL, default_boundary, unreached_sides
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
@@ -24,7 +24,7 @@ from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.heat import Normalisation
 from hks_jax.signatures.tail import truncation_map
-from hks_jax.signatures.times import default_times
+from hks_jax.signatures.times import default_times, positive_range
 from hks_jax.signatures.truncation import truncation
 from hks_jax.spectrum_free.auto import HKSMethod, hks, hks_auto
 
@@ -118,10 +118,16 @@ def _result(
 ) -> Result:
     """Return the signature, and its report."""
     with progress.stage("signature"):
-        times = settings.times.explicit or tuple(default_times(pairs, settings.times.automatic).tolist())
+        times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
         values, origin = _signature(pairs, times, settings)
     report = {"input": described, **_report(settings, pairs, times), **origin}
     return Result(place, np.asarray(times), values, np.asarray(pairs.eigenvalues), report)
+
+
+def automatic_times(pairs: Eigenpairs, n: int) -> tuple[float, ...]:
+    """Return n times, log-spaced from the first of `default_times` to where all but the constant is 1 %."""
+    first, last = float(default_times(pairs, 1)[0]), LAST / float(positive_range(pairs)[0])
+    return tuple(np.geomspace(first, max(first, last), n).tolist())
 
 
 def field_of(

@@ -23,6 +23,7 @@ from hks_jax.plot import new_figure, number_text, save_figure, surface
 _OF_GRIDS = {
     "slice": None,
     "mask": None,
+    "background": None,
     "erode": 0,
     "repair": None,
     "frame": None,

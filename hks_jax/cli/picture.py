@@ -13,7 +13,7 @@ from hks_jax.domain.grid import Grid
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io.volume import TensorVolume
 from hks_jax.plot import Orientation, new_figure, number_text, save_figure, scalar_image, volume_panels
-from hks_jax.plot.images import colour_range
+from hks_jax.plot.images import colours_of
 from hks_jax.plot.orientation import View
 
 SPAN = (0.002, 0.998)
@@ -25,6 +25,8 @@ LABELS = {
     "flat": r"HKS · $(4\pi t)^{3/2}$",
 }
 """What the colours of a volume's picture are; t has the unit of the squared lengths in the metric."""
+LEAST_RANGE = 0.01
+"""The least range of the colours, relative to the values: less contrast than this looks like what it is."""
 RIM = 5
 """Nodes from the boundary. At small t it raises a Neumann signature up to fourfold: no colours would be left inside."""
 
@@ -69,14 +71,13 @@ def draw(
     deep, span = _coloured(result, inside)
     for i, (ax, image, text) in enumerate(zip(panels, values, titles, strict=False)):
         grey = first is not None and i == 0
-        low, high = colour_range(
-            image[inside if grey else deep], (0.01, 0.96) if grey else span, centre=None if grey else _centre(result)
-        )
-        constant = high - low <= 2e-6 * abs(high)  # the colours of rounding errors would say nothing
-        vmin, vmax = (None, None) if constant else (low, high)
+        if grey:
+            colours = colours_of(image[inside], (0.01, 0.96))._replace(cmap="gray")
+        else:
+            colours = colours_of(image[deep], span, LEAST_RANGE, _centre(result))
+        low, high, cmap = colours
         image = np.where(inside, image, np.nan)
-        colours = "gray" if grey else _colours(result)
-        scalar_image(ax, image, grid, cmap=colours, vmin=vmin, vmax=vmax, orientation=orientation)
+        scalar_image(ax, image, grid, cmap=cmap, vmin=low, vmax=high, orientation=orientation)
         ax.set_title(text, fontsize="medium")
         ax.set_axis_off()
     for ax in panels[len(values) :]:
@@ -102,13 +103,14 @@ def draw_volume(
     node = None if through is None else _nearest(inside, through)
     grid, box = cropped(volume, inside)
     deep, span = _coloured(result, inside)
+    colours = [colours_of(values[deep], span, LEAST_RANGE, _centre(result)) for values in result.values]
     volume_panels(
         result.values[:, *box],
         result.times,
         grid,
         node=node and [i - part.start for i, part in zip(node, box, strict=True)],
-        limits=[colour_range(values[deep], span, centre=_centre(result)) for values in result.values],
-        cmap=_colours(result),
+        limits=[each[:2] for each in colours],
+        cmap=[each.cmap for each in colours],
         length_unit="mm" if volume.affine is not None else "",
         label=LABELS[result.report["settings"]["normalisation"]],
         orientation=placed(volume, box, view),
@@ -119,10 +121,6 @@ def draw_volume(
 def _centre(result: Result) -> float | None:
     """Return the value of the middle colour, if there is one that means something."""
     return 1.0 if result.report["settings"]["normalisation"] == "flat" else None
-
-
-def _colours(result: Result) -> str:
-    return "viridis" if _centre(result) is None else "RdBu_r"
 
 
 def _coloured(

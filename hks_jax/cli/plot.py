@@ -83,8 +83,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--range",
         default="own",
         metavar="R",
-        help="of the colours: own for each image (default), shared by all, or two numbers LOW,HIGH (write "
-        "--range=LOW,HIGH where LOW is negative)",
+        help="of the colours: own for each image (default) or shared by all, 1 %% of the values at least; or two "
+        "numbers LOW,HIGH (write --range=LOW,HIGH where LOW is negative)",
     )
     add("--quantiles", type=_pair, default=(0.0, 1.0), metavar="Q,Q", help="that own and shared ranges span (0,1)")
     add("--cmap", default="viridis", metavar="NAME", help="a colour map of matplotlib (default viridis)")
@@ -198,7 +198,7 @@ def _choose_times(saved: Saved, args: argparse.Namespace) -> np.ndarray:
 
 
 def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] | None) -> Any:
-    from hks_jax.cli.picture import bounding_box, orientation_of
+    from hks_jax.cli.picture import LEAST_RANGE, bounding_box, orientation_of
     from hks_jax.plot import hks_panels, middle_node
 
     values, grid, title, thin = saved.values, saved.grid, args.title, saved.slice_axis
@@ -232,6 +232,7 @@ def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] 
         vmin=vmin,
         vmax=vmax,
         quantiles=args.quantiles,
+        least_range=LEAST_RANGE,
         suptitle=title,
         orientation=None if saved.affine is None else orientation_of(saved.affine, thin, box, args.view),
     )

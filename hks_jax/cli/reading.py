@@ -27,7 +27,7 @@ from hks_jax.io.nifti import is_nifti
 from hks_jax.io.nrrd import is_nrrd
 from hks_jax.io.questions import reviewed
 from hks_jax.io.read import SUFFIXES
-from hks_jax.io.repair import without_background
+from hks_jax.io.repair import find_background, without_background
 from hks_jax.io.units import unit_question
 from hks_jax.io.vtk_image import is_vtk_image
 
@@ -68,6 +68,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("which voxels").add_argument
     add("--slice", type=parse_slice, metavar="AXIS=N", help="only one slice, such as z=14")
     add("--mask", type=Path, metavar="FILE", help="zeros and ones: NIfTI, MRtrix, NRRD, .npy, or .npz with 'mask'")
+    add(
+        "--background",
+        choices=("outside", "inside"),
+        help="without a mask: whether voxels that a program filled with one isotropic tensor, or near zero, "
+        "are outside the domain or inside (default: inside, with a warning; exact zeros are outside)",
+    )
     add("--erode", type=int, default=0, metavar="N", help="peel N voxels off the mask's rim")
     add = parser.add_argument_group(
         "what the numbers mean", "needed only where the file does not say it; a wrong axis mirrors the tensors"
@@ -157,6 +163,7 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
             raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
         volume = volume.with_mask(mask)
     volume = without_background(volume)
+    volume = _without_filling(volume, args.background, progress)
     if args.erode:
         volume = volume.with_mask(erode(volume.inside, args.erode))
     if args.positive is not None:
@@ -193,6 +200,18 @@ def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str
             )
         ask(spelled)
     return volume
+
+
+def _without_filling(volume: TensorVolume, background: str | None, progress: Progress) -> TensorVolume:
+    """Return the volume without what looks like background, if that is to be outside; warn if nothing is said of it."""
+    found = None if background == "inside" else find_background(volume)
+    if found is None:
+        return volume
+    if background is None:
+        progress.warn(f"{found[1]}. Pass --mask, or --background outside, or inside if they are of the domain")
+        return volume
+    note = found[1].replace("count as inside", "are left out as asked")
+    return replace(volume.with_mask(~found[0]), notes=(*volume.notes, note))
 
 
 def _count_clipped(volume: TensorVolume) -> int:

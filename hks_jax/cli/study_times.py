@@ -1,17 +1,14 @@
 """Times for all subjects of a study, where none are given."""
 
 import argparse
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from hks_jax.cli.arguments import LAST
 from hks_jax.cli.info import describe
 from hks_jax.io import TensorVolume
-
-SMALLEST_TIMES_FIRST_EIGENVALUE = 4 * math.log(10.0)
-"""λ₁t at which all but the constant has decayed by 1e-4: the end of the default times of Sun et al."""
 
 
 class Range(NamedTuple):
@@ -40,14 +37,13 @@ def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float,
         ranges: one for each subject, by name.
         n: how many.
         unit: ``"scanner"``: from the largest of the least times to the least of the largest; ``"lambda1"``: the same of
-            λ₁t, whose largest is 4 ln 10.
+            λ₁t, whose largest is `LAST`.
 
     Raises:
         ValueError: no time suits all.
     """
     if unit == "lambda1":
-        end = SMALLEST_TIMES_FIRST_EIGENVALUE
-        ranges = {name: Range(end * least / most, end) for name, (least, most) in ranges.items()}
+        ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}
     late, flat = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
     least, largest = ranges[late].least, ranges[flat].largest
     if least >= largest:

@@ -117,6 +117,7 @@ def fit_dwi(
         f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
         *remarks,
         *found,
+        *nifti.placement_notes(image),
     ]
     if bvec_frame != "fsl":
         notes.append(f"gradient directions along the {bvec_frame} axes, as asked; tensors taken to the voxel axes")

@@ -195,6 +195,7 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not (np.isfinite(affine).all() and spacing.min() > 0):
         raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
+    notes += placement_notes(image)
     axes = affine[:3, :3] / spacing
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
         notes.append("the affine's axes are not orthogonal: the shear is ignored")
@@ -220,6 +221,27 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
         length_unit="mm",
         unit=record.get("unit", ""),
     )
+
+
+def placement_notes(image: Any) -> list[str]:
+    """Say what is doubtful about where an image lies: its sform and qform differ, or there is neither."""
+    by_sform, sform = image.header.get_sform(coded=True)
+    by_qform, qform = image.header.get_qform(coded=True)
+    if not (sform or qform):
+        return [
+            "the file does not say where its voxels lie (neither sform nor qform is set): which side is left is a guess"
+        ]
+    if not (sform and qform):
+        return []
+    ends = np.stack(np.meshgrid(*((0, n - 1) for n in image.shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
+    apart = float(np.linalg.norm(ends @ (by_sform - by_qform).T, axis=1).max())
+    if apart <= 0.1 * np.linalg.norm(by_sform[:3, :3], axis=0).min():
+        return []
+    mirrored = np.linalg.det(by_sform[:3, :3]) * np.linalg.det(by_qform[:3, :3]) < 0
+    return [
+        f"the file places its voxels twice, by its sform (code {sform}) and its qform (code {qform}), up to "
+        f"{apart:.3g} apart{', and one mirrors the other' * bool(mirrored)}: the sform is used"
+    ]
 
 
 def _sizes(values: np.ndarray) -> str:

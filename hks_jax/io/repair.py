@@ -26,6 +26,9 @@ REPAIRS: dict[str, str] = {
 LISTED = 20
 """So many voxels are listed in a report."""
 
+_SAME, _TINY = 1e-6, 1e-6
+"""Relative difference of tensors that are the same; relative size of tensors that are nothing."""
+
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
     """Mark the voxels inside whose tensor is not finite and positive definite, or has an eigenvalue below `floor`."""
@@ -160,6 +163,35 @@ def without_background(volume: TensorVolume) -> TensorVolume:
         return volume
     note = f"no mask: the {int((~inside).sum())} voxels whose tensor is zero count as outside"
     return replace(volume, mask=inside, notes=(*volume.notes, note))
+
+
+def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
+    """Return which voxels look as if a program had filled in what lies outside, and a sentence; None if few do.
+
+    No measurement gives the same isotropic tensor twice, nor one that is a millionth of the others: programs such as
+    ANTs write either where there is no signal. Of a volume with a mask, and of one that is alike everywhere, None.
+    """
+    if volume.mask is not None:
+        return None
+    tensors = volume.tensors.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of what is not finite
+        mean = np.trace(tensors, axis1=-2, axis2=-1) / volume.dimension
+        parts = tensors - mean[..., None, None] * np.eye(volume.dimension)
+        isotropic = (mean > 0) & (np.abs(parts).max(axis=(-2, -1)) <= _SAME * mean)
+    if not (mean > 0).any():
+        return None
+    tiny = np.abs(mean) <= _TINY * np.quantile(mean[mean > 0], 0.99)
+    values, counts = np.unique(mean[isotropic].astype(np.float32), return_counts=True)
+    filled = float(values[np.argmax(counts)]) if counts.size else np.nan
+    same = isotropic & (np.abs(mean - filled) <= _SAME * filled)
+    found = same if same.sum() >= tiny.sum() else tiny
+    if found.sum() <= MANY * found.size or found.all():
+        return None
+    what = f"have the same isotropic tensor, {filled:.3g}·I" if found is same else "have tensors near zero"
+    return found, (
+        f"no mask: {int(found.sum())} of {found.size} voxels {what}, as programs write what is outside the object, and "
+        "count as inside"
+    )
 
 
 def _clip(tensors: Float[np.ndarray, "n d d"], floor: float) -> Float[np.ndarray, "n d d"]:

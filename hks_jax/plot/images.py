@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -44,7 +44,8 @@ def scalar_image(
         vmin: value of the first colour; None: from `quantiles`.
         vmax: value of the last colour; None: from `quantiles`.
         centre: value of the middle colour where vmin and vmax do not say, such as 1 for 4πt·HKS, which it is where the
-            metric is flat: the colours reach as far above it as below.
+            metric is flat: the colours reach as far above it as below. Of values that are never negative they reach
+            down to 0 at most; if then most values would have one of the last colours, there is no centre.
         quantiles: the values' quantiles that take the first and the last colour where vmin and vmax do not
             say. The colour bar has arrows where values lie beyond.
         least_range: the least difference between the last colour's value and the first's, relative to the larger.
@@ -62,13 +63,13 @@ def scalar_image(
     array = masked("values", values, grid)
     if orientation is not None:
         array, grid = orientation.array(array), orientation.grid(grid)
-    low, high = colour_range(array.compressed(), quantiles, least_range, centre)
-    low, high = low if vmin is None else vmin, high if vmax is None else vmax
+    colours = colours_of(array.compressed(), quantiles, least_range, centre)
+    low, high = colours.low if vmin is None else vmin, colours.high if vmax is None else vmax
     image = ax.imshow(
         array.T,
         origin="lower",
         extent=cell_extent(grid),
-        cmap=cmap or ("viridis" if centre is None else "RdBu_r"),
+        cmap=cmap or colours.cmap,
         vmin=low,
         vmax=high,
         **{"interpolation": "nearest", **kwargs},
@@ -95,6 +96,7 @@ def hks_panels(
     vmax: float | None = None,
     centre: float | None = None,
     quantiles: tuple[float, float] = (0.0, 1.0),
+    least_range: float = 1e-6,
     label: str = "",
     suptitle: str = "",
     orientation: Orientation | None = None,
@@ -114,6 +116,7 @@ def hks_panels(
         vmax: value of the last colour of all images; likewise.
         centre: value of the middle colour, as for `scalar_image`.
         quantiles: as for `scalar_image`.
+        least_range: as for `scalar_image`.
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: as for `scalar_image`.
@@ -126,8 +129,8 @@ def hks_panels(
     images = [masked("values", v, grid) for v in np.asarray(values)]
     everything = np.concatenate([image.compressed() for image in images])
     if shared_range:
-        low, high = colour_range(everything, quantiles, centre=centre)
-        vmin, vmax = low if vmin is None else vmin, high if vmax is None else vmax
+        low, high, own = colours_of(everything, quantiles, least_range, centre)
+        vmin, vmax, cmap = low if vmin is None else vmin, high if vmax is None else vmax, cmap or own
 
     rows, columns = _layout(t.size)
     fig = _panel_figure(grid if orientation is None else orientation.grid(grid), rows, columns, bool(suptitle))
@@ -136,7 +139,8 @@ def hks_panels(
         if index >= t.size:
             ax.remove()
             continue
-        colours: dict[str, Any] = {"cmap": cmap, "vmin": vmin, "vmax": vmax, "centre": centre, "quantiles": quantiles}
+        colours: dict[str, Any] = {"cmap": cmap, "vmin": vmin, "vmax": vmax, "centre": centre}
+        colours |= {"quantiles": quantiles, "least_range": least_range}
         scalar_image(ax, images[index], grid, label=label, orientation=orientation, **colours)
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
@@ -183,16 +187,28 @@ def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
     return masked
 
 
-def colour_range(
+class Colours(NamedTuple):
+    """The values of the first and the last colour, and the colour map unless another is asked for."""
+
+    low: float
+    high: float
+    cmap: str = "viridis"
+
+
+def colours_of(
     values: np.ndarray, quantiles: tuple[float, float], least_range: float = 1e-6, centre: float | None = None
-) -> tuple[float, float]:
-    """Return the values of the first and the last colour; see `scalar_image`."""
+) -> Colours:
+    """Return the colours of values; see `scalar_image`."""
     low, high = (float(q) for q in np.quantile(values, quantiles))
+    cmap = "viridis"
     if centre is not None:
         reach = max(high - centre, centre - low, 0.0)
-        low, high = centre - reach, centre + reach
+        if values.min() >= 0 < centre < reach:  # no colours for what is negative
+            reach = centre if np.median(values) <= 1.5 * centre else 0.0
+        if reach or low == high:
+            low, high, cmap = centre - reach, centre + reach, "RdBu_r"
     lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
-    return low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
+    return Colours(low - max(lacking, 0) / 2, high + max(lacking, 0) / 2, cmap)
 
 
 def _layout(n: int) -> tuple[int, int]:

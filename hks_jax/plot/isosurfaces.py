@@ -13,7 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.images import colour_range, masked
+from hks_jax.plot.images import colours_of, masked
 from hks_jax.plot.volumes import require_volume
 
 
@@ -60,7 +60,7 @@ def isosurfaces(
     """
     require_volume(grid)
     array = masked("values", values, grid)
-    low, high = colour_range(array.compressed(), quantiles)
+    low, high, _ = colours_of(array.compressed(), quantiles)
     low, high = low if vmin is None else vmin, high if vmax is None else vmax
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():

@@ -15,7 +15,7 @@ from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, new_figure, save_figure
-from hks_jax.plot.images import beyond, colour_range, masked, panel_titles, scalar_image
+from hks_jax.plot.images import beyond, colours_of, masked, panel_titles, scalar_image
 from hks_jax.plot.orientation import Orientation
 
 AXES = "xyz"
@@ -77,7 +77,7 @@ def orthogonal_slices(
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
     array, grid, node = _turned(_volume(values, grid), grid, node, orientation)
-    low, high = colour_range(array.compressed(), quantiles)
+    low, high, _ = colours_of(array.compressed(), quantiles)
     low, high = low if vmin is None else vmin, high if vmax is None else vmax
     colours: dict[str, Any] = {"cmap": cmap, "vmin": low, "vmax": high}
     return _slices(axes, array, grid, node, orientation, cross=cross, **colours, **kwargs)
@@ -119,7 +119,7 @@ def volume_panels(
     length_unit: str = "",
     limits: Sequence[tuple[float, float]] | None = None,
     path: str | os.PathLike[str] | None = None,
-    cmap: str | Colormap = "viridis",
+    cmap: str | Colormap | Sequence[str] = "viridis",
     quantiles: tuple[float, float] = (0.0, 1.0),
     label: str = "",
     suptitle: str = "",
@@ -137,7 +137,7 @@ def volume_panels(
         length_unit: the unit of the coordinates.
         limits: the values of the first and the last colour, one pair per time; None: from `quantiles`.
         path: where to save the figure; None: nowhere.
-        cmap: colour map.
+        cmap: colour map, or one per time.
         quantiles: as for `orthogonal_slices`.
         label: the colour bars' label.
         suptitle: the figure's title.
@@ -150,9 +150,12 @@ def volume_panels(
     t, titles = panel_titles(values, times, grid, titles, unit)
     volumes = [_volume(v, grid) for v in np.asarray(values)]
     if limits is None:
-        limits = [colour_range(volume.compressed(), quantiles) for volume in volumes]
+        limits = [colours_of(volume.compressed(), quantiles)[:2] for volume in volumes]
     elif len(limits) != t.size:
         raise ValueError(f"limits: got {len(limits)}; expected {t.size}, one pair per time")
+    cmaps = [cmap] * t.size if isinstance(cmap, str | Colormap) else list(cmap)
+    if len(cmaps) != t.size:
+        raise ValueError(f"cmap: got {len(cmaps)}; expected {t.size}, one per time")
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
     if orientation is not None:
         volumes = [orientation.array(volume) for volume in volumes]
@@ -173,7 +176,7 @@ def volume_panels(
                     ax.remove()
                 continue
             low, high = limits[index]
-            colours: dict[str, Any] = {"cmap": cmap, "vmin": low, "vmax": high}
+            colours: dict[str, Any] = {"cmap": cmaps[index], "vmin": low, "vmax": high}
             image = _slices(panels[:3, column], volumes[index], shown, chosen, orientation, **colours)
             panels[0, column].set_title(titles[index], fontsize="medium")
             _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
