@@ -230,7 +230,7 @@ def test_meshes_that_hold_something_else_than_they_declare(tmp_path, name, old, 
     assert len(hj.io.read_mesh(path).faces) == 2
     whole = path.read_bytes()
     assert old in whole
-    with pytest.raises(ValueError, match=f"{name}: not a mesh that meshio can read") as told:
+    with pytest.raises(ValueError, match=f"{name}: not a (mesh that meshio can read|readable OFF mesh)") as told:
         hj.io.read_mesh(_written(path, whole.replace(old, new, 1)))
     assert not isinstance(told.value.__cause__, MemoryError)
 

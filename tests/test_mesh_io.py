@@ -76,10 +76,13 @@ def test_seams_are_closed_if_asked(tmp_path):
     split = np.concatenate([split, [[0, 0, 1]]])  # a triangle without area, and a vertex without a triangle
     meshio.Mesh(np.concatenate([corners, [[9.0, 9, 9]]]), [("triangle", split)]).write(tmp_path / "m.obj")
     with pytest.raises(
-        ValueError, match=r"belong to no face \(the first is vertex 24\); remove them\. clean=True merges"
+        ValueError, match=r"belong to no face \(the first is vertex 24\); remove them\. clean=True puts right"
     ):
         read_mesh(tmp_path / "m.obj")
-    mesh = read_mesh(tmp_path / "m.obj", clean=True)
+    with pytest.warns(
+        UserWarning, match="18 vertices merged with another one at the same place; 1 triangles without area"
+    ):
+        mesh = read_mesh(tmp_path / "m.obj", clean=True)
     assert mesh.vertices.shape == (6, 3)
     np.testing.assert_array_equal(sorted_corners(mesh.vertices, mesh.faces), sorted_corners(vertices, faces))
     np.testing.assert_array_equal(mesh.vertices[0], corners[0])  # in the order of the file
@@ -141,9 +144,10 @@ def test_cleaned_tetrahedra_and_their_arrays(tmp_path, rng):
     tensors = rng.random((641, 9))
     tensors[1:] = corners @ rng.random((3, 9))
     meshio.Mesh(points, [("tetra", cells)], point_data={"D": tensors}).write(tmp_path / "m.vtu")
-    with pytest.raises(ValueError, match=r"belong to no cell \(the first is vertex 0\).* clean=True merges"):
+    with pytest.raises(ValueError, match=r"belong to no cell \(the first is vertex 0\).* clean=True puts right"):
         read_mesh(tmp_path / "m.vtu")
-    mesh = read_mesh(tmp_path / "m.vtu", clean=True)
+    with pytest.warns(UserWarning, match="54 tetrahedra turned round; 1 tetrahedra without volume removed; 1 vertices"):
+        mesh = read_mesh(tmp_path / "m.vtu", clean=True)
     assert mesh.vertices.shape == (55, 3)
     assert float(hj.assemble(mesh).volume) == pytest.approx(float(hj.assemble(SOLID).volume))
     D = read_mesh_arrays(tmp_path / "m.vtu", clean=True)["D"]

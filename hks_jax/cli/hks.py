@@ -11,6 +11,7 @@ import numpy as np
 
 from hks_jax.cli.arguments import Times, parse_times, parse_voxel
 from hks_jax.cli.inputs import (
+    add_clean_argument,
     add_eigenpair_arguments,
     add_json_argument,
     add_tensor_arguments,
@@ -68,6 +69,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         metavar="I,J,K",
         help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
     )
+    add_clean_argument(parser)
     add_signature_arguments(parser)
     add_view_argument(parser)
     add(
@@ -128,6 +130,8 @@ def run(args: argparse.Namespace) -> None:
     from hks_jax.cli.saved_pairs import is_saved_pairs
 
     on_mesh, saved = is_mesh(args.file), is_saved_pairs(args.file)
+    if args.clean and not on_mesh:
+        raise ValueError("--clean: it is for meshes; leave it out for tensors on a grid, and see --repair")
     if not (on_mesh or saved):
         require_metric(args)
     from hks_jax.cli import mesh as meshes

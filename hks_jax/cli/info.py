@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from hks_jax.cli.arguments import DEFAULT_K, LAST, RESOLVED
 from hks_jax.cli.boundary import MEAN, default_boundary, n_problems
+from hks_jax.cli.inputs import add_clean_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.cli.spelling import READING, as_options
@@ -56,6 +57,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_arguments(parser)
+    add_clean_argument(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
@@ -65,7 +67,7 @@ def run(args: argparse.Namespace) -> None:
     progress, questions = Progress(quiet=True), list[str]()
     with progress.catching_warnings():
         if is_mesh(args.file):
-            description = describe_mesh(args.file)
+            description = describe_mesh(args.file, args.clean)
         else:
             description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
     if args.json:
@@ -123,9 +125,9 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
     return description
 
 
-def describe_mesh(path: Path) -> dict[str, Any]:
+def describe_mesh(path: Path, clean: bool = False) -> dict[str, Any]:
     """Return what there is to say of a mesh."""
-    mesh = read_mesh(path)
+    mesh = read_mesh(path, clean=clean)
     vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
     words = WORDS[d]
     measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)

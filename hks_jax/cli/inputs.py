@@ -81,6 +81,16 @@ def add_eigenpair_arguments(parser: argparse.ArgumentParser, unless_given: str, 
     add("--solver", choices=("auto", *SOLVERS), default="auto", help="eigensolver (default auto)")
 
 
+def add_clean_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that asks for a mesh to be put right."""
+    parser.add_argument(
+        "--clean",
+        action="store_true",
+        help="of a mesh: merge vertices at the same place, and drop what is NaN, without area, there twice, or unused; "
+        "says what was done",
+    )
+
+
 def add_view_argument(parser: argparse.ArgumentParser) -> None:
     """Add the argument that says which side of a picture is left."""
     parser.add_argument(

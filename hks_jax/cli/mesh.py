@@ -70,7 +70,7 @@ def read_domain(args: argparse.Namespace) -> SurfaceMesh | TetMesh:
         ValueError: a file that is no mesh, or whose tensors make no metric.
     """
     use_dtype(args.dtype)
-    mesh = read_mesh(args.file)
+    mesh = read_mesh(args.file, clean=args.clean)
     vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
     if args.array is None:
@@ -80,7 +80,7 @@ def read_domain(args: argparse.Namespace) -> SurfaceMesh | TetMesh:
 
 
 def _tensors(args: argparse.Namespace) -> Float[np.ndarray, "V 3 3"]:
-    arrays = read_mesh_arrays(args.file)
+    arrays = read_mesh_arrays(args.file, clean=args.clean)
     if args.array not in arrays:
         there = ", ".join(arrays) or "none"
         raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {there}")

@@ -26,4 +26,4 @@ def as_options(message: str, names: Iterable[str]) -> str:
         argument = rf"\b([Pp]ass|[Cc]hoose|or|try) {re.escape(name)}\b(?! [a-z])(?: \({option}\))?"
         message = re.sub(rf'{argument}(?: |=|: )"([\w/-]+)"', rf"\1 {option} \2", message)
         message = re.sub(argument, rf"\1 {option}", message)
-    return message
+    return message.replace("clean=True puts right what it can: see read_mesh", "--clean puts right what it can")

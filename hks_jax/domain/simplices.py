@@ -5,11 +5,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
 """The area (volume) of a simplex, relative to that of the cube over its longest edge, up to which it has none."""
+_ON_EDGE = 1e-6
+"""Distance of a vertex from an edge, relative to the edge's length, up to which it lies on it."""
 
 
 class Words(NamedTuple):
@@ -68,7 +72,11 @@ def signed_measure(
 
 
 def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Raise ValueError for vertices that are not finite, and for degenerate, inverted or overlapping simplices."""
+    """Raise ValueError for vertices that are not finite, and for degenerate, inverted or overlapping simplices.
+
+    Of triangles two with the same vertices overlap. Warn of surfaces with three triangles at one edge, or with an edge
+    that passes through a vertex.
+    """
     infinite = ~np.isfinite(vertices).all(axis=1)
     if infinite.any():
         raise ValueError(
@@ -83,6 +91,9 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
             f"(the first is {words.one} {int(np.argmin(sound))}); remove or merge them"
         )
     if triangulation.dimension == 2:
+        _check_once(cells)
+        _warn_of_crowds(triangulation)
+        _warn_of_hanging(vertices, triangulation)
         return
     inverted = measure < 0
     if inverted.any():
@@ -98,4 +109,69 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
         raise ValueError(
             f"cells: {len(overlaps)} pairs of tetrahedra overlap, as they lie on one side of a common triangle (the "
             f"first are cells {a} and {b}); remove duplicates, and move the vertices of a folded mesh apart"
+        )
+
+
+def check_metric(metric: Float[np.ndarray, "n d d"], vertices: Float[np.ndarray, "V 3"], cells: np.ndarray) -> None:
+    """Raise ValueError where the metric of space on a simplex is NaN: its height is lost in rounding."""
+    thin = np.isnan(metric).any(axis=(1, 2))
+    if not thin.any():
+        return
+    first = int(np.argmax(thin))
+    words, corners = WORDS[cells.shape[1] - 1], vertices[cells[first]]
+    longest = max(np.linalg.norm(a - b) for a, b in combinations(corners, 2))
+    height = np.abs(signed_measure(vertices, cells[first : first + 1])[0][0]) / longest ** (cells.shape[1] - 1)
+    raise ValueError(
+        f"{words.argument}: {int(thin.sum())} of {len(cells)} {words.simplices} are so thin that {metric.dtype} knows "
+        f"no metric of them (the first is {words.one} {first}, vertices {cells[first].tolist()}, {height:.1e} high "
+        "where its longest edge is 1); merge or move their vertices" + ", or use float64" * (metric.dtype != np.float64)
+    )
+
+
+def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
+    """Raise ValueError for triangles that are there twice, in whatever order of their vertices."""
+    vertices = np.sort(faces, axis=1)
+    order = np.lexsort(vertices.T[::-1])
+    again = np.flatnonzero((vertices[order[1:]] == vertices[order[:-1]]).all(axis=1))
+    if again.size:
+        a, b = sorted(order[again[0] : again[0] + 2].tolist())
+        raise ValueError(
+            f"faces: {again.size} of {len(faces)} triangles are there twice (the first are faces {a} and {b}, with the "
+            f"vertices {faces[a].tolist()}), and would count twice; remove the copies"
+        )
+
+
+def _warn_of_crowds(triangulation: Triangulation) -> None:
+    crowded = triangulation.crowded_facets
+    if crowded.size:
+        edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
+        warn_of_accuracy(
+            f"faces: {crowded.size} edges belong to three triangles or more (the first is that of vertices {edge}): "
+            "the surface branches there, and heat goes into all branches. If it should not, remove the inner sheets"
+        )
+
+
+def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
+    """Warn of edges on the boundary that pass through a vertex: a crack, where one side has more vertices."""
+    edges = triangulation.facet_vertices(triangulation.boundary_facets)
+    rim = np.unique(edges)
+    if not rim.size:
+        return
+    start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
+    length = np.linalg.norm(end - start, axis=1)
+    near = cKDTree(vertices[rim]).query_ball_point((start + end) / 2, length * (0.5 + _ON_EDGE))
+    which = np.repeat(np.arange(len(edges)), [len(found) for found in near])
+    vertex = rim[np.concatenate(near).astype(int)]
+    along = (end - start)[which] / length[which, None]
+    offset = vertices[vertex] - start[which]
+    part = np.sum(offset * along, axis=1)
+    apart = np.linalg.norm(offset - part[:, None] * along, axis=1)
+    inner = np.abs(part / length[which] - 0.5) < 0.5 - _ON_EDGE
+    hanging = np.flatnonzero(inner & (apart <= _ON_EDGE * length[which]))
+    if hanging.size:
+        first = hanging[0]
+        warn_of_accuracy(
+            f"faces: {np.unique(vertex[hanging]).size} vertices lie on edges that they do not belong to (the first is "
+            f"vertex {vertex[first]}, on the edge of the vertices {edges[which[first]].tolist()}): the surface is torn "
+            "there, and no heat goes across. Split the triangle at that edge, so that both sides have the same vertices"
         )

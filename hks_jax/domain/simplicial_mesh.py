@@ -11,7 +11,7 @@ from hks_jax.checks import real_array
 from hks_jax.describe import describe_array
 from hks_jax.domain import spd
 from hks_jax.domain.mesh_tensors import metric_of_tensors
-from hks_jax.domain.simplices import WORDS, check_places, checked_cells
+from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_cells
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, checked_tensors
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.traced import is_traced
@@ -34,6 +34,8 @@ class SimplicialMesh(eqx.Module):
         self.vertices = positions
         self.triangulation = triangulation
         self._metric = None if metric is None else _checked_metric(metric, triangulation)
+        if metric is None and not is_traced(positions):
+            check_metric(np.asarray(self.metric), np.asarray(positions, np.float64), triangulation.cells)
 
     def __repr__(self) -> str:
         """Return one line: the sizes, and where the metric comes from."""

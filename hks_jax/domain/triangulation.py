@@ -77,6 +77,13 @@ class Triangulation:
         return np.stack([order[again - 1], order[again]], axis=1) // (self.dimension + 1)
 
     @cached_property
+    def crowded_facets(self) -> Int[np.ndarray, " m"]:
+        """A facet each of those that belong to three cells or more."""
+        order, begins, _ = self._grouped_facets
+        starts = np.flatnonzero(begins)
+        return order[starts[np.diff(np.append(starts, order.size)) > 2]]
+
+    @cached_property
     def boundary_vertices(self) -> Bool[np.ndarray, " V"]:
         """The vertices on facets that belong to one cell only, bool (V,)."""
         on_boundary = np.zeros(self.n_vertices, dtype=bool)

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.atomic import atomic_path
-from hks_jax.domain.simplices import signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.io import cortex
+from hks_jax.io.mesh_cleaning import cleaned, require_joined
 from hks_jax.io.mesh_formats import Loaded, meshio, polygonal, through_meshio
+from hks_jax.io.mesh_text import load_obj, load_off
 from hks_jax.io.vtk_image import holds_dataset
 from hks_jax.reading import existing
 
@@ -27,35 +29,42 @@ WRITTEN = {".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".ply": "ply"}
 def read_mesh(path: str | os.PathLike[str], *, clean: bool = False) -> SurfaceMesh | TetMesh:
     """Read a mesh: tetrahedra, where the file has any, or else triangles.
 
-    ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply``, ``.stl``, ``.obj``, ``.off`` through meshio; polygonal data in
+    ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply``, ``.stl`` through meshio; ``.obj`` and ``.off``; polygonal data in
     ``.vtk`` and ``.vtp``, which meshio does not read, through VTK; GIFTI (``.gii``) and FreeSurfer's surfaces
     (``lh.white``, … by their first bytes) through nibabel, their coordinates as they are in the file.
 
-    Quadrilaterals (of polygonal data all polygons) are cut into triangles; vertices keep their order. STL has no
-    vertices, only corners: those at the same place become one vertex. Beside tetrahedra, the triangles, lines and
-    points of their boundary are passed over.
+    Quadrilaterals (of polygonal data, OBJ and OFF all polygons) are cut into triangles; vertices keep their order. STL
+    has no vertices, only corners: those at the same place become one vertex. Beside tetrahedra, the triangles, lines
+    and points of their boundary are passed over. A warning says where vertices lie at the same place, as at the seams
+    of a texture: the surface is torn there.
 
     Args:
         path: the file.
-        clean: make one vertex of those at the same place (as at a texture's seams), then drop cells without area or
-            volume and vertices without a cell, and turn tetrahedra round whose vertices are in the other order, all of
-            which a `SurfaceMesh` or `TetMesh` refuses. The vertices are numbered anew, in the order of the file.
+        clean: drop vertices that are not finite, with their cells; make one vertex of those at the same place (up to
+            1e-8 of the mesh's size); flip the longest edges of triangles that have hardly a height; drop cells without
+            area or volume, cells that are there twice and vertices without a cell; and turn tetrahedra round whose
+            vertices are in the other order. The vertices are numbered anew, in the order of the file. A warning says
+            what was done.
 
     Raises:
         FileNotFoundError: no such file.
         ValueError: an unknown kind of file, an unreadable one, cells that are neither triangles, quadrilaterals nor
-            tetrahedra, or a mesh that `SurfaceMesh` or `TetMesh` refuses.
+            tetrahedra, a mesh in pieces that touch at vertices at the same place, or one that `SurfaceMesh` or
+            `TetMesh` refuses.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
-    loaded = _load(path, clean)
+    loaded, said = _load(path, clean)
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
+    remedy = "" if clean else ". clean=True puts right what it can: see read_mesh"
     try:
-        return make(loaded.vertices, loaded.cells)
+        mesh = make(loaded.vertices, loaded.cells)
+        if not clean:
+            said = require_joined(loaded)
     except ValueError as error:
-        remedy = "" if clean else ". clean=True merges vertices at one place and drops what has no area or no face"
-        if not clean and make is TetMesh:
-            remedy = ". clean=True merges vertices at one place, drops what is flat or unused, and orders the others"
         raise ValueError(f"{os.fspath(path)}: {error}{remedy}") from error
+    if said:
+        warn_of_accuracy(f"{os.fspath(path)}: {said}{remedy}", UserWarning if clean else AccuracyWarning)
+    return mesh
 
 
 def read_mesh_arrays(
@@ -78,7 +87,7 @@ def read_mesh_arrays(
         ValueError: a file that is no mesh, or unreadable.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
-    return _load(path, clean).arrays
+    return _load(path, clean)[0].arrays
 
 
 def is_mesh(path: Path) -> bool:
@@ -108,29 +117,22 @@ def write(
     return Path(path)
 
 
-def _load(path: str | os.PathLike[str], clean: bool) -> Loaded:
+def _load(path: str | os.PathLike[str], clean: bool) -> tuple[Loaded, str]:
+    """Return what is in a file, cleaned if asked to, and what was done about it."""
     file = existing(path)
     name = file.name.lower()
     if name.endswith((".gii", ".gii.gz")):
         loaded = cortex.load_gifti(file)
     elif name.endswith(".vtp") or (name.endswith(".vtk") and holds_dataset(file, "POLYDATA")):
         loaded = polygonal(str(file))
+    elif name.endswith(".obj"):
+        loaded = load_obj(file)
+    elif name.endswith(".off"):
+        loaded = load_off(file)
     elif name.endswith(READ):
         loaded = through_meshio(str(file))
     elif cortex.is_freesurfer(file):
         loaded = cortex.load_freesurfer(file)
     else:
         raise ValueError(f"{file}: unknown kind of mesh; expected {', '.join(READ)}, or a surface of FreeSurfer's")
-    return _cleaned(loaded) if clean else loaded
-
-
-def _cleaned(loaded: Loaded) -> Loaded:
-    _, first, inverse = np.unique(loaded.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
-    cells = first[inverse.ravel()[loaded.cells]]
-    measure, sound = signed_measure(loaded.vertices, cells)
-    if cells.shape[1] == 4:
-        cells = np.where(measure[:, None] < 0, cells[:, [1, 0, 2, 3]], cells)
-    cells = cells[sound]
-    used, numbered = np.unique(cells, return_inverse=True)
-    arrays = {name: values[used] for name, values in loaded.arrays.items()}
-    return Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays)
+    return cleaned(loaded) if clean else (loaded, "")

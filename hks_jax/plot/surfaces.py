@@ -71,7 +71,9 @@ def surface(
         Poly3DCollection(corners, facecolors=colours, edgecolors=colours, **{"linewidths": 0.2, **kwargs})
     )
     low, high = vertices.min(axis=0), vertices.max(axis=0)
+    thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # a flat surface has a box, too
+    low, high = low - thin, high + thin
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(tuple(high - low), zoom=zoom)
+    ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # of the former its corners show
     ax.set_axis_off()
     return mappable
