@@ -9,7 +9,7 @@ import pytest
 import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.io import read_mesh, read_mesh_arrays
-from hks_jax.io.mesh_text import fans
+from hks_jax.io.mesh_formats import fans
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 SIDES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])

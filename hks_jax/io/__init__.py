@@ -15,6 +15,7 @@ from hks_jax.io.positive import positive_tensors as positive_tensors
 from hks_jax.io.questions import questions as questions
 from hks_jax.io.read import read_tensors as read_tensors
 from hks_jax.io.repair import REPAIRS as REPAIRS
+from hks_jax.io.repair import find_background as find_background
 from hks_jax.io.repair import find_invalid as find_invalid
 from hks_jax.io.repair import repair_tensors as repair_tensors
 from hks_jax.io.save import save as save

@@ -51,7 +51,10 @@ def through_meshio(name: str) -> Loaded:
         checks.compare(read)
         points = np.asarray(read.points, np.float64)
         tetrahedra = [_corners(block.data, 4) for block in read.cells if block.type == "tetra"]
-        triangles = [_triangles(block.data) for block in read.cells if block.type in _OF_SURFACES]
+        if points.ndim != 2 or points.shape[1] not in (2, 3):
+            raise ValueError(f"points of shape {points.shape}")
+        points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+        triangles = [_triangles(block.data, points) for block in read.cells if block.type in _OF_SURFACES]
         arrays = _real_arrays(read.point_data, len(points))
     others = {block.type for block in read.cells} - _OF_BOUNDARIES - {"tetra"}
     if others:
@@ -59,10 +62,9 @@ def through_meshio(name: str) -> Loaded:
             f"{name}: has {', '.join(sorted(others))} cells; expected triangles (or quadrilaterals), or tetrahedra"
         )
     blocks = tetrahedra or triangles
-    if points.ndim != 2 or points.shape[1] not in (2, 3) or not blocks:
+    if not blocks:
         raise ValueError(f"{name}: has no triangles and no tetrahedra; expected a mesh in two or three dimensions")
-    flat = np.zeros((len(points), 3 - points.shape[1]))
-    return Loaded(np.concatenate([points, flat], axis=1), np.concatenate(blocks).astype(np.int64), arrays)
+    return Loaded(points, np.concatenate(blocks).astype(np.int64), arrays)
 
 
 def polygonal(name: str) -> Loaded:
@@ -127,9 +129,33 @@ def _corners(cells: Int[np.ndarray, "n corners"], corners: int) -> Int[np.ndarra
     return cells
 
 
-def _triangles(cells: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "m 3"]:
+def _triangles(cells: Int[np.ndarray, "n corners"], points: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, "m 3"]:
     if cells.ndim != 2 or cells.shape[1] not in (3, 4):
         raise ValueError(f"triangles or quadrilaterals of shape {cells.shape}")
     if cells.shape[1] == 3:
         return cells
-    return np.stack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+    if cells.size and not 0 <= cells.min() <= cells.max() < len(points):
+        raise ValueError(f"a quadrilateral has the corner {cells.max()} of {len(points)} points")
+    cut = fans(points, cells)
+    if (cut < 0).any():
+        raise ValueError("a quadrilateral whose sides cross")
+    return cut.reshape(-1, 3)
+
+
+def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "n m 3"]:
+    """Return each polygon cut into triangles around one of its corners; −1 where no corner sees all others.
+
+    It is the first corner from which all triangles lie on one side; of a flat polygon the first corner of all.
+    """
+    n, size = polygons.shape
+    found = np.full((n, size - 2, 3), -1)
+    for first in reversed(range(size)):
+        turned = np.roll(polygons, -first, axis=1)
+        fan = np.stack([np.broadcast_to(turned[:, :1], (n, size - 2)), turned[:, 1:-1], turned[:, 2:]], axis=-1)
+        a, b, c = np.moveaxis(points[fan], 2, 0)
+        with np.errstate(over="ignore", invalid="ignore"):  # of vertices that are far away or not finite
+            normals = np.cross(b - a, c - a)
+            along = np.einsum("nmx,nx->nm", normals, normals.sum(axis=1))
+        seen = ~(along < 0).any(axis=1)
+        found[seen] = fan[seen]
+    return found

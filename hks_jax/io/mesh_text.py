@@ -4,9 +4,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
 
-from hks_jax.io.mesh_formats import Loaded
+from hks_jax.io.mesh_formats import Loaded, fans
 from hks_jax.reading import reading
 
 _KEYWORD = re.compile(r"(ST)?C?N?OFF")
@@ -82,22 +81,3 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
         order.append(np.repeat(which, size - 2))
         triangles.append(cut.reshape(-1, 3))
     return Loaded(points, np.concatenate(triangles)[np.argsort(np.concatenate(order), kind="stable")], {})
-
-
-def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "n m 3"]:
-    """Return each polygon cut into triangles around one of its corners; −1 where no corner sees all others.
-
-    It is the first corner from which all triangles lie on one side; of a flat polygon the first corner of all.
-    """
-    n, size = polygons.shape
-    found = np.full((n, size - 2, 3), -1)
-    for first in reversed(range(size)):
-        turned = np.roll(polygons, -first, axis=1)
-        fan = np.stack([np.broadcast_to(turned[:, :1], (n, size - 2)), turned[:, 1:-1], turned[:, 2:]], axis=-1)
-        a, b, c = np.moveaxis(points[fan], 2, 0)
-        with np.errstate(over="ignore", invalid="ignore"):  # of vertices that are far away or not finite
-            normals = np.cross(b - a, c - a)
-            along = np.einsum("nmx,nx->nm", normals, normals.sum(axis=1))
-        seen = ~(along < 0).any(axis=1)
-        found[seen] = fan[seen]
-    return found

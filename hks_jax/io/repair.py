@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -173,11 +174,12 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
     """
     if volume.mask is not None:
         return None
-    tensors = volume.tensors.astype(np.float64)
-    with np.errstate(invalid="ignore"):  # of what is not finite
-        mean = np.trace(tensors, axis1=-2, axis2=-1) / volume.dimension
-        parts = tensors - mean[..., None, None] * np.eye(volume.dimension)
-        isotropic = (mean > 0) & (np.abs(parts).max(axis=(-2, -1)) <= _SAME * mean)
+    tensors, d = volume.tensors, volume.dimension
+    with np.errstate(invalid="ignore", over="ignore"):  # of what is not finite
+        mean = np.trace(tensors, axis1=-2, axis2=-1, dtype=np.float64) / d
+        isotropic = mean > 0
+        for i, j in product(range(d), repeat=2):  # one by one: volumes are large
+            isotropic &= np.abs(tensors[..., i, j] - (mean if i == j else 0.0)) <= _SAME * mean
     if not (mean > 0).any():
         return None
     tiny = np.abs(mean) <= _TINY * np.quantile(mean[mean > 0], 0.99)
