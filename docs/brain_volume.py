@@ -47,6 +47,7 @@ def main() -> None:
     grid, whole = signature(volume, args.k)
     titles = [f"t = {t:.0e} s".replace("e+0", "e") for t in TIMES]
     middle = hj.plot.middle_node(np.asarray(grid.mask))
+    orientation = hj.plot.Orientation.of(volume.affine)
     hj.plot.volume_panels(
         whole,
         TIMES,
@@ -55,11 +56,15 @@ def main() -> None:
         titles=titles,
         length_unit="mm",
         quantiles=(0.02, 0.93),
+        orientation=orientation,
         path=args.output / "brain_volume.png",
     )
 
     plane, alone = signature(volume.slice("z", z), 2 * args.k)
-    ends = [(plane.nodes[plane.mask][:, a].min() - 3, plane.nodes[plane.mask][:, a].max() + 3) for a in (0, 1)]
+    orientation = hj.plot.Orientation.of(volume.affine, 2)
+    turned = orientation.grid(plane)
+    ends = [(turned.nodes[turned.mask][:, a].min() - 3, turned.nodes[turned.mask][:, a].max() + 3) for a in (0, 1)]
+    colours = {"quantiles": (0.02, 0.98), "orientation": orientation}
     figure = plt.figure(figsize=(3.4 * len(TIMES), 7.6))
     figure.set_layout_engine("constrained", w_pad=0.15)
     for column, (pair, title) in enumerate(zip(zip(alone, whole[..., z], strict=True), titles, strict=True)):
@@ -68,7 +73,7 @@ def main() -> None:
         print(f"{title}: correlation of the logarithms {correlation:.3f}")
         for row, (image, of) in enumerate(zip(pair, ("slice alone", "in the volume"), strict=True)):
             ax = figure.add_subplot(2, len(TIMES), 1 + column + row * len(TIMES))
-            hj.plot.scalar_image(ax, jnp.asarray(np.where(plane.mask, image, np.nan)), plane, quantiles=(0.02, 0.98))
+            hj.plot.scalar_image(ax, jnp.asarray(np.where(plane.mask, image, np.nan)), plane, **colours)
             ax.set(title=f"{of}, {title}", xlim=ends[0], ylim=ends[1])
             ax.axis("off")
     hj.plot.save_figure(figure, args.output / "brain_slices.png")

@@ -2,6 +2,7 @@
 
 import json
 from itertools import permutations, product
+from types import SimpleNamespace
 
 import matplotlib.image
 import nibabel as nib
@@ -13,7 +14,7 @@ import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.io import TensorVolume, read_tensors, save, save_tensors
 from hks_jax.io.repair import find_background
-from hks_jax.plot import Orientation, hks_panels, new_figure, orthogonal_slices, save_figure, scalar_image
+from hks_jax.plot import Orientation, fit_panels, hks_panels, new_figure, orthogonal_slices, save_figure, scalar_image
 from hks_jax.plot.images import colours_of
 
 SHAPE, SPACING, ORIGIN = (10, 9, 5), (2.0, 2.5, 3.0), (-5.0, -4.0, -3.0)
@@ -329,3 +330,20 @@ def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatc
     values, more = drawn[-1]
     assert np.ptp(values) < 1e-3 * values.max()
     assert more["vmax"] - more["vmin"] == pytest.approx(0.01 * values.max(), rel=1e-2)
+
+
+def test_a_fit_is_the_same_picture_too(monkeypatch, tmp_path):
+    """The ellipses of the metric turn with the images."""
+    monkeypatch.setattr("hks_jax.plot.fit._draw_loss", lambda ax, fit: None)
+    values = 1 + np.random.default_rng(0).random((1, *SHAPE[:2]))
+    for name, turned in (("RAS", (False,) * 3), ("LAS", (True, False, False))):
+        array, affine = stored(tensors()[:, :, 2:3] + 1e-4 * np.eye(3), RAS, (0, 1, 2), turned)
+        images = values[:, ::-1] if turned[0] else values
+        field = hj.TensorField(hj.Grid(SHAPE[:2], SPACING[:2]), array[:, :, 0, :2, :2])
+        observation = SimpleNamespace(times=None, signature="hks")
+        fit = SimpleNamespace(field=field, hks=images + 0.1, problem=SimpleNamespace(observation=observation))
+        with unchecked():
+            figure = fit_panels(fit, images, [1.0], orientation=Orientation.of(affine, 2))
+        assert [letters(ax) for ax in figure.axes if ax.texts] == ["LRPA"] * 4
+        save_figure(figure, tmp_path / f"{name}.png")
+    assert np.abs(pixels(tmp_path / "RAS.png") - pixels(tmp_path / "LAS.png")).mean() < 1e-5

@@ -23,6 +23,7 @@ def figure6(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
     volume, name = _brain(echo) or _phantom(echo)
     volume = _cropped(volume)
     grid = volume.grid("largest")
+    orientation = None if volume.affine is None else plot.Orientation.of(volume.affine, 2)
     depth = distance_transform_edt(np.pad(grid.inside, 1), sampling=grid.spacing)[1:-1, 1:-1]
     diffusivity = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
     typical = float(np.median(diffusivity[grid.inside]))
@@ -34,11 +35,11 @@ def figure6(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
     colours = colormaps["viridis"].with_extremes(over="0.85")
     fig = plot.new_figure(15.5, 8.6)
     panels = fig.subplots(2, 5, sharex=True, sharey=True)
-    plot.scalar_image(panels[0, 0], 1e3 * diffusivity, grid, quantiles=(0.01, 0.99))
+    plot.scalar_image(panels[0, 0], 1e3 * diffusivity, grid, quantiles=(0.01, 0.99), orientation=orientation)
     panels[0, 0].set_title("mean diffusivity\nin $10^{-3}$ mm²/s", fontsize="medium")
     eigenvalues = np.linalg.eigvalsh(volume.tensors)
     anisotropy = np.ptp(eigenvalues, axis=-1) / np.maximum(eigenvalues.sum(axis=-1), 1e-12)
-    plot.scalar_image(panels[1, 0], anisotropy, grid, quantiles=(0.01, 0.99))
+    plot.scalar_image(panels[1, 0], anisotropy, grid, quantiles=(0.01, 0.99), orientation=orientation)
     panels[1, 0].set_title("anisotropy\n$(λ_1 - λ_2)/(λ_1 + λ_2)$", fontsize="medium")
     for row, (metric, (label, area, unit)) in zip(panels, rows.items(), strict=True):
         field = TensorField.from_diffusion(grid, volume.tensors, metric=metric)
@@ -49,8 +50,8 @@ def figure6(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         for ax, image, t, length in zip(row[1:], values, times, LENGTHS, strict=True):
             # The natural boundary raises the HKS at the rim up to fourfold: let the tissue have the colours.
             tissue = depth > min(2 * length, 0.3 * depth.max())
-            low, high = np.quantile(image[tissue], (0.01, 0.99))
-            plot.scalar_image(ax, image, grid, cmap=colours, vmin=float(low), vmax=float(high))
+            low, high = np.quantile(image[tissue], (0.01, 0.99)).tolist()
+            plot.scalar_image(ax, image, grid, cmap=colours, vmin=low, vmax=high, orientation=orientation)
             ax.set_title(f"{label}\n$t$ = {plot.number_text(t)} {unit}", fontsize="medium")
         row[0].set_ylabel("mm")
     for ax in panels[1]:
@@ -67,7 +68,11 @@ def _cropped(volume: TensorVolume) -> TensorVolume:
     inside = np.argwhere(volume.mask)
     low, high = np.maximum(inside.min(axis=0) - 2, 0), inside.max(axis=0) + 3
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    return TensorVolume(volume.tensors[box], volume.spacing, (0.0, 0.0), volume.mask[box])
+    affine = volume.affine
+    if affine is not None:
+        affine = affine.copy()
+        affine[:, 3] += affine @ [*low, 0, 0]
+    return TensorVolume(volume.tensors[box], volume.spacing, (0.0, 0.0), volume.mask[box], affine)
 
 
 def _brain(echo: Callable[[str], None]) -> tuple[TensorVolume, str] | None:
