@@ -179,7 +179,7 @@ def test_a_brain_stored_in_another_order_is_the_same_picture(brains, tmp_path):
         pictures[name].append(pixels(tmp_path / f"{name}-slice" / "hks.png"))
         assert main(["curvature", str(path), "-o", str(tmp_path / f"{name}-K"), *flat, *options[:2], *options[7:]]) == 0
         pictures[name].append(pixels(tmp_path / f"{name}-K" / "curvature.png"))
-        for more in ([], ["--view", "radiological"], ["--points", "1,1,3", "5,8.5,0"]):
+        for more in ([], ["--view", "radiological"], ["--points", "-1,1,3", "5,8.5,0"]):
             picture, saved = tmp_path / "plot.png", tmp_path / name / "hks.npz"
             cut = flat if "--points" not in more else []
             assert main(["plot", str(saved), "-o", str(picture), *cut, *more, "-q"]) == 0

@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ curve over the times for each point.
 EPILOG = """\
 examples:
   hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9 --unit s
-  hks-jax plot out/hks.npz -o curves.pdf --points 80,95 60,40 --unit s --scaled
+  hks-jax plot out/hks.npz -o curves.pdf --points -22,5 24,5 --unit s --scaled
 """
 
 NAMES = ("hks", "curvature")
@@ -61,6 +62,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    # What begins with a minus and a digit is a point, such as -20,35, and no option.
+    parser._negative_number_matcher = re.compile(r"-[\d.]")
     add = parser.add_argument
     add("result", metavar="RESULT", type=Path, help="the result: .npz")
     add("-o", "--output", metavar="PICTURE", type=Path, required=True, help="the picture: .png, .pdf, .svg, …")
