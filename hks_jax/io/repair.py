@@ -27,8 +27,8 @@ REPAIRS: dict[str, str] = {
 LISTED = 20
 """So many voxels are listed in a report."""
 
-_SAME, _TINY = 1e-6, 1e-6
-"""Relative difference of tensors that are the same; relative size of tensors that are nothing."""
+_SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
+"""Relative difference of tensors that are the same; relative size of tensors that are nothing; least share of either."""
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -187,7 +187,7 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
     filled = float(values[np.argmax(counts)]) if counts.size else np.nan
     same = isotropic & (np.abs(mean - filled) <= _SAME * filled)
     found = same if same.sum() >= tiny.sum() else tiny
-    if found.sum() <= MANY * found.size or found.all():
+    if found.sum() <= _FILLED * found.size or found.all():
         return None
     what = f"have the same isotropic tensor, {filled:.3g}·I" if found is same else "have tensors near zero"
     return found, (
