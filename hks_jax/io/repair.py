@@ -28,7 +28,7 @@ LISTED = 20
 """So many voxels are listed in a report."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
-"""Relative difference of tensors that are the same; relative size of tensors that are nothing; least share of either."""
+"""Relative difference of tensors that are the same; relative size of tensors that are nothing; least share of them."""
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
