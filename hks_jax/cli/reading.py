@@ -152,6 +152,8 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
     volume, mask = _load(args)
     if mask is not None and mask.shape == volume.shape:
         volume, mask = volume.with_mask(mask), None
+    if mask is None:  # what a program filled in says nothing of units and axes
+        volume = _without_filling(without_background(volume), args.background, progress)
     volume = _reviewed(volume, args, progress.warn if ask is None else ask)
     if args.slice is not None:
         try:
@@ -161,9 +163,7 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
     if mask is not None:  # it may be one of the slice alone
         if mask.shape != volume.shape:
             raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
-        volume = volume.with_mask(mask)
-    volume = without_background(volume)
-    volume = _without_filling(volume, args.background, progress)
+        volume = without_background(volume.with_mask(mask))
     if args.erode:
         volume = volume.with_mask(erode(volume.inside, args.erode))
     if args.positive is not None:
