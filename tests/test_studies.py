@@ -309,7 +309,7 @@ def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
 
 
 def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, view: path.write_text("picture"))
     image = nib.load(study / "t1.nii.gz")
     for number, matrix, scale in ((4, AFFINE, 1e6), (5, AFFINE, 1e6), (6, AFFINE @ np.diag([-1.0, 1, 1, 1]), 1.0)):
         other = nib.Nifti1Image(image.get_fdata() * scale, matrix)  # without the record that our files have
@@ -334,7 +334,7 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
 
 
 def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, view: path.write_text("picture"))
     for i, scale in enumerate((1e3, 0.8e3, 1e6)):  # two in um2/ms, one in um2/s
         np.savez(study / f"n{i}.npz", tensors=tensors(scale), spacing=(2.0, 2.0, 3.0))
     rows = "".join(f"0{i}\tn{i}.npz\n" for i in range(3))

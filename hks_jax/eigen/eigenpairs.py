@@ -67,7 +67,7 @@ class Eigenpairs(eqx.Module):
         complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
             because all were computed; in an interval, none between its lower end and the bound. NaN where there is
             none. Constant to derivatives.
-        origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else a number at or just below the lowest one; the
+        spectral_origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else a number at or just below the lowest one; the
             lower end of an interval.
         multiplet_tolerance: the gap, relative to the distance from the origin, below which neighbouring eigenvalues
             count as one multiple eigenvalue.
@@ -85,7 +85,7 @@ class Eigenpairs(eqx.Module):
     part: Int[Array, " k"]
     next_eigenvalue: Float[Array, ""]
     complete_below: Float[Array, ""]
-    origin: Float[Array, ""]
+    spectral_origin: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
     pencil: Pencil | MirrorPencil
     solver_name: str = eqx.field(static=True)
@@ -139,7 +139,7 @@ class Eigenpairs(eqx.Module):
     @property
     def cut_multiplet(self) -> Array:
         """How many of the last kept pairs belong to a multiple eigenvalue that the truncation cuts; 0 if none is."""
-        known = self.eigenvalues, self.kept, self.next_eigenvalue, self.origin, self.multiplet_tolerance
+        known = self.eigenvalues, self.kept, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance
         return _cut_multiplet(*jax.lax.stop_gradient(known)) if self.k else jnp.zeros((), int)
 
     @property
@@ -147,7 +147,7 @@ class Eigenpairs(eqx.Module):
         """Whether the solver has a certificate, and it ends before the last eigenvalue."""
         if not self.k:
             return jnp.zeros((), bool)
-        allowed = 2 * self.multiplet_tolerance * (self.last_eigenvalue - self.origin)
+        allowed = 2 * self.multiplet_tolerance * (self.last_eigenvalue - self.spectral_origin)
         return self.complete_below < self.last_eigenvalue - allowed
 
     @property

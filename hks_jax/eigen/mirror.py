@@ -111,7 +111,7 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: 
         part=part,
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
         complete_below=jnp.min(jnp.stack([_complete_below(pairs) for pairs in solved])),
-        origin=solved[0].origin,
+        spectral_origin=solved[0].spectral_origin,
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         pencil=pencil,
         solver_name=name,

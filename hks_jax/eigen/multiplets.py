@@ -32,7 +32,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
             (unless nothing would be left); ``"complete"`` takes its missing copies in if there are at most `SPARE`,
             and else drops it.
     """
-    known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.origin, pairs.multiplet_tolerance
+    known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.spectral_origin, pairs.multiplet_tolerance
     chosen = _choose(*jax.lax.stop_gradient(known), k, multiplet)
     return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), pairs, chosen)
 

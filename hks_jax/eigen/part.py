@@ -156,7 +156,9 @@ def _pairs(
         part=part,
         next_eigenvalue=jnp.asarray(following) + origin,  # of a constant JAX makes a number where it differentiates
         complete_below=jnp.asarray(bound) + origin,
-        origin=origin if known or isinstance(solved_pencil, LocatedPencil) else jax.lax.stop_gradient(values[0]),
+        spectral_origin=origin
+        if known or isinstance(solved_pencil, LocatedPencil)
+        else jax.lax.stop_gradient(values[0]),
         multiplet_tolerance=tolerance,
         pencil=pencil,
         solver_name=name,

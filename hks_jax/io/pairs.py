@@ -20,7 +20,7 @@ ARRAYS = (
     "residuals",
     "converged",
     "kept",
-    "origin",
+    "spectral_origin",
     "part",
     "next_eigenvalue",
     "complete_below",
