@@ -67,9 +67,9 @@ class Eigenpairs(eqx.Module):
         complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
             because all were computed; in an interval, none between its lower end and the bound. NaN where there is
             none. Constant to derivatives.
-        spectral_origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else a number at or just below the lowest one; the
-            lower end of an interval.
-        multiplet_tolerance: the gap, relative to the distance from the origin, below which neighbouring eigenvalues
+        spectral_origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else a number at or just below the lowest
+            one; the lower end of an interval.
+        multiplet_tolerance: the gap, relative to the distance from that origin, below which neighbouring eigenvalues
             count as one multiple eigenvalue.
         pencil: the matrices.
         solver_name: the method that found them.
