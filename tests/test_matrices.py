@@ -288,3 +288,33 @@ def test_single_precision():
     pairs = hj.eigsh(K.astype(np.float32), M.astype(np.float32), 9)
     assert pairs.eigenvalues.dtype == jnp.float32
     np.testing.assert_allclose(hj.hks(pairs, [0.05]), exact, rtol=1e-4)
+
+
+def test_an_entry_and_the_one_across_the_diagonal_are_one_parameter(rng):
+    K, M = graph()
+    pencil = hj.sparse_pencil(K, M)
+
+    def value(entries):
+        moved = eqx.tree_at(lambda p: p.stiffness.entries, pencil, entries)
+        return jnp.sum(hj.hks(hj.eigenpairs(moved, 8), TIMES)[:, 3])
+
+    gradient = np.asarray(jax.grad(value)(pencil.stiffness.entries))
+    np.testing.assert_allclose(gradient, gradient[pencil.pattern.across], rtol=1e-12)
+    assert np.abs(gradient).max() > 1e-3
+    after = value(pencil.stiffness.entries - 0.01 * jnp.sign(rng.standard_normal(gradient.shape)) * gradient)
+    assert np.isfinite(after)
+
+
+def test_as_many_pairs_as_rigid_modes():
+    pairs = hj.eigsh(*truss(), k=6, throw=True)
+    np.testing.assert_array_equal(pairs.eigenvalues, 0)
+    assert pairs.residuals.max() < 1e-10
+
+
+def test_too_few_pairs_of_an_interval_are_told():
+    K, M = graph()
+    pencil = hj.sparse_pencil(K, M)
+    held = hj.eigsh(pencil, interval=(0.05, 2.0)).k
+    run = eqx.filter_jit(lambda pencil, k: hj.eigsh(pencil, k=k, interval=(0.05, 2.0)).result)
+    assert run(pencil, held) == hj.RESULTS.successful
+    assert run(pencil, held - 1) == hj.RESULTS.unconfirmed

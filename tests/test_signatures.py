@@ -323,6 +323,19 @@ def test_bad_sources(pairs, sources, message):
         hj.heat_kernel(pairs, [0.5], sources)
 
 
+def test_shape_dna_of_pairs_that_are_not_kept_has_a_gradient():
+    field = hj.TensorField(hj.Grid((12, 12), 1 / 11), jnp.broadcast_to(jnp.eye(2), (12, 12, 2, 2)))
+
+    def value(tensors):
+        pairs = hj.eigenpairs(hj.TensorField(field.grid, tensors), 6, multiplet="complete")
+        assert not pairs.kept.all()
+        return jnp.nansum(hj.shape_dna(pairs))
+
+    change = jnp.linspace(0, 1, 144).reshape(12, 12, 1, 1) ** 2 * field.tensors
+    along = jax.jvp(value, (field.tensors,), (change,))[1]
+    np.testing.assert_allclose(jnp.vdot(jax.grad(value)(field.tensors), change), along, rtol=1e-9)
+
+
 def test_other_bad_arguments(pairs):
     with pytest.raises(ValueError, match="energies, sigma: give both or neither"):
         hj.wks(pairs, [1.0])

@@ -115,13 +115,18 @@ class Eigenpairs(eqx.Module):
         return self.eigenvalues.shape[-1]
 
     @property
+    def null_space_known(self) -> bool:
+        """Whether these are the lowest pairs of pencils whose null spaces are known."""
+        return self.lowest and all(part.null_space is not None for part in self.pencil.parts)
+
+    @property
     def n_null(self) -> int:
         """The number of zero eigenvalues among the k.
 
         Raises:
             ValueError: values are traced, and nothing is known of the null space.
         """
-        if self.lowest and all(part.null_space is not None for part in self.pencil.parts):
+        if self.null_space_known:
             return min(self.k, sum(part.n_null for part in self.pencil.parts))
         values = jax.lax.stop_gradient(self.eigenvalues)
         if is_traced(values):
@@ -144,11 +149,15 @@ class Eigenpairs(eqx.Module):
 
     @property
     def unconfirmed(self) -> Bool[Array, ""]:
-        """Whether the solver has a certificate, and it ends before the last eigenvalue."""
+        """Whether the solver's certificate ends before the last eigenvalue.
+
+        Where the null space is known, some solvers have no certificate, and nothing is to be confirmed.
+        """
         if not self.k:
             return jnp.zeros((), bool)
         allowed = 2 * self.multiplet_tolerance * (self.last_eigenvalue - self.spectral_origin)
-        return self.complete_below < self.last_eigenvalue - allowed
+        confirmed = self.complete_below >= self.last_eigenvalue - allowed
+        return ~confirmed & ~jnp.isnan(self.complete_below) if self.null_space_known else ~confirmed
 
     @property
     def result(self) -> RESULTS:

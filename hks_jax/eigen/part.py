@@ -15,7 +15,7 @@ from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.located import LocatedPencil, locate, translated
-from hks_jax.eigen.quality import indistinct, quality
+from hks_jax.eigen.quality import indistinct, largest, quality
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
@@ -70,12 +70,14 @@ class Interval(NamedTuple):
         low: its lower end, which belongs to it.
         high: its upper end, which does not.
         below: how many eigenvalues lie under ``low``.
-        k: how many lie in it.
+        held: how many lie in it.
+        k: how many to compute; the same where values are concrete.
     """
 
     low: Float[Array, ""]
     high: Float[Array, ""]
     below: Int[Array, ""]
+    held: Int[Array, ""]
     k: int
 
 
@@ -83,14 +85,14 @@ def solve_interval(
     pencil: Pencil, interval: Interval, solver: BlockLanczos | Dense, throw: bool, report: Report
 ) -> Eigenpairs:
     """Return the k eigenpairs in [low, high)."""
-    low, high, below, k = interval
+    low, high, below, held, k = interval
     length = high - low
     moved = translated(pencil, low, below, length / (2 * max(k / SLICE, 1)), length / max(k, 1))
     nothing = jnp.zeros((0, pencil.size), low.dtype)
     found = jnp.zeros(0, low.dtype), nothing, nothing, jnp.asarray(jnp.inf, low.dtype), length
     if k:
         found = solved(solver, moved, k, 0, True, throw, report)
-    found = *found[:4], jnp.minimum(found[4], length)
+    found = *found[:4], jnp.where(held == k, jnp.minimum(found[4], length), jnp.nan)
     return _pairs(pencil, moved, low, found, solver, solver.name, lowest=False)
 
 
@@ -108,14 +110,16 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
                 "be known beforehand: `count_eigenvalues` at both ends, outside jax.jit"
             )
         require_count("k", k)
-        return Interval(low, high, certain_count(pencil, low)[0], int(k))
+        below, above = (certain_count(pencil, end)[0] for end in (low, high))
+        return Interval(low, high, below, above - below, int(k))
     if not float(low) < float(high):
         raise ValueError(f"interval: got ({float(low):g}, {float(high):g}); expected (a, b) with a < b, both finite")
     try:
         below, above = (count_eigenvalues(pencil, end) for end in (low, high))
     except ValueError as error:
         raise ValueError(f"interval: {str(error).removeprefix('below: ')}") from None
-    count = int(above - below)
+    held = above - below
+    count = int(held)
     if k is not None and k != count:
         raise ValueError(f"k: got {k}; there are {count} eigenvalues in the interval. Leave k out")
     needed = 4 * count * pencil.size * low.dtype.itemsize
@@ -125,7 +129,7 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
             f"interval: it holds {count} eigenpairs, which need about {needed / 1e9:.3g} GB, and the machine has "
             f"{available / 1e9:.3g} GB; divide the interval"
         )
-    return Interval(low, high, below, count)
+    return Interval(low, high, below, held, count)
 
 
 def _pairs(
@@ -184,8 +188,11 @@ def _quality(
     kept, part = jnp.ones(k, bool), jnp.zeros(k, int)
     if k == 0:
         return jnp.zeros(0, values.dtype), kept, kept, part, kept, jnp.asarray(1e-6, values.dtype)
-    unit = values[min(pencil.n_null, k - 1)] if known else (values[-1] - values[0]) / k
+    zero = jnp.abs(values + origin) <= indistinct(pencil, values.dtype)
+    if known:
+        unit = values[min(pencil.n_null, k - 1)]
+    else:  # where all are zero within rounding, only the size of K is left
+        unit = jnp.where(jnp.all(zero), largest(pencil), (values[-1] - values[0]) / k)
     residuals, small, rounding = quality(pencil, values, vectors, unit, tolerance)
     converged = small & (values >= 0) if known else small
-    zero = jnp.abs(values + origin) <= indistinct(pencil, values.dtype)
     return residuals, converged, kept, part, zero, jnp.clip(rounding[-1], 1e-6, 1e-3)

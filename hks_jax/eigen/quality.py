@@ -65,8 +65,10 @@ def allowed_defects(scale: Float[Array, "*m"], rounding: Float[Array, ""], toler
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
-    """Return the distance below which rounding in K alone makes two eigenvalues one: 4 ε λ_max.
+    """Return the distance below which rounding in K alone makes two eigenvalues one: 4 ε λ_max."""
+    return 4 * jnp.finfo(dtype).eps * largest(pencil)
 
-    4·max|Kᵢᵢ/Mᵢᵢ| is λ_max on a uniform grid in 2D and 3D.
-    """
-    return 4 * jnp.finfo(dtype).eps * 4 * jnp.max(jnp.abs(pencil.stiffness.diagonal()) / pencil.mass.diagonal())
+
+def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
+    """Return about the largest eigenvalue: 4·max|Kᵢᵢ/Mᵢᵢ| is λ_max on a uniform grid in 2D and 3D."""
+    return 4 * jnp.max(jnp.abs(pencil.stiffness.diagonal()) / pencil.mass.diagonal())

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,7 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.fem.sparse_input import require_null_space, sparse_pencil
-from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator
+from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
@@ -122,6 +123,10 @@ def _pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> Pencil | Mir
         domain = sparse_pencil(*domain)
     elif not isinstance(domain, Pencil | MirrorPencil):
         domain = sparse_pencil(domain)
+    if isinstance(domain, Pencil) and isinstance(domain.space, MatrixSpace):
+        matrices = domain.stiffness, domain.mass
+        symmetric = [m.symmetric_part() if isinstance(m, SparseOperator) else m for m in matrices]
+        domain = eqx.tree_at(lambda p: (p.stiffness, p.mass), domain, symmetric)
     for part in jax.lax.stop_gradient(domain).parts:
         require_null_space(part)
         if isinstance(part.space, MatrixSpace) and not is_traced(part):

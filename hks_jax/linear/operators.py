@@ -138,6 +138,11 @@ class SparseOperator(PatternedOperator):
         """Return the matrix with other entries at the same places."""
         return SparseOperator(entries, self.structure, self.table)
 
+    @jax.jit
+    def symmetric_part(self) -> "SparseOperator":
+        """Return (A + Aᵀ)/2: an entry and the one across the diagonal become one parameter, in derivatives too."""
+        return self.with_flat((self.entries + self.entries[self.pattern.across]) / 2)
+
     @property
     def _places(self) -> Ellpack:
         return self.pattern.table if self.table is None else self.table

@@ -91,6 +91,11 @@ class SparsePattern(Pattern):
         return bisect_graph(self.size, self.rows, self.cols)
 
     @cached_property
+    def across(self) -> Int[np.ndarray, " m"]:
+        """For each entry the place of the one across the diagonal."""
+        return np.lexsort((self.rows, self.cols)).astype(np.int32)
+
+    @cached_property
     def table(self) -> Ellpack:
         """The places as a table, as wide as makes products fastest: a few long rows do not widen it."""
         counts = np.bincount(self.rows, minlength=self.size)

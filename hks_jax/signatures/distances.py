@@ -43,7 +43,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
     Raises:
         ValueError: sources out of range or outside the mask; a domain of several components; no positive eigenvalue.
     """
-    known = not is_traced(jax.lax.stop_gradient(pairs.eigenvalues)) or pairs.pencil.parts[0].null_space is not None
+    known = pairs.null_space_known or not is_traced(jax.lax.stop_gradient(pairs.eigenvalues))
     if known and pairs.n_null > 1:
         raise ValueError(
             f"pairs: the domain has {pairs.n_null} components, and the biharmonic distance between two of them is "
@@ -65,11 +65,12 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
 
     NaN for pairs that are not kept.
     """
-    values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)
-    if not normalise:
-        return values
-    dimension = dimension_of(pairs, "ShapeDNA that is normalised")
-    return values * volume_of(pairs, "ShapeDNA that is normalised") ** (2 / dimension)
+    values = pairs.eigenvalues
+    if normalise:
+        dimension = dimension_of(pairs, "ShapeDNA that is normalised")
+        values = values * volume_of(pairs, "ShapeDNA that is normalised") ** (2 / dimension)
+    # NaN comes last: as 0·NaN it would reach the volume's derivative.
+    return jnp.where(pairs.kept, values, jnp.nan)
 
 
 def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:

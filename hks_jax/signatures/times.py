@@ -94,8 +94,7 @@ def _n_positive(pairs: Eigenpairs) -> int:
     values, kept = jax.lax.stop_gradient((pairs.eigenvalues, pairs.kept))
     if not is_traced((values, kept)):
         return int((kept & (values > 0)).sum())
-    known = pairs.lowest and all(part.null_space is not None for part in pairs.pencil.parts)
-    return pairs.k - pairs.n_null if known else pairs.k
+    return pairs.k - pairs.n_null if pairs.null_space_known else pairs.k
 
 
 def default_times(pairs: Eigenpairs, n: int = 16) -> Float[Array, " n"]:
