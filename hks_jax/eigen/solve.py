@@ -60,9 +60,10 @@ def eigenpairs(
             and in an interval, only ``"dense"`` and ``"block-lanczos"``; derivatives in an interval take the
             tolerance of the solver's ``adjoint`` alone.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
-        multiplet: what to do with a multiple eigenvalue that k cuts. ``"report"`` warns; ``"drop"`` leaves its copies
-            out of every signature; ``"complete"`` computes 8 pairs more and takes the missing copies in (or drops
-            it, if 8 are too few). What is left out is still in the arrays, and marked in ``.kept``.
+        multiplet: what to do with a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns;
+            ``"drop"`` leaves its copies out of every signature; ``"complete"`` computes 8 pairs more and takes the
+            missing copies in (or drops it, if 8 are too few). What is left out is still in the arrays, and marked in
+            ``.kept``.
         throw: whether a failure is an error, also under `jit`, where no warning is possible: pairs whose ``.result`` is
             not successful, and derivatives that do not converge. It takes a callback to the host. Else pairs carry the
             code and derivatives are NaN, with a warning where values are concrete.
