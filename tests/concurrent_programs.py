@@ -72,7 +72,7 @@ def gradients_on_devices():
 
 
 def two_eigsh():
-    n = 1200
+    n = 1600
     path = BCOO.from_scipy_sparse(sp.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(n, n), format="csr"))
 
     def eigenvalues(entries):

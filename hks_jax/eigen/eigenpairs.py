@@ -1,5 +1,6 @@
 """Eigenpairs, and what is known of their quality."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -155,9 +156,8 @@ class Eigenpairs(eqx.Module):
         """
         if not self.k:
             return jnp.zeros((), bool)
-        allowed = 2 * self.multiplet_tolerance * (self.last_eigenvalue - self.spectral_origin)
-        confirmed = self.complete_below >= self.last_eigenvalue - allowed
-        return ~confirmed & ~jnp.isnan(self.complete_below) if self.null_space_known else ~confirmed
+        known = self.eigenvalues, self.kept, self.complete_below, self.spectral_origin, self.multiplet_tolerance
+        return _unconfirmed(*known, self.null_space_known)
 
     @property
     def result(self) -> RESULTS:
@@ -200,6 +200,20 @@ def multiplet_gap(
 @jax.jit
 def _last(values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, ""]:
     return values[jnp.sum(kept) - 1]
+
+
+@partial(jax.jit, static_argnames="optional")
+def _unconfirmed(
+    values: Float[Array, " k"],
+    kept: Bool[Array, " k"],
+    bound: Float[Array, ""],
+    origin: Float[Array, ""],
+    multiplet_tolerance: Float[Array, ""],
+    optional: bool,
+) -> Bool[Array, ""]:
+    last = _last(values, kept)
+    confirmed = bound >= last - 2 * multiplet_tolerance * (last - origin)
+    return ~confirmed & ~(optional & jnp.isnan(bound))
 
 
 @jax.jit

@@ -146,10 +146,12 @@ def _pairs(
     held = jax.lax.stop_gradient((tabulated(solved_pencil), values, vectors))
     known = not isinstance(solved_pencil, LocatedPencil) and solved_pencil.null_space is not None
     residuals, converged, kept, part, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
+    # Of a constant JAX makes a number where it differentiates.
+    following, bound = jnp.asarray(following), jnp.asarray(bound)
     if not known:
         # Eigenvalues that are zero within rounding become exactly zero; their derivatives stay.
-        values = values + origin
-        values = values + jax.lax.stop_gradient(jnp.where(zero, -values, 0))
+        values = values + origin + jax.lax.stop_gradient(jnp.where(zero, -values - origin, 0))
+        following, bound = following + origin, bound + origin
     return Eigenpairs(
         values,
         vectors,
@@ -158,8 +160,8 @@ def _pairs(
         converged,
         kept=kept,
         part=part,
-        next_eigenvalue=jnp.asarray(following) + origin,  # of a constant JAX makes a number where it differentiates
-        complete_below=jnp.asarray(bound) + origin,
+        next_eigenvalue=following,
+        complete_below=bound,
         spectral_origin=origin
         if known or isinstance(solved_pencil, LocatedPencil)
         else jax.lax.stop_gradient(values[0]),
