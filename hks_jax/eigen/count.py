@@ -10,7 +10,7 @@ from hks_jax.checks import require_number
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.quality import indistinct
+from hks_jax.eigen.quality import largest
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import MirrorPencil, Pencil
@@ -127,4 +127,4 @@ def _smallest_scale(pencil: SymmetricPencil | MirrorPencil) -> Float[Array, ""]:
         assert pencil.volume is not None
         return 1 / pencil.volume ** (2 / pencil.space.dimension)
     assert isinstance(pencil, SymmetricPencil)
-    return indistinct(pencil, pencil.stiffness.dtype)
+    return 1e-6 * largest(pencil)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
@@ -17,7 +17,7 @@ from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
-from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import with_transpose
 from hks_jax.linear.one_by_one import one_by_one
@@ -71,10 +71,11 @@ def solved(
 #
 # Within a multiple eigenvalue the rotation (j ≠ i, λᵢ = λⱼ) is a matter of gauge: a perturbation may choose any basis
 # there. The rule takes −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN; and so it does where the gap is
-# below √ε λ, because dividing by it would leave no digits. So dφᵢ is the derivative of an eigenvector only where λᵢ is
-# simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What does not depend on the basis, such
-# as every spectral function, must not be computed from that gauge. For it there is the frame: its derivative has the
-# sum over j > k alone, which no basis of the first k changes (hks_jax/signatures/spectral.py).
+# below √ε (λ − λ₀), λ₀ the lowest computed, because dividing by it would leave no digits. So dφᵢ is the derivative of
+# an eigenvector only where λᵢ is simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What
+# does not depend on the basis, such as every spectral function, must not be computed from that gauge. For it there is
+# the frame: its derivative has the sum over j > k alone, which no basis of the first k changes
+# (hks_jax/signatures/spectral.py).
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver,
@@ -162,7 +163,8 @@ def tangents_of(
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     gap = eigenvalues[:, None] - values
-    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(jnp.abs(eigenvalues)[:, None], jnp.abs(values))
+    above = values - jnp.nanmin(values)
+    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(above[:k, None], above)
     apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
     inverse = jnp.where(apart, 1 / jnp.where(apart, gap, 1), 0)
     # Apart from the guards: reverse mode of the frame needs the product with these alone.
@@ -262,3 +264,22 @@ def _exact_null_modes(
     vectors = vectors - product(share, nulls)
     vectors = vectors / jnp.sqrt(1 - jnp.sum(share * share, axis=1, keepdims=True))
     return values.at[:n_null].set(0), vectors.at[:n_null].set(nulls)
+
+
+@jax.custom_jvp
+def frame_within(
+    vectors: Float[Array, "k n_dof"], pencil: Pencil | MirrorPencil, part: Int[Array, " k"]
+) -> Float[Array, "k n_dof"]:
+    """Return the vectors as a frame: their derivative without what rotates them among themselves.
+
+    It serves vectors that were chosen from more: frames of all leave out rotations into those that were not chosen.
+    """
+    return vectors
+
+
+@frame_within.defjvp
+def _frame_within_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    vectors, pencil, part = first_order_only(primals)
+    change = tangents[0]
+    inside = pencil.among(pencil.apply_mass(change, part), part, vectors, part)
+    return vectors, change - combine(inside, vectors)

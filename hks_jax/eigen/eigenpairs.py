@@ -68,8 +68,8 @@ class Eigenpairs(eqx.Module):
         complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
             because all were computed; in an interval, none between its lower end and the bound. NaN where there is
             none. Constant to derivatives.
-        spectral_origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else a number at or just below the lowest
-            one; the lower end of an interval.
+        spectral_origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else the lowest one; the lower end of an
+            interval.
         multiplet_tolerance: the gap, relative to the distance from that origin, below which neighbouring eigenvalues
             count as one multiple eigenvalue.
         pencil: the matrices.
@@ -139,7 +139,9 @@ class Eigenpairs(eqx.Module):
 
     @property
     def last_eigenvalue(self) -> Float[Array, ""]:
-        """The largest eigenvalue that is kept."""
+        """The largest eigenvalue that is kept; NaN where there is none."""
+        if not self.k:
+            return jnp.full((), jnp.nan, self.eigenvalues.dtype)
         return _last(self.eigenvalues, self.kept)
 
     @property
@@ -173,6 +175,8 @@ class Eigenpairs(eqx.Module):
 
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Needs concrete values."""
+        if not self.k:
+            return "no eigenpairs: there are none in the interval"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
         kept, following = int(self.kept.sum()), float(self.next_eigenvalue)
         last = float(self.last_eigenvalue)

@@ -5,8 +5,6 @@ from typing import Any
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver, Report
-from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.sparse_input import sparse_pencil
 
 
 def eigsh(
@@ -54,5 +52,6 @@ def eigsh(
     Warns:
         AccuracyWarning: pairs that did not converge, a bound that is not confirmed, a multiple eigenvalue that k cuts.
     """
-    pencil = K if isinstance(K, Pencil) and M is None else sparse_pencil(K, M)
-    return eigenpairs(pencil, k, solver=solver or "auto", throw=throw, progress=progress, interval=interval)
+    return eigenpairs(
+        K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress, interval=interval
+    )

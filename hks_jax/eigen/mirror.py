@@ -7,16 +7,15 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.derivative import frame_within
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.part import solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.pencil import MirrorPencil
-from hks_jax.linear.products import combine
 from hks_jax.traced import is_traced
 
 
@@ -104,7 +103,7 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: 
     return Eigenpairs(
         values[lowest],
         vectors,
-        _frame(vectors, pencil, part),
+        frame_within(vectors, pencil, part),
         jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
         jnp.concatenate([pairs.converged for pairs in solved])[lowest],
         kept=jnp.ones(lowest.shape, bool),
@@ -124,20 +123,3 @@ def _complete_below(pairs: Eigenpairs) -> Float[Array, ""]:
     if pairs.k == pairs.space.n_dof or not pairs.lowest:
         return pairs.complete_below
     return jnp.minimum(pairs.complete_below, pairs.eigenvalues[-1])
-
-
-@jax.custom_jvp
-def _frame(vectors: Float[Array, "k n_dof"], pencil: MirrorPencil, part: Int[Array, " k"]) -> Float[Array, "k n_dof"]:
-    """Return the vectors; their derivative, without what rotates them among themselves.
-
-    The parts' own frames do not serve: they leave out rotations among more pairs than the merged spectrum has.
-    """
-    return vectors
-
-
-@_frame.defjvp
-def _frame_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    vectors, pencil, part = first_order_only(primals)
-    change = tangents[0]
-    inside = pencil.among(pencil.apply_mass(change, part), part, vectors, part)
-    return vectors, change - combine(inside, vectors)

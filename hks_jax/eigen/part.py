@@ -11,7 +11,7 @@ from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.count import certain_count, count_eigenvalues
 from hks_jax.eigen.dense import Dense
-from hks_jax.eigen.derivative import solved
+from hks_jax.eigen.derivative import frame_within, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.located import LocatedPencil, locate, translated
@@ -20,6 +20,9 @@ from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
+
+_FAR = 30
+"""How many times the spread of the wanted eigenvalues the origin may lie below them."""
 
 
 def solve_lowest(
@@ -57,9 +60,16 @@ def solve_lowest(
     spacing = (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
     moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spacing)
     found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+    values = jax.lax.stop_gradient(found[0])
+    if not is_traced(values) and (spread := values[-1] - values[0]) > 0 and values[0] > _FAR * spread:
+        # Once more, from an origin nearer to the spectrum: distances from one so far below would lose their digits.
+        origin, first = origin + values[0] - spread, origin + values[-1]
+        moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spread / number)
+        found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
     if number > k:
-        values, vectors, frame, _, bound = found
-        found = values[:k], vectors[:k], frame[:k], jax.lax.stop_gradient(values[k]), bound
+        values, vectors, _, _, bound = found
+        frame = frame_within(vectors[:k], pencil, jnp.zeros(k, int))
+        found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method, name if method is solver else method.name)
 
 
@@ -162,9 +172,7 @@ def _pairs(
         part=part,
         next_eigenvalue=following,
         complete_below=bound,
-        spectral_origin=origin
-        if known or isinstance(solved_pencil, LocatedPencil)
-        else jax.lax.stop_gradient(values[0]),
+        spectral_origin=origin if known or not lowest else jax.lax.stop_gradient(values[0]),
         multiplet_tolerance=tolerance,
         pencil=pencil,
         solver_name=name,

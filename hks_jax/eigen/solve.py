@@ -95,7 +95,7 @@ def eigenpairs(
         if not isinstance(k, int | float | np.number) or k != k // 1 or not 1 <= k <= total:
             raise ValueError(
                 f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
-                "Use a smaller k or a finer grid"
+                "Use a smaller k or a finer grid, or give an interval"
             )
         pairs = _lowest(pencil, int(k), solver, multiplet, throw, report)
     if throw:
@@ -110,7 +110,7 @@ def eigenpairs(
 
 def _pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> Pencil | MirrorPencil:
     """Return the pencil that a domain, or what a user gives in its place, stands for; checked where it is theirs."""
-    matrix = issparse(domain) or isinstance(domain, BCOO | BCSR | Operator | np.ndarray | jax.Array)
+    matrix = issparse(domain) or isinstance(domain, BCOO | BCSR | Operator | np.ndarray | jax.Array | list)
     given = matrix or isinstance(domain, SymmetricPencil | MirrorPencil | tuple)
     if not given:
         return assemble(domain, boundary, mass)

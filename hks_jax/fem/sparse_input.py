@@ -22,6 +22,10 @@ _ROUNDING = 1000
 """By how many units of rounding of the largest entry a matrix may differ from its transpose."""
 
 
+_FEW = 8
+"""Null vectors that are checked one by one."""
+
+
 class _Entries(NamedTuple):
     """A matrix by its entries, of which those at one place add up."""
 
@@ -73,8 +77,10 @@ def sparse_pencil(
     n, dtype = pencil.size, pencil.stiffness.dtype
     if dimension not in (None, 2, 3):
         raise ValueError(f"dimension: got {dimension!r}; expected 2 or 3, or None if there is none")
-    if shape is not None and math.prod(shape) != n:
-        raise ValueError(f"shape: got {shape}, {math.prod(shape)} nodes; expected {n} in all")
+    if shape is not None:
+        shape = (shape,) if isinstance(shape, int) else tuple(shape)
+        if math.prod(shape) != n or min(shape) < 1:
+            raise ValueError(f"shape: got {shape}, {math.prod(shape)} nodes; expected {n} in all")
     if volume is not None:
         require_number("volume", volume)
         volume = jnp.asarray(volume, dtype)
@@ -90,10 +96,14 @@ def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[A
     if not is_traced(vectors) and len(vectors):
         lengths = np.linalg.norm(np.asarray(vectors), axis=1, keepdims=True)
         sizes = np.linalg.svd(np.asarray(vectors) / np.where(lengths > 0, lengths, 1), compute_uv=False)
-        if sizes[-1] < len(vectors) * np.sqrt(np.finfo(vectors.dtype).eps):
-            raise ValueError("null_vectors: they depend on each other; expected a basis, without zero vectors")
+        if sizes[-1] < np.finfo(vectors.dtype).eps ** 0.25:
+            raise ValueError(
+                f"null_vectors: they depend on each other, their least singular value is {sizes[-1]:.2g}; expected a "
+                "basis without zero vectors, as orthogonal as may be"
+            )
     require_null_space(SymmetricPencil(pencil.stiffness, pencil.mass, null_space=NullSpace(vectors)))
-    return vectors
+    # Orthonormal, so that what becomes M-orthonormal of them does so to rounding.
+    return vectors if is_traced(vectors) else jnp.asarray(np.linalg.qr(np.asarray(vectors).T)[0].T)
 
 
 def require_null_space(pencil: SymmetricPencil) -> None:
@@ -113,8 +123,11 @@ def require_null_space(pencil: SymmetricPencil) -> None:
         return float(np.abs(image).max() / max(np.abs(vector).max(), finfo.tiny) / size)
 
     vectors = np.asarray(pencil.null_space.vectors)
-    signs = np.random.default_rng(0).choice([-1, 1], len(vectors))
-    if defect(signs @ vectors) > _ROUNDING * finfo.eps:
+    lengths = np.abs(vectors).max(axis=1, keepdims=True)
+    # Of many, a random combination does for all.
+    weights = np.random.default_rng(0).standard_normal(len(vectors))
+    some = vectors if len(vectors) <= _FEW else [weights @ (vectors / np.where(lengths > 0, lengths, 1))]
+    if max(map(defect, some)) > _ROUNDING * finfo.eps:
         defects = [defect(vector) for vector in vectors]
         worst = int(np.argmax(defects))
         raise ValueError(
@@ -126,8 +139,9 @@ def require_null_space(pencil: SymmetricPencil) -> None:
 
 def _pencil(K: Any, M: Any) -> SymmetricPencil:
     stiffness = _entries("K", K)
+    dtype = stiffness.values.dtype
     n = stiffness.size
-    diagonal, mass = _diagonal(M, n, stiffness.values.dtype), None
+    diagonal, mass = _diagonal(M, n, dtype), None
     if diagonal is None:
         mass = _entries("M", M)
         if mass.size != n:
@@ -135,6 +149,9 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
         if (mass.rows == mass.cols).all():
             index = jnp.asarray(mass.rows)
             diagonal = jnp.zeros(n, mass.values.dtype).at[index].add(mass.values)
+    given = diagonal.dtype if mass is None and diagonal is not None else mass.values.dtype  # type: ignore[union-attr]
+    if given != dtype:
+        raise ValueError(f"M: got {given}, and K is {dtype}; expected one dtype. Convert one of them with .astype")
     if diagonal is not None:
         _check_diagonal(diagonal)
         pattern = _pattern(n, stiffness)

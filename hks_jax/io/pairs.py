@@ -1,6 +1,5 @@
 """Eigenpairs in files, so that other times take no other computation."""
 
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +19,7 @@ ARRAYS = (
     "residuals",
     "converged",
     "kept",
+    "lowest",
     "spectral_origin",
     "part",
     "next_eigenvalue",
@@ -88,13 +88,14 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: Pencil | Mirro
             f"{name}: got eigenfunctions of shape {values['vectors'].shape}; expected {(k, n)}, those of this pencil. "
             "Are mask and boundary those that the pairs were computed with?"
         )
-    pairs = Eigenpairs(
-        **values, frame=values["vectors"], pencil=pencil, solver_name=str(np.asarray(arrays["solver_name"]))
-    )
+    lowest = bool(values.pop("lowest"))
+    solver_name = str(np.asarray(arrays["solver_name"]))
+    pairs = Eigenpairs(**values, lowest=lowest, frame=values["vectors"], pencil=pencil, solver_name=solver_name)
     images, masses = (apply(pairs.vectors, pairs.part) for apply in (pencil.apply_stiffness, pencil.apply_mass))
     gap = jnp.linalg.norm(images - pairs.eigenvalues[:, None] * masses, axis=1) / jnp.linalg.norm(masses, axis=1)
-    following = float(pairs.next_eigenvalue)
-    worst = float(jnp.max(gap)) / (following if math.isfinite(following) else float(pairs.eigenvalues[-1]))
+    ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
+    size = np.max(np.abs(ends[np.isfinite(ends)]))
+    worst = float(jnp.max(gap, initial=0)) / max(size, np.finfo(ends.dtype).tiny)
     if not worst < _FAR:
         raise ValueError(
             f"{name}: these pairs do not solve Kφ = λMφ for this pencil (relative residual {worst:.1e}); expected the "

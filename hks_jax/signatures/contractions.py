@@ -86,7 +86,7 @@ class SquaredDistances(_FromSources):
         return self._map(vectors, reading)
 
     def _map(self, vectors: Float[Array, "k n"], reading: Callable[[Array], Array]) -> Float[Array, "m s nodes"]:
-        nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], -1)
+        nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], self.space.free.size)
         readings = jax.lax.map(lambda source: reading(nodal - source[:, None]), self.at_sources(vectors).T)
         return jnp.moveaxis(readings, 0, 1)
 

@@ -79,6 +79,8 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
     NaN for pairs that are not kept.
     """
     positive_range(pairs)
-    n = pairs.n_null
+    n = pairs.n_null  # raises where that is not known
+    if not pairs.null_space_known:  # negative ones come first
+        n = int((jax.lax.stop_gradient(pairs.eigenvalues) <= 0).sum())
     values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)[n:]
     return pairs.space.extend(pairs.vectors[n:] / jnp.sqrt(values[:, None]))

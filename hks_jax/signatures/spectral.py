@@ -133,6 +133,8 @@ def _tangent(
     d_pencil: Pencil | MirrorPencil,
     d_frame: Float[Array, "k n_dof"],
 ) -> Array:
+    if not len(vectors):
+        return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where it does not count
     size = even_size(len(vectors), _ROWS)
     starts, place = row_blocks(len(vectors), size)

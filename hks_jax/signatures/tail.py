@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.special import gammainccinv
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import spectral_diagonal
-from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.times import bottom_of, checked_times, require_pairs
 
 _LEAST_EXPONENT, _GREATEST_EXPONENT = 0.5, 8.0
 """Between a strip, which is a line to all eigenfunctions that were computed, and a corner of Dirichlet sides in 3D."""
@@ -77,15 +78,19 @@ def truncation_map(
         where all pairs were computed. Constant to derivatives.
 
     Raises:
-        ValueError: times that are not positive and finite.
+        ValueError: times that are not positive and finite; pairs in an interval.
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
+    if not pairs.lowest:
+        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
     return _map(*jax.lax.stop_gradient((pairs, checked_times("times", times, dtype))))
 
 
 @jax.jit
 def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
-    dtype = at.dtype
+    dtype, bottom = at.dtype, bottom_of(pairs)
+    moved = pairs.eigenvalues - bottom, pairs.next_eigenvalue - bottom
+    pairs = eqx.tree_at(lambda p: (p.eigenvalues, p.next_eigenvalue), pairs, moved)
     complete, axes = jnp.isinf(pairs.next_eigenvalue), (1,) * len(pairs.space.node_shape)
     following = jnp.where(complete, 1, pairs.next_eigenvalue)
     at_zero = jnp.zeros(1, dtype)

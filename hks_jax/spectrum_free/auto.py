@@ -105,6 +105,8 @@ def hks(
         raise ValueError(f'method: got {method!r}; expected "spectral", "spectrum-free" or "auto"')
     times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
     require_number("tolerance", tolerance, 1)
+    if not pairs.lowest:
+        raise ValueError('method: got "spectrum-free" for pairs in an interval; expected "spectral"')
     return _scaled(pairs, times, normalisation, _without(pairs.pencil, times, tolerance))
 
 
