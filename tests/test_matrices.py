@@ -318,3 +318,77 @@ def test_too_few_pairs_of_an_interval_are_told():
     run = eqx.filter_jit(lambda pencil, k: hj.eigsh(pencil, k=k, interval=(0.05, 2.0)).result)
     assert run(pencil, held) == hj.RESULTS.successful
     assert run(pencil, held - 1) == hj.RESULTS.unconfirmed
+
+
+def path(n):
+    """The Laplacian of a path."""
+    ends = np.r_[1.0, 2 * np.ones(n - 2), 1.0]
+    return sp.diags([ends, -np.ones(n - 1), -np.ones(n - 1)], [0, 1, -1]).tocsr()
+
+
+@pytest.mark.parametrize("offset", [0.0, -1e5, 1e5])
+@pytest.mark.parametrize("solver", ["dense", "block-lanczos"])
+def test_an_offset_changes_no_derivative(offset, solver):
+    """Gaps, and not eigenvalues, say which eigenvectors are known, wherever the spectrum lies."""
+    n, k = 300, 8
+    pencil, change = sparse_path(n), np.sin(0.7 * np.arange(n))
+    full = path(n).toarray()
+
+    def signature(potential):
+        moved = pencil.with_stiffness(pencil.stiffness.plus(offset + potential))
+        pairs = hj.eigenpairs(moved, k, solver=solver)
+        return hj.spectral_signature(pairs, lambda t, x: jnp.exp(-t * (x - offset)), jnp.ones(1))[0, 5]
+
+    def exact(h):
+        values, vectors = scipy.linalg.eigh(full + h * np.diag(change))
+        return np.exp(-values[:k]) @ vectors[5, :k] ** 2
+
+    along = (exact(1e-5) - exact(-1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(signature)(jnp.zeros(n)) @ change, along, rtol=1e-5)
+
+
+def sparse_path(n):
+    return hj.sparse_pencil(path(n))
+
+
+def test_pairs_in_an_interval_stay_so_in_files(tmp_path):
+    pencil = sparse_path(30)
+    read = load_pairs(save_pairs(tmp_path / "pairs.npz", hj.eigsh(pencil, interval=(0.1, 0.95))), pencil)
+    assert not read.lowest
+    with pytest.raises(ValueError, match="pairs: these lie in an interval"):
+        hj.truncation_map(read, [1.0])
+    moved = hj.sparse_pencil(path(30) + sp.diags(np.linspace(-1, 1, 30)))
+    file = save_pairs(tmp_path / "moved.npz", hj.eigsh(moved, k=3))
+    load_pairs(file, moved)
+    with pytest.raises(ValueError, match="these pairs do not solve"):
+        load_pairs(file, hj.sparse_pencil(5 * path(30)))
+
+
+@pytest.mark.parametrize("offset", [-3.0, 3.0])
+def test_what_lies_beyond_is_estimated_from_the_bottom_of_the_spectrum(offset):
+    plain = hj.assemble(hj.TensorField(hj.Grid((14, 14), 1.0), jnp.broadcast_to(jnp.eye(2), (14, 14, 2, 2))))
+    moved = plain.with_stiffness(plain.stiffness.plus(offset * (plain.mass @ jnp.ones(plain.size))))
+    few, all_pairs = hj.eigenpairs(moved, 10), hj.eigenpairs(moved, plain.size)
+    true = 1 - hj.heat_trace(few, [0.5]) / hj.heat_trace(all_pairs, [0.5])
+    np.testing.assert_allclose(hj.truncation(few, [0.5]).tail, true, rtol=0.2)
+
+
+def test_vectors_that_only_add_up_to_a_null_vector_are_refused():
+    halves = np.zeros((2, 60))
+    halves[0, :25] = halves[1, 25:] = 1
+    with pytest.raises(ValueError, match="null_vectors: the stiffness does not annihilate vector 0"):
+        hj.sparse_pencil(path(60), null_vectors=halves)
+
+
+def test_only_positive_eigenvalues_have_a_point_signature():
+    pairs = hj.eigsh(sp.diags([-2.0, -1.0, 0.0, 1.0, 4.0]).tocsr(), k=5)
+    np.testing.assert_allclose(np.abs(hj.global_point_signature(pairs)), [[0, 0, 0, 1, 0], [0, 0, 0, 0, 0.5]])
+
+
+def test_an_empty_interval_has_signatures_and_derivatives():
+    pencil = sparse_path(30)
+    pairs = hj.eigsh(pencil, interval=(-50.0, -49.0))
+    assert "no eigenpairs" in pairs.summary()
+    np.testing.assert_array_equal(hj.diffusion_distance(pairs, [1.0], [0]), 0)
+    gradient = jax.grad(lambda p: jnp.sum(hj.hks(hj.eigsh(p, interval=(-50.0, -49.0)), [1.0])))(pencil)
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient))
