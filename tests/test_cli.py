@@ -223,10 +223,11 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
         assert image.shape == (*SHAPE, 5, 2)
         np.testing.assert_allclose(image.affine, nib.load(nifti).affine)
         np.testing.assert_array_equal(image.get_fdata(), np.moveaxis(read["hks"], 0, -1))
-    # Two columns of three slices with a colour bar each; the lines cross at voxel (8, 5, 3), in mm.
+    # Two columns of three slices with a colour bar each; the lines cross at voxel (8, 5, 3), in coordinates of space.
+    place = nib.load(nifti).affine @ [8, 5, 3, 1]
     panels = drawn[0].axes
     assert len(panels) == 8
-    assert [line.get_xdata()[0] for line in panels[0].lines][:1] == [16.0]
+    assert [line.get_xdata()[0] for line in panels[0].lines][:1] == [place[0]]
     assert "t^{-3/2}" in panels[6].get_xlabel()
 
 

@@ -530,7 +530,8 @@ def test_a_killed_study_is_resumed_with_the_same_result(study):
     """Three volumes in processes of their own, killed once a subject is there; the times are automatic."""
 
     def start(out):
-        arguments = [word for word in command(study, out, "--boundary", "mean") if word not in ("--slice", "z=1")]
+        words = command(study, out, "--boundary", "mean")
+        arguments = ["80" if word == "8" else word for word in words if word not in ("--slice", "z=1")]
         return [sys.executable, "-m", "hks_jax", *arguments]
 
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}

@@ -118,6 +118,8 @@ class Eigenpairs(eqx.Module):
     @property
     def null_space_known(self) -> bool:
         """Whether these are the lowest pairs of pencils whose null spaces are known."""
+        if self.pencil is None:  # those that a fit hands over carry no matrices; it is one of fields
+            return self.lowest
         return self.lowest and all(part.null_space is not None for part in self.pencil.parts)
 
     @property
