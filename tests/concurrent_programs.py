@@ -50,7 +50,7 @@ def count_of_batch():
 
 
 def gradient(boundary):
-    return jax.jit(jax.grad(partial(signature, boundary, 30))), flat(40, 40)
+    return jax.jit(jax.grad(partial(signature, boundary, 16))), flat(26, 26)
 
 
 def product_of_two():
@@ -61,8 +61,8 @@ def product_of_two():
 
 
 def gradients_of_batch(solver):
-    gradients = jax.vmap(jax.grad(partial(signature, "mirror", 10, solver=solver)))
-    return jax.jit(gradients), jnp.stack([flat(20, 20), 1.3 * flat(20, 20)])
+    gradients = jax.vmap(jax.grad(partial(signature, "mirror", 8, solver=solver)))
+    return jax.jit(gradients), jnp.stack([flat(16, 16), 1.3 * flat(16, 16)])
 
 
 def gradients_on_devices():
