@@ -218,8 +218,8 @@ def _unconfirmed(
     optional: bool,
 ) -> Bool[Array, ""]:
     last = _last(values, kept)
-    confirmed = bound >= last - 2 * multiplet_tolerance * (last - origin)
-    return ~confirmed & ~(optional & jnp.isnan(bound))
+    needed = last - 2 * multiplet_tolerance * (last - origin)
+    return bound < needed if optional else ~(bound >= needed)
 
 
 @jax.jit
