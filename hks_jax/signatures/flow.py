@@ -12,7 +12,7 @@ from hks_jax.checks import require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import spectral_flow
-from hks_jax.signatures.times import bottom_of, checked_times, require_pairs
+from hks_jax.signatures.times import checked_times, require_pairs
 from hks_jax.signatures.truncation import TAIL_LIMIT
 from hks_jax.traced import is_traced
 
@@ -65,7 +65,7 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
     squared = n_parts * jnp.sum(u * image, axis=1)
     beyond = jnp.maximum(squared - jnp.sum(jnp.where(used, coefficients**2, 0), axis=1), 0)
     share = float(jnp.max(jnp.where(squared > 0, beyond / jnp.where(squared > 0, squared, 1), 0))) ** 0.5
-    rate = float(pairs.next_eigenvalue - bottom_of(pairs)) if pairs.k else np.inf
+    rate = float(pairs.next_eigenvalue - pairs.spectral_origin)
     left = share * float(np.exp(-float(jnp.min(times)) * rate))
     if left > TAIL_LIMIT:
         enough = np.log(share / TAIL_LIMIT) / rate

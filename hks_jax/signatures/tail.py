@@ -15,7 +15,7 @@ from scipy.special import gammainccinv
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import spectral_diagonal
-from hks_jax.signatures.times import bottom_of, checked_times, require_pairs
+from hks_jax.signatures.times import checked_times, require_pairs
 
 _LEAST_EXPONENT, _GREATEST_EXPONENT = 0.5, 8.0
 """Between a strip, which is a line to all eigenfunctions that were computed, and a corner of Dirichlet sides in 3D."""
@@ -88,7 +88,7 @@ def truncation_map(
 
 @jax.jit
 def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
-    dtype, bottom = at.dtype, bottom_of(pairs)
+    dtype, bottom = at.dtype, pairs.spectral_origin
     moved = pairs.eigenvalues - bottom, pairs.next_eigenvalue - bottom
     pairs = eqx.tree_at(lambda p: (p.eigenvalues, p.next_eigenvalue), pairs, moved)
     complete, axes = jnp.isinf(pairs.next_eigenvalue), (1,) * len(pairs.space.node_shape)

@@ -62,12 +62,6 @@ def volume_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
     return volume
 
 
-def bottom_of(pairs: Eigenpairs) -> Float[Array, ""]:
-    """Return where the spectrum begins: 0 where the null space is known, else at the lowest eigenvalue."""
-    first = pairs.eigenvalues[0]
-    return jnp.zeros_like(first) if pairs.null_space_known else first
-
-
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     """Return the first positive and the last eigenvalue.
 

@@ -16,7 +16,7 @@ from hks_jax.fem.resolution import Resolution
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import sum_of
 from hks_jax.signatures.tail import beyond_by_weyl, resolving
-from hks_jax.signatures.times import bottom_of, checked_times, dimension_of, require_pairs
+from hks_jax.signatures.times import checked_times, dimension_of, require_pairs
 from hks_jax.traced import is_traced
 
 TAIL_LIMIT = 0.01
@@ -96,7 +96,7 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     if not pairs.lowest:
         raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
     # Weyl's law counts from the bottom of the spectrum, which a potential moves.
-    bottom = bottom_of(pairs)
+    bottom = pairs.spectral_origin
     known = pairs.pencil.resolution, pairs.eigenvalues - bottom, pairs.kept, pairs.next_eigenvalue - bottom
     return _truncation(
         *jax.lax.stop_gradient((*known, checked_times("times", times, dtype))),
