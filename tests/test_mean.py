@@ -214,3 +214,15 @@ def test_bad_boundaries_are_named(rng):
         hj.boundary_influence(field, [1.0])
     with pytest.warns(hj.AccuracyWarning, match="acts nowhere: there is no mask"):
         hj.assemble(flat((5, 5), (1.0, 1.0)), ("neumann", "neumann", "dirichlet"))
+
+
+@pytest.mark.parametrize("boundary", ["mean", "mirror", ("mirror", "mean")])
+def test_a_part_that_others_include_has_no_more_than_its_share_of_pairs(boundary, rng):
+    field = hj.TensorField(hj.Grid((9, 8), 0.1), random_spd(rng, (9, 8)))
+    pairs = hj.eigenpairs(field, 60, boundary)
+    counts = np.bincount(np.asarray(pairs.part), minlength=len(pairs.pencil.parts))
+    shares = [60 // len(including) for including in pairs.pencil.including]
+    assert (counts <= shares).all()
+    assert sorted(map(len, pairs.pencil.including)) == ([1, 2] if len(shares) == 2 else [1, 2, 2, 4])
+    traced = jax.jit(lambda t: hj.eigenpairs(hj.TensorField(field.grid, t), 60, boundary).eigenvalues)(field.tensors)
+    np.testing.assert_allclose(traced, pairs.eigenvalues, atol=1e-9 * pairs.eigenvalues[-1])

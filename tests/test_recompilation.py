@@ -91,7 +91,7 @@ def test_matrices_scale_with_the_spacing(rng):
     assert not seen
     for ours, other in ((fine.stiffness, unit.stiffness), (fine.mass, unit.mass)):
         np.testing.assert_allclose(ours.to_dense(), other.to_dense(), atol=1e-13)
-    np.testing.assert_allclose(fine.mesh_width, unit.mesh_width, rtol=1e-13)
+    np.testing.assert_allclose(fine.resolution.mesh_width, unit.resolution.mesh_width, rtol=1e-13)
     assert fine.space == unit.space
     assert hash(fine.space) == hash(unit.space)
 

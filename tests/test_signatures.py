@@ -202,9 +202,14 @@ def test_truncation_map_finds_the_worst_node(rng, shape, boundary, spread):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_medians_by_bisection_are_those_of_sorting(rng, dtype):
     shares = np.concatenate([rng.uniform(0, 1, (3, 41)), np.zeros((1, 41)), np.ones((1, 41))]).astype(dtype)
-    np.testing.assert_allclose(median_of_shares(jnp.asarray(shares)), np.median(shares, axis=1), rtol=3e-7, atol=1e-12)
-    shares[1, 5] = np.nan
-    np.testing.assert_array_equal(np.isnan(median_of_shares(jnp.asarray(shares))), np.arange(5) == 1)
+    free = np.arange(60) % 3 != 1  # 40 of 60; the others count as zero
+    padded = np.zeros((5, 60), dtype)
+    padded[:, free] = shares[:, :40]
+    found = median_of_shares(jnp.asarray(padded), jnp.asarray(free))
+    # Of an even number, the lower of the two in the middle.
+    np.testing.assert_allclose(found, np.sort(shares[:, :40], axis=1)[:, 19], rtol=3e-7, atol=1e-12)
+    padded[1, 5] = np.nan
+    np.testing.assert_array_equal(np.isnan(median_of_shares(jnp.asarray(padded), jnp.asarray(free))), np.arange(5) == 1)
 
 
 def test_resolution_bias_bounds_the_discretisation_error():
@@ -256,7 +261,7 @@ def test_tensors_that_do_not_turn_have_no_lasting_bias(rng):
     conformal = np.exp(grid.nodes @ [1.0, 2.0])[..., None, None] * np.eye(2)
     for field in (hj.TensorField(grid, constant), hj.TensorField(grid, conformal, "log-euclidean")):
         resolution = hj.assemble(field).resolution
-        np.testing.assert_allclose(resolution.turning, 0, atol=1e-14)
+        np.testing.assert_allclose(np.asarray(resolution.turning)[mask], 0, atol=1e-14)
         np.testing.assert_allclose(resolution.swelling, 0, atol=1e-14)
     periodic = hj.assemble(flat((6, 5), (1.0, 2.0), (True, True)), "periodic").resolution
     # h²/48 on each axis, in the units of the metric.

@@ -19,7 +19,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.heat import Normalisation
@@ -165,7 +165,7 @@ def compute_pairs(
     return field, _solve(pencil, settings, progress), replace(settings, boundary=boundary)
 
 
-def _solve(pencil: Pencil | MirrorPencil, settings: Settings, progress: Progress) -> Eigenpairs:
+def _solve(pencil: AnyPencil, settings: Settings, progress: Progress) -> Eigenpairs:
     """Compute eigenpairs; raise ComputationError unless all of them converged."""
     unknowns = sum(part.space.n_dof for part in pencil.parts)
     k = min(DEFAULT_K[pencil.space.dimension], max(1, unknowns // 4)) if settings.k is None else settings.k

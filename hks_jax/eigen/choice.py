@@ -11,7 +11,7 @@ from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos, known_by_weyl
 from hks_jax.eigen.solver import Eigensolver
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.stencil import StencilOperator
 from hks_jax.traced import is_traced
 
@@ -63,7 +63,7 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
     return SOLVERS[solver]()
 
 
-def choose_for_fit(pencil: Pencil | MirrorPencil, k: int) -> Eigensolver:
+def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return what ``"auto"`` stands for in a fit, where one linearisation serves many products with the Jacobian.
 
     Factorisations serve them all, which the filter does not have; and as fits are traced, none runs on the host.

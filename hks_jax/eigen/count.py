@@ -13,7 +13,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.quality import largest
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import factorise, try_out
 from hks_jax.linear.pencil import SymmetricPencil
@@ -123,7 +123,7 @@ def count_once(
 
 def _smallest_scale(pencil: SymmetricPencil | MirrorPencil) -> Float[Array, ""]:
     """Return the least distance of eigenvalues to expect: what σ near zero is compared with."""
-    if isinstance(pencil, Pencil | MirrorPencil) and pencil.measured:
+    if isinstance(pencil, AnyPencil) and pencil.measured:
         assert pencil.volume is not None
         return 1 / pencil.volume ** (2 / pencil.space.dimension)
     assert isinstance(pencil, SymmetricPencil)

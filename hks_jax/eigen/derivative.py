@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
@@ -17,10 +17,11 @@ from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import with_transpose
 from hks_jax.linear.one_by_one import one_by_one
+from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products
 from hks_jax.traced import is_traced
@@ -104,10 +105,10 @@ def _solved_jvp(
 
 # The transpose keeps what its arguments have, needed or not.
 def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
-    """Return a pencil without estimates of its resolution."""
-    if not isinstance(pencil, Pencil) or pencil.resolution is None:
+    """Return a pencil without what serves estimates alone."""
+    if not isinstance(pencil, Pencil) or pencil.metric is None:
         return pencil
-    return eqx.tree_at(lambda p: p.resolution, pencil, None)
+    return eqx.tree_at(lambda p: p.metric, pencil, None)
 
 
 def _computed(
@@ -267,19 +268,25 @@ def _exact_null_modes(
 
 
 @jax.custom_jvp
-def frame_within(
-    vectors: Float[Array, "k n_dof"], pencil: Pencil | MirrorPencil, part: Int[Array, " k"]
+def frame_of_chosen(
+    vectors: Float[Array, "k n_dof"], mass: Operator, chosen: Bool[Array, " k"]
 ) -> Float[Array, "k n_dof"]:
-    """Return the vectors as a frame: their derivative without what rotates them among themselves.
+    """Return the vectors as a frame: their derivative without what rotates them among those that are chosen.
 
-    It serves vectors that were chosen from more: frames of all leave out rotations into those that were not chosen.
+    The frame of all the vectors leaves out rotations into those that are not chosen, too.
     """
     return vectors
 
 
-@frame_within.defjvp
-def _frame_within_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    vectors, pencil, part = first_order_only(primals)
+@frame_of_chosen.defjvp
+def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    vectors, mass, chosen = first_order_only(primals)
     change = tangents[0]
-    inside = pencil.among(pencil.apply_mass(change, part), part, vectors, part)
+    inside = jnp.where(chosen, products_with_constants(mass.apply(change), vectors), 0)
     return vectors, change - combine(inside, vectors)
+
+
+# The transpose that JAX makes of these products is one with the transposed vectors, which takes twice as long.
+def products_with_constants(images: Float[Array, "b n_dof"], vectors: Float[Array, "k n_dof"]) -> Float[Array, "b k"]:
+    """Return the inner products, linear in the images: the vectors are constants to derivatives."""
+    return with_transpose(partial(inner_products, vectors), lambda mix: combine(mix, vectors), images)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.describe import describe_array
 from hks_jax.eigen.messages import messages
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
@@ -62,7 +62,8 @@ class Eigenpairs(eqx.Module):
         converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
         kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was
             dropped or completed: then signatures leave out the last pairs, those that are not kept.
-        part: (k,) under "mirror" and "mean", which of the problems a pair comes from (0: the Neumann problem); else 0.
+        part: (k,) under "mirror" and "mean", which of the pencil's parts a pair belongs to (0: the Neumann problem);
+            else None.
         next_eigenvalue: the first eigenvalue not kept; infinite if there is none, or none is known, as after an
             interval. Constant to derivatives.
         complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
@@ -83,12 +84,12 @@ class Eigenpairs(eqx.Module):
     residuals: Float[Array, " k"]
     converged: Bool[Array, " k"]
     kept: Bool[Array, " k"]
-    part: Int[Array, " k"]
+    part: Int[Array, " k"] | None
     next_eigenvalue: Float[Array, ""]
     complete_below: Float[Array, ""]
     spectral_origin: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
-    pencil: Pencil | MirrorPencil
+    pencil: AnyPencil
     solver_name: str = eqx.field(static=True)
     lowest: bool = eqx.field(static=True, default=True)
 
@@ -114,6 +115,10 @@ class Eigenpairs(eqx.Module):
     def k(self) -> int:
         """The number of pairs."""
         return self.eigenvalues.shape[-1]
+
+    def of_part(self, number: int) -> "Eigenpairs":
+        """Return the pairs, with those of one part of a doubled domain kept: others count as pairs with f = 0."""
+        return self if self.part is None else eqx.tree_at(lambda p: p.kept, self, self.kept & (self.part == number))
 
     @property
     def null_space_known(self) -> bool:

@@ -11,7 +11,7 @@ from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.count import certain_count, count_eigenvalues
 from hks_jax.eigen.dense import Dense
-from hks_jax.eigen.derivative import frame_within, solved
+from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.located import LocatedPencil, locate, translated
@@ -68,7 +68,7 @@ def solve_lowest(
         found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
     if number > k:
         values, vectors, _, _, bound = found
-        frame = frame_within(vectors[:k], pencil, jnp.zeros(k, int))
+        frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
         found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method, name if method is solver else method.name)
 
@@ -155,7 +155,7 @@ def _pairs(
     values, vectors, frame, following, bound = found
     held = jax.lax.stop_gradient((tabulated(solved_pencil), values, vectors))
     known = not isinstance(solved_pencil, LocatedPencil) and solved_pencil.null_space is not None
-    residuals, converged, kept, part, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
+    residuals, converged, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
     # Of a constant JAX makes a number where it differentiates.
     following, bound = jnp.asarray(following), jnp.asarray(bound)
     if not known:
@@ -168,8 +168,8 @@ def _pairs(
         frame,
         residuals,
         converged,
-        kept=kept,
-        part=part,
+        kept=jnp.ones(values.size, bool),
+        part=None,
         next_eigenvalue=following,
         complete_below=bound,
         spectral_origin=origin if known or not lowest else jax.lax.stop_gradient(values[0]),
@@ -189,15 +189,14 @@ def _quality(
     tolerance: float,
     known: bool,
 ) -> tuple[Array, ...]:
-    """Return what `Eigenpairs` has of pairs not yet cut, and which eigenvalues are zero within rounding.
+    """Return residuals, which of them are small, which eigenvalues are zero within rounding, the multiplet tolerance.
 
     Residuals are relative to eigenvalues as they count from the origin; small ones are measured by the first positive
     one where the null space is known, and else by the mean distance of eigenvalues.
     """
     k = values.size
-    kept, part = jnp.ones(k, bool), jnp.zeros(k, int)
     if k == 0:
-        return jnp.zeros(0, values.dtype), kept, kept, part, kept, jnp.asarray(1e-6, values.dtype)
+        return jnp.zeros(0, values.dtype), *[jnp.zeros(0, bool)] * 2, jnp.asarray(1e-6, values.dtype)
     zero = jnp.abs(values + origin) <= indistinct(pencil, values.dtype)
     if known:
         unit = values[min(pencil.n_null, k - 1)]
@@ -205,4 +204,4 @@ def _quality(
         unit = jnp.where(jnp.all(zero), largest(pencil), (values[-1] - values[0]) / k)
     residuals, small, rounding = quality(pencil, values, vectors, unit, tolerance)
     converged = small & (values >= 0) if known else small
-    return residuals, converged, kept, part, zero, jnp.clip(rounding[-1], 1e-6, 1e-3)
+    return residuals, converged, zero, jnp.clip(rounding[-1], 1e-6, 1e-3)

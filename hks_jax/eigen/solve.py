@@ -13,15 +13,15 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.choice import choose_solver
 from hks_jax.eigen.count import certain_count
 from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.mirror import solve_intervals, solve_mirror
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice, check_choice, truncate
 from hks_jax.eigen.part import Interval, checked_interval, solve_interval, solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.fem.sparse_input import require_null_space, sparse_pencil
 from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
@@ -108,7 +108,7 @@ def eigenpairs(
     return pairs
 
 
-def _pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> Pencil | MirrorPencil:
+def _pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
     """Return the pencil that a domain, or what a user gives in its place, stands for; checked where it is theirs."""
     matrix = issparse(domain) or isinstance(domain, BCOO | BCSR | Operator | np.ndarray | jax.Array | list)
     given = matrix or isinstance(domain, SymmetricPencil | MirrorPencil | tuple)
@@ -122,7 +122,7 @@ def _pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> Pencil | Mir
         if len(domain) != 2:
             raise ValueError(f"domain: got a tuple of {len(domain)}; expected a pair (K, M)")
         domain = sparse_pencil(*domain)
-    elif not isinstance(domain, Pencil | MirrorPencil):
+    elif not isinstance(domain, AnyPencil):
         domain = sparse_pencil(domain)
     if isinstance(domain, Pencil) and isinstance(domain.space, MatrixSpace):
         matrices = domain.stiffness, domain.mass
@@ -147,7 +147,7 @@ def _check_mass(pencil: Pencil) -> None:
 
 
 def _lowest(
-    pencil: Pencil | MirrorPencil,
+    pencil: AnyPencil,
     k: int,
     solver: str | Eigensolver,
     multiplet: MultipletChoice,
@@ -160,14 +160,14 @@ def _lowest(
     name = " + ".join(dict.fromkeys(choice.name for choice in choices))
     extra = min(1, total - size)  # to see where the spectrum is cut
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_mirror(pencil, choices, size, extra, name, throw, report)
+        pairs = solve_doubled(pencil, choices, size, extra, name, throw, report)
     else:
         pairs = solve_lowest(pencil, choices[0], size, extra, name, throw, report)
     return truncate(pairs, k, multiplet)
 
 
 def _in_interval(
-    pencil: Pencil | MirrorPencil,
+    pencil: AnyPencil,
     interval: tuple[float, float],
     k: int | None,
     solver: str | Eigensolver,
@@ -180,7 +180,10 @@ def _in_interval(
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
     problems = zip(pencil.parts, checked, solvers, strict=True)
     solved = tuple(solve_interval(part, each, method, throw, report) for part, each, method in problems)
-    return solve_intervals(pencil, solved) if isinstance(pencil, MirrorPencil) else solved[0]
+    if not isinstance(pencil, MirrorPencil):
+        return solved[0]
+    name = " + ".join(dict.fromkeys(pairs.solver_name for pairs in solved))
+    return merge(pencil, solved, sum(pairs.k for pairs in solved), 0, name)
 
 
 def _for_interval(solver: str | Eigensolver, pencil: Pencil, interval: Interval) -> BlockLanczos | Dense:

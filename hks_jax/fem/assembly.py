@@ -17,8 +17,8 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.fem.elements import Element, at_quadrature, element_matrices, simplex_element, tensor_product_element
 from hks_jax.fem.masks import couplings_for, mask_for
-from hks_jax.fem.pencil import MirrorPencil, Pencil
-from hks_jax.fem.resolution import grid_resolution, mesh_resolution
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
+from hks_jax.fem.resolution import SampledMetric
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
 from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
@@ -32,7 +32,7 @@ MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
 
 def assemble(
     domain: TensorField | SimplicialMesh, boundary: BoundarySpec = "neumann", mass: MassKind = "consistent"
-) -> Pencil | MirrorPencil:
+) -> AnyPencil:
     """Assemble the generalized eigenproblem Kφ = λMφ of the Laplace–Beltrami operator.
 
     K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus and Hotz, section 3), with Q1 elements and 2^d
@@ -85,7 +85,7 @@ def assemble(
     return _joined(pencils)
 
 
-def _joined(pencils: list[Pencil]) -> Pencil | MirrorPencil:
+def _joined(pencils: list[Pencil]) -> AnyPencil:
     """Return the pencil, or the problems that make up a doubled domain."""
     if len(pencils) == 1:
         return pencils[0]
@@ -103,13 +103,10 @@ def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Penc
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
     arrays = tensors, domain, elements, couplings_for(tensors, space), gradients, weights
     stiffness, consistent, lumped, volume = _grid_integrals(*arrays, space.periodic, field.interpolation)
-    # Constant to derivatives before it is computed, it is not compiled again for them.
-    fixed = jax.lax.stop_gradient(tensors)
-    resolution = grid_resolution(fixed, domain, space.periodic, steps, field.interpolation, mass == "lumped")
     chosen = _chosen_mass(mass, space, StencilOperator(coefficients=consistent, space=space), lumped)
     stiffness = StencilOperator(coefficients=stiffness, space=space)
-    constants = _constants(space, tensors)
-    return Pencil(stiffness, chosen, resolution.mapped(space.restrict), volume, space, null_space=constants)
+    metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
+    return Pencil(stiffness, chosen, metric, volume, space, null_space=_constants(space, tensors))
 
 
 def _constants(space: FunctionSpace, values: Array) -> NullSpace:
@@ -209,10 +206,9 @@ def _assemble_mesh(mesh: SimplicialMesh, space: MeshSpace, mass: MassKind) -> Pe
         return SparseOperator(entries, pattern)
 
     lumped = jax.ops.segment_sum(jnp.sum(consistent, axis=-1).ravel(), cells.ravel(), n_vertices)
-    resolution = mesh_resolution(metric, cells, n_vertices, mass == "lumped")
     chosen = _chosen_mass(mass, space, gather(consistent), lumped)
-    fine, constants = resolution.mapped(space.restrict), _constants(space, metric)
-    return Pencil(gather(stiffness), chosen, fine, jnp.sum(lumped), space, null_space=constants)
+    sampled = SampledMetric(jax.lax.stop_gradient(metric), None)
+    return Pencil(gather(stiffness), chosen, sampled, jnp.sum(lumped), space, null_space=_constants(space, metric))
 
 
 @lru_cache(maxsize=16)

@@ -1,6 +1,5 @@
-"""How well a grid or a mesh resolves a metric: the nodal numbers behind the estimate of the discretisation error."""
+"""How well a grid or a mesh resolves a metric: the nodal numbers behind estimates of the discretisation error."""
 
-from collections.abc import Callable
 from functools import partial
 from itertools import combinations
 
@@ -12,27 +11,48 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import Interpolation
+from hks_jax.fem.masks import mask_for
+from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
+
+
+class SampledMetric(eqx.Module):
+    """The metric that a pencil was assembled from, for estimates; constant to derivatives.
+
+    Attributes:
+        tensors: (*shape, d, d) at the nodes of a grid; or (n_cells, d, d) in the cells of a mesh, in their own edges.
+        spacing: (d,) of the grid; None on a mesh.
+        interpolation: what lies between the nodes.
+    """
+
+    tensors: Float[Array, "*shape d d"]
+    spacing: Float[np.ndarray | Array, " d"] | None
+    interpolation: Interpolation = eqx.field(static=True, default="linear")
 
 
 class Resolution(eqx.Module):
     """What the spacing does to heat kernel signatures, to leading order; see `truncation`. Constant to derivatives.
 
     Attributes:
-        mesh_width: (n_dof,) the local distance of neighbouring nodes in the units of the metric.
-        dispersion: (n_dof,) the bias times t, in (metric length)², of tensors that do not vary: it falls as t grows.
-        turning: (n_dof,) the relative error of eigenvalues, whatever their size, because tensors turn or stretch
+        mesh_width: (*shape) the local distance of neighbouring nodes in the units of the metric.
+        dispersion: (*shape) the bias times t, in (metric length)², of tensors that do not vary: it falls as t grows.
+        turning: (*shape) the relative error of eigenvalues, whatever their size, because tensors turn or stretch
             between neighbours.
         swelling: the relative error of the domain's area or volume.
     """
 
-    mesh_width: Float[Array, "*n_dof"]
-    dispersion: Float[Array, "*n_dof"]
-    turning: Float[Array, "*n_dof"]
+    mesh_width: Float[Array, "*shape"]
+    dispersion: Float[Array, "*shape"]
+    turning: Float[Array, "*shape"]
     swelling: Float[Array, ""]
 
-    def mapped(self, change: Callable[[Array], Array]) -> "Resolution":
-        """Return the same with every array of nodal values changed, such as restricted to the free nodes."""
-        return Resolution(change(self.mesh_width), change(self.dispersion), change(self.turning), self.swelling)
+
+def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool) -> Resolution:
+    """Return what the spacing of a grid, or the edges of a mesh, do to the functions of a space."""
+    if isinstance(space, GridSpace):
+        # The mask goes in as an array, so that grids that differ only in it share one compilation.
+        return _of_grid(metric, mask_for(metric.tensors, space.domain), space.periodic, lumped)
+    assert isinstance(space, MeshSpace)
+    return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
 
 
 # Where tensors hardly vary, a plane wave of wave vector k has the discrete eigenvalue λ(1 + δ) with
@@ -44,11 +64,11 @@ class Resolution(eqx.Module):
 # A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6, which adds d/24 Σₐ hₐ²gₐₐ/t, by E λkₐ² = (d + 2)gₐₐ/4t²;
 # 1/20 in place of 1/24 is what the next terms make of it at t = 6h².
 def dispersion(
-    tensors: Float[Array, "*shape d d"], spacing: Float[np.ndarray | Array, " d"], lumped: bool | Bool[Array, ""]
+    tensors: Float[Array, "*shape d d"], spacing: Float[np.ndarray | Array, " d"], lumped: bool
 ) -> Float[Array, "*shape"]:
     """Return the error, times t, of the signature that Q1 elements give where tensors do not vary."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
-    of_mass = 1 / 12 + jnp.where(lumped, d / 20, 0.0)
+    of_mass = 1 / 12 + (d / 20 if lumped else 0)
     total = jnp.zeros(tensors.shape[:-2], tensors.dtype)
     for a in range(d):
         along = tensors[..., a, a]
@@ -111,23 +131,18 @@ def _neighbours(domain: Bool[Array, "*shape"], axis: int, wraps: bool) -> Bool[A
     return pairs & (jnp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@partial(jax.jit, static_argnames=("periodic", "interpolation"))
-def grid_resolution(
-    tensors: Float[Array, "*shape d d"],
-    domain: Bool[Array, "*shape"],
-    periodic: tuple[bool, ...],
-    spacing: Float[np.ndarray | Array, " d"],
-    interpolation: Interpolation,
-    lumped: bool | Bool[Array, ""],
+@partial(jax.jit, static_argnames=("periodic", "lumped"))
+def _of_grid(
+    metric: SampledMetric, domain: Bool[Array, "*shape"], periodic: tuple[bool, ...], lumped: bool
 ) -> Resolution:
-    """Return what the spacing of a grid does, (*shape) in place of (n_dof,)."""
-    tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
-    along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
+    assert metric.spacing is not None
+    tensors = spd.positive_or_nan(spd.identity_unless(domain, metric.tensors))
+    along = [metric.spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
     return Resolution(
         jnp.sqrt(jnp.max(jnp.stack(along), axis=0)),
-        dispersion(tensors, spacing, lumped),
+        dispersion(tensors, metric.spacing, lumped),
         turning(tensors, domain, periodic),
-        swelling(tensors, domain, periodic, interpolation),
+        swelling(tensors, domain, periodic, metric.interpolation),
     )
 
 
@@ -139,17 +154,15 @@ The medians over the nodes of squares, spheres, boxes and balls, cut regularly o
 """
 
 
-def mesh_resolution(
-    metric: Float[Array, "n d d"], cells: Int[np.ndarray, "n corners"], n_vertices: int, lumped: bool
+@partial(jax.jit, static_argnames=("n_vertices", "lumped"))
+def _of_mesh(
+    metric: Float[Array, "n d d"], cells: Int[np.ndarray | Array, "n corners"], n_vertices: int, lumped: bool
 ) -> Resolution:
-    """Return what the edges of a mesh do, (V,) in place of (n_dof,), whose metric is given in the cells' own edges.
-
-    A vertex is as coarse as the longest edge of its cells. The metric is what they have, without turning between them.
-    """
+    """A vertex is as coarse as the longest edge of its cells: the metric as it is, without turning between them."""
     d = metric.shape[-1]
     corners = np.concatenate([np.zeros((1, d)), np.eye(d)])
     edges = jnp.asarray([b - a for a, b in combinations(corners, 2)], metric.dtype)
-    squared = jnp.einsum("ea,nab,eb->ne", edges, jax.lax.stop_gradient(metric), edges, precision="highest")
+    squared = jnp.einsum("ea,nab,eb->ne", edges, metric, edges, precision="highest")
     longest = jnp.repeat(jnp.max(squared, axis=1), d + 1)
     at_vertices = jnp.maximum(jax.ops.segment_max(longest, cells.ravel(), n_vertices), 0)
     bias = _BIAS[lumped] * at_vertices

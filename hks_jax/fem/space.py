@@ -93,6 +93,10 @@ class FunctionSpace:
         fill = np.where(self.domain.ravel(), 0.0, outside).astype(values.dtype)
         return _spread(values, self._free_indices, fill).reshape(shape)
 
+    def transfer(self, values: Float[Array, "... n_dof"], to: "FunctionSpace") -> Float[Array, "... n"]:
+        """Return functions of this space as those of another on the same nodes, zero where that has Dirichlet nodes."""
+        return values if to == self else to.restrict(self.extend(values, outside=0.0))
+
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, FunctionSpace) and self._key == other._key)
 

@@ -12,7 +12,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.single_precision import residuals_of
@@ -72,7 +72,7 @@ def losses_of(data: Float[Array, " m"], penalties: Float[Array, " r"]) -> tuple[
     return misfit + jnp.sum(penalties**2) / 2, misfit
 
 
-def pairs_below(eigenvalue: float, pencil: Pencil | MirrorPencil, field: TensorField) -> int:
+def pairs_below(eigenvalue: float, pencil: AnyPencil, field: TensorField) -> int:
     """Return about how many eigenvalues lie below one, by Weyl's law, and some more."""
     return math.ceil(1.1 * float(weyl_count(pencil, [eigenvalue], field)[0])) + 4
 
@@ -82,7 +82,7 @@ def most_pairs(n_dof: int) -> int:
     return max(n_dof // 4, min(n_dof, 20))
 
 
-def pairs_for(times: Any, pencil: Pencil | MirrorPencil, field: TensorField) -> int:
+def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
     """Return how many eigenpairs resolve the smallest time to `TAIL`: all, if that many are needed.
 
     Raises:
@@ -103,6 +103,6 @@ def pairs_for(times: Any, pencil: Pencil | MirrorPencil, field: TensorField) -> 
     return min(count(TAIL), n_dof)
 
 
-def unknowns_of(pencil: Pencil | MirrorPencil) -> int:
+def unknowns_of(pencil: AnyPencil) -> int:
     """Return how many eigenpairs there are."""
     return sum(part.space.n_dof for part in pencil.parts)

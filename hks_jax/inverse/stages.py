@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.problem import most_pairs, pairs_below, pairs_for, unknowns_of
 from hks_jax.inverse.truncated import observed_times
@@ -35,7 +35,7 @@ def pairs_of_stage(
     observation: Observation,
     k: int | None,
     shape: tuple[int, ...],
-    pencil: Pencil | MirrorPencil,
+    pencil: AnyPencil,
     field: TensorField,
 ) -> int:
     """Return how many eigenpairs to compute."""

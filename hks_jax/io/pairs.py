@@ -10,7 +10,7 @@ import numpy as np
 
 from hks_jax.atomic import atomic_path
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.npz import load_npz
 
 ARRAYS = (
@@ -49,14 +49,14 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
     """
     if not os.fspath(path).endswith(".npz"):
         raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in .npz")
-    arrays = {name: np.asarray(getattr(pairs, name)) for name in ARRAYS}
+    arrays = {name: np.asarray(getattr(pairs, name)) for name in ARRAYS if getattr(pairs, name) is not None}
     content: dict[str, Any] = {**arrays, "solver_name": pairs.solver_name, **(extra or {})}
     with atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **content)
     return Path(path)
 
 
-def load_pairs(path: str | os.PathLike[str], pencil: Pencil | MirrorPencil) -> Eigenpairs:
+def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
     """Read eigenpairs that `save_pairs` wrote, for the pencil that they belong to.
 
     Signatures and all that is computed from the pairs are those of the pairs that were saved. Derivatives with respect
@@ -73,14 +73,16 @@ def load_pairs(path: str | os.PathLike[str], pencil: Pencil | MirrorPencil) -> E
     return pairs_of(os.fspath(path), load_npz(path), pencil)
 
 
-def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: Pencil | MirrorPencil) -> Eigenpairs:
+def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> Eigenpairs:
     """Return the pairs that were read from a file; see `load_pairs`."""
-    missing = [key for key in (*ARRAYS, "solver_name") if key not in arrays]
+    doubled = len(pencil.parts) > 1
+    names = [key for key in ARRAYS if key != "part" or doubled]
+    missing = [key for key in (*names, "solver_name") if key not in arrays]
     if missing:
         raise ValueError(f"{name}: lacks {', '.join(missing)}; expected eigenpairs as save_pairs writes them")
     dtype = pencil.parts[0].stiffness.dtype
     values: dict[str, Any] = {
-        key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in ARRAYS for a in [arrays[key]]
+        key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in names for a in [arrays[key]]
     }
     k, n = values["eigenvalues"].shape[-1], pencil.space.n_dof
     if values["vectors"].shape != (k, n):
@@ -90,15 +92,25 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: Pencil | Mirro
         )
     lowest = bool(values.pop("lowest"))
     solver_name = str(np.asarray(arrays["solver_name"]))
+    values.setdefault("part", None)
     pairs = Eigenpairs(**values, lowest=lowest, frame=values["vectors"], pencil=pencil, solver_name=solver_name)
-    images, masses = (apply(pairs.vectors, pairs.part) for apply in (pencil.apply_stiffness, pencil.apply_mass))
-    gap = jnp.linalg.norm(images - pairs.eigenvalues[:, None] * masses, axis=1) / jnp.linalg.norm(masses, axis=1)
+    gap = np.concatenate([_residuals(pairs, number) for number in range(len(pencil.parts))])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))
-    worst = float(jnp.max(gap, initial=0)) / max(size, np.finfo(ends.dtype).tiny)
+    worst = float(np.max(gap, initial=0)) / max(size, np.finfo(ends.dtype).tiny)
     if not worst < _FAR:
         raise ValueError(
             f"{name}: these pairs do not solve Kφ = λMφ for this pencil (relative residual {worst:.1e}); expected the "
             "tensors, the mask, the boundary and the interpolation that they were computed with"
         )
     return pairs
+
+
+def _residuals(pairs: Eigenpairs, number: int) -> np.ndarray:
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ of the pairs of one part of a doubled domain."""
+    part = pairs.pencil.parts[number]
+    own = slice(None) if pairs.part is None else np.flatnonzero(np.asarray(pairs.part) == number)
+    vectors = pairs.space.transfer(pairs.vectors[own], part.space)
+    image = part.mass.apply(vectors)
+    left = part.stiffness.apply(vectors) - pairs.eigenvalues[own][:, None] * image
+    return np.asarray(jnp.linalg.norm(left, axis=1) / jnp.linalg.norm(image, axis=1))

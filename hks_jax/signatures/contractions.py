@@ -6,7 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.quadratic_forms import quadratic_forms
@@ -96,29 +96,19 @@ class Applied(Contraction):
 
     Attributes:
         functionals: (s, n).
-        part: (k,) the part of a doubled problem that a function is of; the functionals act on those of part 0.
     """
 
     functionals: Float[Array, "s n"]
-    part: Int[Array, " k"]
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
         """Return Σᵢ cᵢ (φᵢ·w) φᵢ(x)."""
-        return _matmul(weights[:, None, :] * self._coefficients(vectors), vectors)
+        return _matmul(weights[:, None, :] * _matmul(self.functionals, vectors.T), vectors)
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
     ) -> Float[Array, "m s n"]:
         """Return Σᵢⱼ Cᵢⱼ (φᵢ·w) φⱼ(x)."""
-        return _matmul(_matmul(self._coefficients(vectors), matrices), vectors)
-
-    def along(self, tangent: "Contraction") -> "Applied":
-        """Return the reading's derivative along a tangent of itself: it is linear in the functionals."""
-        assert isinstance(tangent, Applied)
-        return Applied(tangent.functionals, self.part)
-
-    def _coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
-        return jnp.where(self.part == 0, _matmul(self.functionals, vectors.T), 0)
+        return _matmul(_matmul(_matmul(self.functionals, vectors.T), matrices), vectors)
 
 
 def _matmul(a: Array, b: Array) -> Array:

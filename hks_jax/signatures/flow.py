@@ -61,7 +61,7 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
     image = mass.apply(u)
     n_parts = len(pairs.pencil.parts)
     coefficients = n_parts * jnp.matmul(image, pairs.vectors.T, precision="highest")
-    used = pairs.kept & (pairs.part == 0)
+    used = pairs.of_part(0).kept
     squared = n_parts * jnp.sum(u * image, axis=1)
     beyond = jnp.maximum(squared - jnp.sum(jnp.where(used, coefficients**2, 0), axis=1), 0)
     share = float(jnp.max(jnp.where(squared > 0, beyond / jnp.where(squared > 0, squared, 1), 0))) ** 0.5

@@ -10,16 +10,21 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.products import even_size, row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter
 from hks_jax.static_array import StaticArray
+from hks_jax.traced import is_traced
 
 _ROWS = 128
 """Eigenvectors whose products with all others are computed together: what is computed from them takes memory."""
+_SIZES = 8
+"""How many sizes there are for the pairs of a part of a doubled domain: each is compiled."""
 _FILTERS = 8
 """Filters whose matrices (k, k) are computed together, and read the eigenvectors together."""
 
@@ -54,9 +59,9 @@ def spectral_flow(
     Under "mirror" and "mean" the functions are continued evenly, as the metric is.
     """
     # Inner products over the doubled domain: twice those over the domain for each doubling, and 0 with odd functions.
-    part = pairs.pencil.parts[0]
-    functionals = len(pairs.pencil.parts) * part.mass.apply(pairs.space.restrict(functions))
-    return pairs.space.extend(_kernel(Applied(functionals, pairs.part), filters, pairs))
+    parts = pairs.pencil.parts
+    functionals = len(parts) * parts[0].mass.apply(pairs.space.restrict(functions))
+    return pairs.space.extend(_kernel(Applied(functionals), filters, pairs.of_part(0)))
 
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
@@ -94,20 +99,23 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
 # xᵢ the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept count as pairs
-# with f = 0. Under "mirror" and "mean" pairs of different parts do not mix.
+# with f = 0. Under "mirror" and "mean" it is the sum over the parts, whose pairs do not mix.
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
     value, terms = _kernel(contraction, filters, pairs), []
     if isinstance(contraction, Applied) and not _is_constant(d_contraction.functionals):
-        terms.append(_kernel(contraction.along(d_contraction), filters, pairs))
+        terms.append(_kernel(d_contraction, filters, pairs))  # linear in the functionals
     if not _is_constant(d_filters):
         terms.append(_kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs))
     if not _is_constant(d_pairs.pencil):
         pairs = first_order_only(pairs)
-        known = pairs.eigenvalues, pairs.vectors, pairs.kept, pairs.part
-        moved = _instantiated((d_pairs.pencil, d_pairs.frame))
-        terms.append(_tangent(contraction, filters, *known, pairs.pencil.n_fixed > 0, *moved))
+        change, d_frame = _instantiated((d_pairs.pencil, d_pairs.frame))
+        for number, part in enumerate(pairs.pencil.parts):
+            own = pairs.of_part(number)
+            known = own.eigenvalues, own.vectors, own.kept, d_frame
+            static = part.n_fixed > 0, len(pairs.pencil.parts), pairs.space
+            terms.append(_tangent(contraction, filters, known, _rows_of(own, number), *static, change.parts[number]))
     elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
         pairs = first_order_only(pairs)
         moved = jax.jvp(
@@ -119,20 +127,41 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return value, reduce(operator.add, terms) if terms else jnp.zeros_like(value)
 
 
+def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
+    """Return where the pairs of a part of a doubled domain are, and which these are: some more, up to one of few sizes.
+
+    None where there are no parts.
+    """
+    if pairs.part is None:
+        return None
+    most, own = pairs.k, jax.lax.stop_gradient(pairs.part) == number
+    if pairs.lowest:
+        assert isinstance(pairs.pencil, MirrorPencil)
+        most //= len(pairs.pencil.including[number])
+    if not is_traced(own):
+        step = -(-pairs.k // _SIZES)
+        most = min(most, step * -(-int(own.sum()) // step))
+    rows = jnp.argsort(~own)[:most]
+    return rows, own[rows]
+
+
 # The transpose computes again what it needs: kept, that would be two copies of the eigenvectors.
-@partial(jax.jit, static_argnames="fixed")
-@partial(jax.checkpoint, static_argnums=6)
+@partial(jax.jit, static_argnames=("fixed", "copies"))
+@partial(jax.checkpoint, static_argnums=(4, 5))
 def _tangent(
     contraction: Contraction,
     filters: Filter,
-    values: Float[Array, " k"],
-    vectors: Float[Array, "k n_dof"],
-    kept: Bool[Array, " k"],
-    part: Int[Array, " k"],
+    pairs: tuple[Float[Array, " k"], Float[Array, "k n_dof"], Bool[Array, " k"], Float[Array, "k n_dof"]],
+    selection: tuple[Int[Array, " m"], Bool[Array, " m"]] | None,
     fixed: bool,
-    d_pencil: Pencil | MirrorPencil,
-    d_frame: Float[Array, "k n_dof"],
+    copies: int,
+    space: FunctionSpace,
+    change: Pencil,
 ) -> Array:
+    """Return the derivative by the change of one part: of values, vectors, those kept, and their moving frame."""
+    values, vectors, kept, d_frame = pairs if selection is None else (x[selection[0]] for x in pairs)
+    if selection is not None:
+        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these
     if not len(vectors):
         return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where it does not count
@@ -140,10 +169,10 @@ def _tangent(
     starts, place = row_blocks(len(vectors), size)
 
     @jax.checkpoint  # reverse mode would keep a copy of the vectors
-    def products(start: Array) -> tuple[Float[Array, "size k"], Float[Array, "size k"]]:
-        own, of = (jax.lax.dynamic_slice_in_dim(x, start, size) for x in (vectors, part))
-        stiffness, mass = d_pencil.apply_stiffness(own, of), d_pencil.apply_mass(own, of)
-        return d_pencil.among(stiffness, of, vectors, part), d_pencil.among(mass, of, vectors, part)
+    def products(start: Array) -> list[Float[Array, "size k"]]:
+        own = space.transfer(jax.lax.dynamic_slice_in_dim(vectors, start, size), change.space)
+        images = (change.space.transfer(matrix.apply(own), space) for matrix in (change.stiffness, change.mass))
+        return [copies * products_with_constants(image, vectors) for image in images]
 
     stiffness, mass = (blocks[place] for blocks in jax.lax.map(products, jnp.asarray(starts)))
     weights = _all_weights(filters, values, kept)

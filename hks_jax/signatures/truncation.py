@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.fem.masks import mask_for
 from hks_jax.fem.resolution import Resolution
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import sum_of
@@ -97,9 +98,12 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
         raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
     # Weyl's law counts from the bottom of the spectrum, which a potential moves.
     bottom = pairs.spectral_origin
-    known = pairs.pencil.resolution, pairs.eigenvalues - bottom, pairs.kept, pairs.next_eigenvalue - bottom
+    known = pairs.eigenvalues - bottom, pairs.kept, pairs.next_eigenvalue - bottom, checked_times("times", times, dtype)
+    resolution = jax.lax.stop_gradient(pairs.pencil).resolution
     return _truncation(
-        *jax.lax.stop_gradient((*known, checked_times("times", times, dtype))),
+        resolution,
+        mask_for(pairs.eigenvalues, pairs.space.free),
+        *jax.lax.stop_gradient(known),
         dimension=dimension_of(pairs, "an estimate of the truncation"),
     )
 
@@ -107,6 +111,7 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
 @partial(jax.jit, static_argnames="dimension")
 def _truncation(
     resolution: Resolution | None,
+    free: Bool[Array, "*shape"],
     values: Float[Array, " k"],
     kept: Bool[Array, " k"],
     next_eigenvalue: Float[Array, ""],
@@ -123,9 +128,9 @@ def _truncation(
     if resolution is None:
         unknown = jnp.full_like(at, jnp.nan)
         return Truncation(at, tail, unknown, unknown, unknown, smallest)
-    bias, lasting = _resolution_bias(resolution, at, 1 - (1 - slope) * (1 - tail))
-    coarse = jnp.mean(bias > BIAS_LIMIT, axis=1)
-    return Truncation(at, tail, median_of_shares(bias), median_of_shares(lasting), coarse, smallest)
+    bias, lasting = _resolution_bias(resolution, free, at, 1 - (1 - slope) * (1 - tail))
+    coarse = jnp.sum(bias > BIAS_LIMIT, axis=1, dtype=at.dtype) / jnp.sum(free, dtype=at.dtype)
+    return Truncation(at, tail, median_of_shares(bias, free), median_of_shares(lasting, free), coarse, smallest)
 
 
 # Eigenvalues larger by the factor 1 + δ make the heat trace Z(t) that of the time (1 + δ)t: an error proportional to
@@ -133,25 +138,28 @@ def _truncation(
 # factor 1 + v is that of the metric times (1 + v)^(2/d), which divides the signature by 1 + v and eigenvalues by
 # (1 + v)^(2/d): an error of v(1 − s). Where k pairs are too few for t, what lies beyond them counts with s = 1.
 def _resolution_bias(
-    resolution: Resolution, times: Float[Array, " n"], slope: Float[Array, " n"]
-) -> tuple[Float[Array, "n n_dof"], Float[Array, "n n_dof"]]:
-    """Return the estimated relative error by the spacing, node by node, and its part that does not fall with t."""
-    lasting = slope[:, None] * resolution.turning + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
-    both = jnp.hypot(resolution.dispersion / times[:, None], lasting)
+    resolution: Resolution, free: Bool[Array, "*shape"], times: Float[Array, " n"], slope: Float[Array, " n"]
+) -> tuple[Float[Array, "n nodes"], Float[Array, "n nodes"]]:
+    """Return the estimated relative error by the spacing, and its part that does not fall with t; 0 at other nodes."""
+    turning, dispersion = (jnp.where(free, x, 0).ravel() for x in (resolution.turning, resolution.dispersion))
+    lasting = slope[:, None] * turning + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
+    lasting = jnp.where(free.ravel(), lasting, 0)
+    both = jnp.hypot(dispersion / times[:, None], lasting)
     # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 
 
-def median_of_shares(x: Float[Array, "n m"]) -> Float[Array, " n"]:
-    """Return the median of each row of numbers between 0 and 1, to 1e-12. Bisection: sorting takes ten times as long.
+def median_of_shares(x: Float[Array, "n nodes"], free: Bool[Array, "*shape"]) -> Float[Array, " n"]:
+    """Return the median over the free nodes of numbers between 0 and 1, 0 at the others, to 1e-12; NaN where one is.
 
-    NaN where there is one.
+    Bisection: sorting takes ten times as long.
     """
+    twice_half = 2 * free.size - jnp.sum(free)
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = (low + high) / 2
-        enough = 2 * jnp.sum(x <= middle[:, None], axis=1) >= x.shape[1]
+        enough = 2 * jnp.sum(x <= middle[:, None], axis=1) >= twice_half
         return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
 
     low = jnp.zeros(len(x), x.dtype)

@@ -99,13 +99,17 @@ def _least_kernels(
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
     """Return the least normalised kernel that the pairs resolve, and the least that the grid resolves."""
     pairs, times = jax.lax.stop_gradient((pairs, times))
-    space, h_squared = pairs.space, jnp.square(pairs.pencil.mesh_width)
+    space, resolution = pairs.space, pairs.pencil.resolution
+    if resolution is None:
+        raise ValueError("pairs: the distance needs the spacing of nodes, which matrices from elsewhere do not have")
     weights = jnp.where(pairs.kept, jnp.exp(-times[:, None] * pairs.eigenvalues), 0)
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0), axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
-    at_nodes = space.extend(h_squared, outside=0.0)
+    at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
     # The spacing along the way is not known: that at its ends, or the domain's mean if that is larger.
-    along = jnp.maximum(jnp.maximum(at_nodes, _broadcast(at_nodes.ravel()[nodes], space)), jnp.mean(h_squared))
+    along = jnp.maximum(
+        jnp.maximum(at_nodes, _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
+    )
     by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along)
     return _broadcast(error[:, None], space), by_grid
 

@@ -10,12 +10,12 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.weyl import weyl_number
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.rim import rim_measure
 
 
 def weyl_count(
-    problem: Eigenpairs | Pencil | MirrorPencil, values: Any, domain: TensorField | SimplicialMesh | None = None
+    problem: Eigenpairs | AnyPencil, values: Any, domain: TensorField | SimplicialMesh | None = None
 ) -> Float[np.ndarray, " n"]:
     """Return how many eigenvalues lie below each of some numbers, by Weyl's law.
 

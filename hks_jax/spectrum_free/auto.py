@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.checks import require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.signatures.heat import Normalisation, hks_of_pairs, normaliser
 from hks_jax.signatures.times import checked_times, require_pairs
 from hks_jax.signatures.truncation import truncation
@@ -175,7 +175,7 @@ def hks_auto(
 
 
 def _without(
-    pencil: Pencil | MirrorPencil, times: Float[Array, " m"], tolerance: float, method: Any = "auto"
+    pencil: AnyPencil, times: Float[Array, " m"], tolerance: float, method: Any = "auto"
 ) -> Float[Array, "m *shape"]:
     return hks_spectrum_free(pencil, times, method=method, tolerance=tolerance)
 
@@ -211,7 +211,7 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
     NaN where that would take more work than is allowed, or rounding does not allow the tolerance.
     """
     pencil = pairs.pencil
-    assert isinstance(pencil, Pencil | MirrorPencil)
+    assert isinstance(pencil, AnyPencil)
     try:
         settings = least_work(pencil, times, tolerance)
     except Unattainable:

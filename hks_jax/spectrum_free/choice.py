@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.selected_inversion import inversion_cost
@@ -32,7 +32,7 @@ _FILL = {2: 150, 3: 40}
 where n is large."""
 
 
-def require_grid(pencil: Pencil | MirrorPencil) -> None:
+def require_grid(pencil: AnyPencil) -> None:
     """Raise TypeError where colouring is asked for on a mesh."""
     if not isinstance(pencil.space, GridSpace):
         raise TypeError(
@@ -41,9 +41,7 @@ def require_grid(pencil: Pencil | MirrorPencil) -> None:
         )
 
 
-def choose_method(
-    pencil: Pencil | MirrorPencil, times: Float[Array, " m"], method: Method, tolerance: float
-) -> Colouring | None:
+def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, tolerance: float) -> Colouring | None:
     """Return the colouring to be used, or None for selected inversion."""
     if not isinstance(method, Colouring) and method not in ("auto", "colouring", "selected-inversion"):
         raise ValueError(
@@ -71,7 +69,7 @@ def choose_method(
     return settings
 
 
-def least_work(pencil: Pencil | MirrorPencil, times: Float[Array, " m"], tolerance: float) -> Colouring | None:
+def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -> Colouring | None:
     """Return the colouring if it takes less work than selected inversion, or None.
 
     Raises:
@@ -104,7 +102,7 @@ class Unattainable(ValueError):
 
 
 def plan(
-    pencil: Pencil | MirrorPencil,
+    pencil: AnyPencil,
     times: Float[Array, " m"],
     tolerance: float,
     memory: float = 2e9,
@@ -157,7 +155,7 @@ def _widest(limits: Sequence[Bounds], slack: float) -> Bounds:
     )
 
 
-def work(settings: Colouring | None, pencil: Pencil | MirrorPencil, times: Float[Array, " m"]) -> float:
+def work(settings: Colouring | None, pencil: AnyPencil, times: Float[Array, " m"]) -> float:
     """Estimate what a method takes, in floating-point operations of stencils.
 
     Infinite for selected inversion where that would take more memory than is chosen automatically.
@@ -176,7 +174,7 @@ def work(settings: Colouring | None, pencil: Pencil | MirrorPencil, times: Float
     return 2.0 * len(pencil.parts) * settings.n_vectors(space) * products * 3**space.dimension * space.free.size
 
 
-def require_fewer_vectors(settings: Colouring, pencil: Pencil | MirrorPencil) -> None:
+def require_fewer_vectors(settings: Colouring, pencil: AnyPencil) -> None:
     """Raise ValueError where colouring degenerates into a vector for every node of a large grid."""
     space = pencil.space
     assert isinstance(space, GridSpace)

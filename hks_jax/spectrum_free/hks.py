@@ -13,7 +13,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.nodal import nodal_pencil
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.heat_series import heat_coefficients
@@ -26,7 +26,7 @@ from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
 
 
 def hks_spectrum_free(
-    domain: TensorField | SimplicialMesh | Pencil | MirrorPencil,
+    domain: TensorField | SimplicialMesh | AnyPencil,
     times: Any,
     boundary: BoundarySpec = "neumann",
     mass: MassKind = "consistent",
@@ -73,7 +73,7 @@ def hks_spectrum_free(
 
 
 def colouring(
-    domain: TensorField | Pencil | MirrorPencil,
+    domain: TensorField | AnyPencil,
     times: Any,
     boundary: BoundarySpec = "neumann",
     mass: MassKind = "consistent",
@@ -112,11 +112,9 @@ def colouring(
     return settings
 
 
-def pencil_of(
-    domain: TensorField | SimplicialMesh | Pencil | MirrorPencil, boundary: BoundarySpec, mass: MassKind
-) -> Pencil | MirrorPencil:
+def pencil_of(domain: TensorField | SimplicialMesh | AnyPencil, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
     """Return the pencil of a domain."""
-    if not isinstance(domain, Pencil | MirrorPencil):
+    if not isinstance(domain, AnyPencil):
         return assemble(domain, boundary, mass)
     if boundary != "neumann" or mass != "consistent":
         raise ValueError("boundary, mass: a pencil has them already; give them to `assemble` instead")

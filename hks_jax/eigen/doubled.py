@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.dense import Dense
-from hks_jax.eigen.derivative import frame_within
+from hks_jax.eigen.derivative import frame_of_chosen
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.part import solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, Status
@@ -19,51 +19,40 @@ from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
 
-def solve_mirror(
+def solve_doubled(
     pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str, throw: bool, report: Report
 ) -> Eigenpairs:
     """Solve the mixed problems and return the k lowest pairs of all, and with one ``extra`` the next eigenvalue.
 
     How many come from each part is not known beforehand. Where values are concrete, ask for what Weyl's law says, with
-    a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask every part for all.
+    a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask for all that there can be.
     """
     parts, total = pencil.parts, k + extra
-    limits = [min(total, part.space.n_dof) for part in parts]
+    shares = [max(total // len(including), 1) for including in pencil.including]
+    limits = [min(share, part.size) for share, part in zip(shares, parts, strict=True)]
     traced = is_traced(jax.lax.stop_gradient(pencil))
-    wanted = (
-        limits if traced else [min(limit, share) for limit, share in zip(limits, _shares(pencil, total), strict=True)]
-    )
+    wanted = limits if traced else [*map(min, limits, _shares(pencil, total))]
     # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
     solvers = [
-        solver if limit <= solver.max_pairs(part.space.n_dof) else Dense(solver.tolerance)
+        solver if limit <= solver.max_pairs(part.size) else Dense(solver.tolerance)
         for solver, part, limit in zip(solvers, parts, limits, strict=True)
     ]
-    problems = zip(parts, solvers, wanted, strict=True)
-    solved = [
-        solve_lowest(part, solver, size, 0, name, throw, _of_problem(report, number, len(parts)))
-        for number, (part, solver, size) in enumerate(problems)
-    ]
+
+    def solve(number: int, report: Report) -> Eigenpairs:
+        return solve_lowest(parts[number], solvers[number], wanted[number], 0, name, throw, report)
+
+    solved = [solve(i, _of_problem(report, i, len(parts))) for i in range(len(parts))]
     while not traced:
         spectra = [np.asarray(jax.lax.stop_gradient(pairs.eigenvalues)) for pairs in solved]
         merged = np.sort(np.concatenate(spectra))
         reach = merged[total - 1] if merged.size >= total else np.inf
-        short = [
-            i
-            for i, spectrum in enumerate(spectra)
-            if wanted[i] < limits[i] and (merged.size < total or spectrum[-1] < reach)
-        ]
+        short = [i for i, spectrum in enumerate(spectra) if wanted[i] < limits[i] and not spectrum[-1] >= reach]
         if not short:
             break
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
-            solved[i] = solve_lowest(parts[i], solvers[i], wanted[i], 0, name, throw, report)
-    return _merge(pencil, tuple(solved), k, extra, name)
-
-
-def solve_intervals(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> Eigenpairs:
-    """Return the pairs in an interval of all problems."""
-    name = " + ".join(dict.fromkeys(pairs.solver_name for pairs in solved))
-    return _merge(pencil, solved, sum(pairs.k for pairs in solved), 0, name)
+            solved[i] = solve(i, report)
+    return merge(pencil, tuple(solved), k, extra, name)
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
@@ -91,23 +80,27 @@ def _shares(pencil: MirrorPencil, total: int) -> list[int]:
 
 
 @partial(jax.jit, static_argnames=("k", "extra", "name"))
-def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
-    values = jnp.concatenate([pairs.eigenvalues for pairs in solved])
-    order = jnp.argsort(values)
-    lowest = order[:k]
-    # An eigenfunction of the doubled domain has unit norm there, hence 1/√2^m of it here.
-    vectors = jnp.concatenate(
-        [pencil.space.restrict(pairs.space.extend(pairs.vectors, outside=0.0)) for pairs in solved]
-    ) / math.sqrt(len(solved))
-    vectors, part = vectors[lowest], jnp.asarray(np.repeat(np.arange(len(solved)), [p.k for p in solved]))[lowest]
+def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
+    """Return the k lowest pairs of all parts, and with one ``extra`` the next eigenvalue."""
+    values, sizes = jnp.concatenate([pairs.eigenvalues for pairs in solved]), [pairs.k for pairs in solved]
+    order = jnp.argsort(jnp.concatenate(_sorted_by(pencil, solved)))
+    lowest, ends = order[:k], np.cumsum(sizes)[:-1]
+    chosen = jnp.split(jnp.zeros(values.size, bool).at[lowest].set(True), ends)
+    frames = [frame_of_chosen(p.vectors, part.mass, c) for p, part, c in zip(solved, pencil.parts, chosen, strict=True)]
+
+    def together(rows: list[Float[Array, "_ _"]]) -> Float[Array, "k n_dof"]:
+        # An eigenfunction of the doubled domain has unit norm there, hence 1/√2^m of it here.
+        of_all = [pairs.space.transfer(own, pencil.space) for pairs, own in zip(solved, rows, strict=True)]
+        return jnp.concatenate(of_all)[lowest] / math.sqrt(len(solved))
+
     return Eigenpairs(
         values[lowest],
-        vectors,
-        frame_within(vectors, pencil, part),
+        together([pairs.vectors for pairs in solved]),
+        together(frames),
         jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
         jnp.concatenate([pairs.converged for pairs in solved])[lowest],
-        kept=jnp.ones(lowest.shape, bool),
-        part=part,
+        kept=jnp.ones(k, bool),
+        part=jnp.asarray(np.repeat(np.arange(len(solved)), sizes))[lowest],
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
         complete_below=jnp.min(jnp.stack([_complete_below(pairs) for pairs in solved])),
         spectral_origin=solved[0].spectral_origin,
@@ -116,6 +109,20 @@ def _merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: 
         solver_name=name,
         lowest=solved[0].lowest,
     )
+
+
+# Rounding may put an eigenvalue of a part below that of the same number of a part that includes it, which equals it;
+# then there would be more pairs of a part than `MirrorPencil.including` says.
+def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
+    """Return the eigenvalues of each part, none less than that of the same number of a part that includes it."""
+    keys: list[Array] = []
+    for pairs, including in zip(solved, pencil.including, strict=True):
+        own = pairs.eigenvalues
+        for j in including[:-1] if pairs.lowest else ():
+            both = min(len(own), len(keys[j]))
+            own = own.at[:both].max(keys[j][:both])
+        keys.append(own)
+    return keys
 
 
 def _complete_below(pairs: Eigenpairs) -> Float[Array, ""]:
