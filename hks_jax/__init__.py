@@ -28,14 +28,15 @@ from hks_jax.eigen.count import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
 from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
-from hks_jax.eigen.eigsh import eigsh as eigsh
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter as ChebyshevFilter
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint as FilteredAdjoint
 from hks_jax.eigen.host.complement import HostAdjoint as HostAdjoint
 from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos as BlockLanczos
 from hks_jax.eigen.solve import eigenpairs as eigenpairs
+from hks_jax.eigen.solve import eigsh as eigsh
 from hks_jax.eigen.solver import Eigensolver as Eigensolver
+from hks_jax.eigen.weyl import weyl_count as weyl_count
 from hks_jax.fem.assembly import assemble as assemble
 from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import reflect as reflect
@@ -56,6 +57,9 @@ from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.heat import heat_kernel as heat_kernel
 from hks_jax.signatures.heat import heat_trace as heat_trace
 from hks_jax.signatures.heat import scale_invariant_hks as scale_invariant_hks
+from hks_jax.signatures.hks import AutomaticHKS as AutomaticHKS
+from hks_jax.signatures.hks import hks as hks
+from hks_jax.signatures.hks import hks_auto as hks_auto
 from hks_jax.signatures.regions import RegionStatistics as RegionStatistics
 from hks_jax.signatures.regions import region_statistics as region_statistics
 from hks_jax.signatures.scale_space import gaussian_scale_space as gaussian_scale_space
@@ -67,13 +71,9 @@ from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
 from hks_jax.signatures.varadhan import varadhan_distance as varadhan_distance
 from hks_jax.signatures.wave import wks as wks
-from hks_jax.signatures.weyl import weyl_count as weyl_count
-from hks_jax.spectrum_free.auto import AutomaticHKS as AutomaticHKS
-from hks_jax.spectrum_free.auto import hks as hks
-from hks_jax.spectrum_free.auto import hks_auto as hks_auto
 from hks_jax.spectrum_free.colours import Colouring as Colouring
-from hks_jax.spectrum_free.hks import colouring as colouring
-from hks_jax.spectrum_free.hks import hks_spectrum_free as hks_spectrum_free
+from hks_jax.spectrum_free.heat_diagonal import colouring as colouring
+from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free as hks_spectrum_free
 
 __version__ = "0.2.0"
 

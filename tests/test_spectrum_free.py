@@ -17,8 +17,8 @@ import hks_jax as hj
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.heat_series import coefficient_sizes, heat_coefficients
-from hks_jax.spectrum_free.choice import choose_method, work
-from hks_jax.spectrum_free.poles import exponential_poles
+from hks_jax.spectrum_free.plan import choose_method, work
+from hks_jax.spectrum_free.rational import exponential_poles
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
 
 MIXED = (("neumann", "dirichlet"), "periodic")
@@ -326,9 +326,9 @@ def test_a_volume_too_large_for_selected_inversion_is_left_to_colouring(monkeypa
     """Decided by the number of nodes alone: to dissect them would take long."""
     pencil, times = hj.assemble(flat((9, 10, 11), (1.0, 1.0, 1.0)), mass="lumped"), jnp.array([0.01])
     assert np.isfinite(work(None, pencil, times))
-    monkeypatch.setattr("hks_jax.spectrum_free.choice._MEMORY", 1e6)
+    monkeypatch.setattr("hks_jax.spectrum_free.plan._MEMORY", 1e6)
     with monkeypatch.context() as patched:
-        patched.delattr("hks_jax.spectrum_free.choice.dissect")
+        patched.delattr("hks_jax.spectrum_free.plan.dissect")
         assert work(None, pencil, times) == np.inf
         assert choose_method(pencil, times, "auto", 1e-3).degree > 1
     with pytest.raises(ValueError, match="traced"):

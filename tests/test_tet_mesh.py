@@ -15,7 +15,7 @@ from scipy.special import spherical_jn
 from solids import box
 
 import hks_jax as hj
-from hks_jax.fem.rim import rim_measure
+from hks_jax.eigen.weyl import rim_measure
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 CELL = np.array([[0, 1, 2, 3]])

@@ -7,8 +7,8 @@ import pytest
 from fields import flat, random_spd
 
 import hks_jax as hj
+from hks_jax.eigen.weyl import rim_measure
 from hks_jax.fem.boundary import normalise_boundary
-from hks_jax.fem.rim import rim_measure
 from hks_jax.fem.space import grid_space
 
 

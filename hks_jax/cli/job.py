@@ -22,11 +22,10 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.heat import Normalisation
+from hks_jax.signatures.hks import HKSMethod, Normalisation, hks, hks_auto
 from hks_jax.signatures.tail import truncation_map
 from hks_jax.signatures.times import default_times, positive_range
 from hks_jax.signatures.truncation import truncation
-from hks_jax.spectrum_free.auto import HKSMethod, hks, hks_auto
 
 
 class ComputationError(RuntimeError):

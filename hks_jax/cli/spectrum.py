@@ -60,8 +60,8 @@ def run(args: argparse.Namespace) -> None:
     require_metric(args)
     from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
     from hks_jax.cli.outputs import check_folder, show_files, write_report
+    from hks_jax.eigen.weyl import weyl_count
     from hks_jax.plot import save_figure
-    from hks_jax.signatures.weyl import weyl_count
 
     check_folder(args.output)
     progress = Progress(args.quiet)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.checks import checked_times
 from hks_jax.curvature import taylor
 from hks_jax.curvature.gaussian import brioschi
 from hks_jax.curvature.jet import (
@@ -25,7 +26,6 @@ from hks_jax.curvature.laplace_beltrami import laplacian
 from hks_jax.curvature.volume_coefficients import volume_coefficients
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.signatures.times import checked_times
 
 Invariants: TypeAlias = tuple[Array, ...]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.describe import describe_array
-from hks_jax.eigen.messages import messages
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.pencil import SymmetricPencil
@@ -178,7 +177,30 @@ class Eigenpairs(eqx.Module):
         if not self.k:
             return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
-        return messages(self, int(self.kept.sum()), int(self.cut_multiplet), other)
+        values, bad = np.asarray(self.eigenvalues), ~np.asarray(self.converged)
+        kept, cut = int(self.kept.sum()), int(self.cut_multiplet)
+        sentences, last = [], values[kept - 1]
+        if bad.any():
+            missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
+            sentences.append(
+                f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found, worst "
+                f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
+                f"Use float64, fewer pairs, or {other}"
+            )
+        if bool(self.unconfirmed):
+            bound = float(self.complete_below)
+            where = f"below {last:.6g}" if np.isnan(bound) else f"between {bound:.6g} and {last:.6g}"
+            sentences.append(
+                f"the {self.solver_name} solver could not confirm that it missed no eigenvalue {where}. "
+                f"Use slightly more or fewer pairs, or {other}"
+            )
+        if cut:
+            remedy = f"Take k = {kept - cut} or a larger one" if cut < kept else "Take a larger k"
+            sentences.append(
+                f"k = {kept} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = {last:.6g}, have equals "
+                f"beyond k, and which of them are among the k is arbitrary. {remedy}"
+            )
+        return sentences
 
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Needs concrete values."""

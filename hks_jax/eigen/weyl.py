@@ -1,10 +1,19 @@
-"""Weyl's law: about how many eigenvalues lie below one, and about where that of a number lies."""
+"""Weyl's law: how many eigenvalues there are, from the volume of a domain and of its rim."""
 
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Float
+
+from hks_jax.checks import require_real
+from hks_jax.domain.components import wrap_nodes
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.domain.triangulation import FACETS
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.fem.pencil import AnyPencil
+from hks_jax.fem.space import FunctionSpace, GridSpace
 
 Real = TypeVar("Real", float, Float[np.ndarray, " n"])
 Volume = TypeVar("Volume", float, Float[Array, ""])
@@ -25,3 +34,91 @@ def weyl_number(values: Real, volume: float, dimension: int, rim: float = 0.0) -
     if dimension == 2:
         return (volume * values + rim * values**0.5) / (4 * math.pi)
     return volume * values**1.5 / (6 * math.pi**2) + rim * values / (16 * math.pi)
+
+
+def weyl_count(
+    problem: Eigenpairs | AnyPencil, values: Any, domain: TensorField | SimplicialMesh | None = None
+) -> Float[np.ndarray, " n"]:
+    """Return how many eigenvalues lie below each of some numbers, by Weyl's law.
+
+    In 2D N(λ) ≈ (A λ ± L √λ)/4π with the area A, in 3D N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π; plus with the length L or area S
+    of the natural part of the rim, minus with that of the Dirichlet part (Ivrii 1980). Where a mask is the domain, its
+    rim is the staircase that the elements make: eigenfunctions feel all of it only where √λ times the spacing nears 1.
+
+    Args:
+        problem: from `eigenpairs` or `assemble`: volume, dimension and boundary conditions.
+        values: (n,) λ ≥ 0, in 1/(metric length)².
+        domain: the field or the mesh that the problem is of, for the second term; None: the first alone.
+
+    Returns:
+        (n,), on the host.
+
+    Raises:
+        ValueError: a negative λ; a domain that the problem is not of.
+    """
+    pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
+    d = pencil.space.dimension
+    volume = pencil.volume if pencil.measured else None
+    if volume is None:
+        raise ValueError("problem: Weyl's law needs dimension and volume; give them to `sparse_pencil`")
+    require_real("values", values)
+    numbers = np.asarray(values, np.float64)
+    if not (np.isfinite(numbers) & (numbers >= 0)).all():
+        raise ValueError(f"values: got {numbers.min()}; expected eigenvalues, finite and not negative")
+    if domain is None:
+        return weyl_number(numbers, float(volume), d)
+    shape = domain.grid.shape if isinstance(domain, TensorField) else (len(domain.vertices),)
+    if shape != pencil.space.node_shape:
+        raise ValueError(f"domain: got one of shape {shape}; expected that of the problem, {pencil.space.node_shape}")
+    # The problems that make up a doubled domain have opposite conditions where it was doubled.
+    rim = sum(rim_measure(domain, part.space) for part in pencil.parts)
+    return weyl_number(numbers, float(volume), d, rim)
+
+
+def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
+    """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part.
+
+    Args:
+        domain: the field or mesh; not traced.
+        space: the space of its functions, which knows the conditions.
+    """
+    if isinstance(domain, SimplicialMesh):
+        return _mesh_rim(domain, space)
+    assert isinstance(space, GridSpace)
+    return sum(_grid_rim(domain, space, axis) for axis in range(space.dimension))
+
+
+def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
+    """Add up the faces across one axis that belong to one element only."""
+    d, spacing = space.dimension, field.grid.spacing
+    others = [a for a in range(d) if a != axis]
+    tensors = np.asarray(field.domain_tensors, np.float64)[..., others, :][..., others]
+    density = wrap_nodes(np.sqrt(np.linalg.det(tensors)), space.periodic)
+    # At each face the trapezoidal rule over its nodes; indices along the axis are those of nodes.
+    for a in others:
+        n = density.shape[a]
+        density = (density.take(range(n - 1), a) + density.take(range(1, n), a)) / 2
+    density *= np.prod([spacing[a] for a in others])
+    elements = space.elements
+    ends = [(1, 1) if a == axis else (0, 0) for a in range(d)]
+    padded = np.pad(elements, ends, mode="wrap") if space.periodic[axis] else np.pad(elements, ends)
+    n = padded.shape[axis]
+    rim = padded.take(range(n - 1), axis) ^ padded.take(range(1, n), axis)
+    if space.periodic[axis]:
+        rim, density = (array.take(range(n - 2), axis) for array in (rim, density))
+    faces = np.where(rim, density, 0).sum(axis=tuple(others))
+    sign = np.full(faces.size, -1.0 if "dirichlet" in space.boundary[-1] else 1.0)
+    for end, condition in zip((0, -1), space.boundary[axis], strict=True):
+        sign[end] = -1 if condition == "dirichlet" else 1
+    return float(faces @ sign)
+
+
+def _mesh_rim(mesh: SimplicialMesh, space: FunctionSpace) -> float:
+    """Add up the facets that belong to one cell only."""
+    d, triangulation = space.dimension, mesh.triangulation
+    cell, corner = np.divmod(triangulation.boundary_facets, d + 1)
+    corners = np.concatenate([np.zeros((1, d)), np.eye(d)])[FACETS[d][corner]]  # in the basis of the cell's edges
+    steps = corners[:, 1:] - corners[:, :1]
+    gram = np.einsum("fia,fab,fjb->fij", steps, np.asarray(mesh.metric, np.float64)[cell], steps)
+    measure = float(np.sqrt(np.linalg.det(gram)).sum()) / math.factorial(d - 1)
+    return -measure if "dirichlet" in space.boundary[0] else measure

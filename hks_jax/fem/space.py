@@ -203,3 +203,12 @@ def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
 
 _unit_space = lru_cache(maxsize=32)(GridSpace)
 mesh_space = lru_cache(maxsize=32)(MeshSpace)
+
+
+def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
+    """Return colours along one axis: nodes of one colour are ``spacing`` or more apart."""
+    if not wraps:
+        return np.arange(n) % min(spacing, n)
+    # As many runs as fit, some a node longer than others: the first of one run is `spacing` or more after the last.
+    runs = max(n // spacing, 1)
+    return np.concatenate([np.arange(len(run)) for run in np.array_split(np.arange(n), runs)])

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.checks import require_number, require_real
+from hks_jax.checks import checked_times, require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.signatures.heat import heat_trace, hks_of_pairs
-from hks_jax.signatures.times import checked_times
+from hks_jax.signatures.heat import heat_trace
+from hks_jax.signatures.hks import hks_of_pairs
 from hks_jax.signatures.wave import wks
 from hks_jax.static_array import StaticArray
 

@@ -12,13 +12,13 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.weyl import weyl_count
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.single_precision import residuals_of
 from hks_jax.inverse.unknowns import Unknowns, Values
 from hks_jax.signatures.tail import resolving
-from hks_jax.signatures.weyl import weyl_count
 
 TAIL = 1e-6
 """What part of the heat trace at the smallest time may lie beyond the pairs that are computed."""

@@ -14,8 +14,8 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.weyl import weyl_number
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.signatures.heat import Normalisation, hks_of_pairs
-from hks_jax.spectrum_free.hks import hks_spectrum_free
+from hks_jax.signatures.hks import Normalisation, hks_of_pairs
+from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
 
 SMALL = 10_000
 """Nodes up to which the signature at one time takes less by selected inversion than the eigenpairs that it needs."""

@@ -9,8 +9,8 @@ from matplotlib.lines import Line2D
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.weyl import weyl_count
 from hks_jax.plot.figure import SMALL
-from hks_jax.signatures.weyl import weyl_count
 
 
 def spectrum(

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import checked_times
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -13,9 +14,9 @@ from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, Sides, normalise_boundary
 from hks_jax.signatures.filters import Heat
-from hks_jax.signatures.heat import hks_of_pairs
+from hks_jax.signatures.hks import hks_of_pairs
 from hks_jax.signatures.spectral import spectral_diagonal
-from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.times import require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
 
 

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral import source_indices, spectral_squared_distances
-from hks_jax.signatures.times import checked_times, dimension_of, positive_range, require_pairs, volume_of
+from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
 from hks_jax.signatures.truncation import warn_if_truncated
 from hks_jax.traced import is_traced
 

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import require_real
+from hks_jax.checks import checked_times, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import spectral_flow
-from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.times import require_pairs
 from hks_jax.signatures.truncation import TAIL_LIMIT
 from hks_jax.traced import is_traced
 

@@ -1,39 +1,17 @@
-"""The heat kernel and its signatures."""
+"""The heat kernel, its trace, and the scale-invariant signature."""
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import checked_times, dimension_of, positive_range, require_pairs, volume_of
+from hks_jax.signatures.times import positive_range, require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
-
-Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
-
-
-def hks_of_pairs(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> Float[Array, "n_times *shape"]:
-    """Compute the heat kernel signature as a sum over eigenpairs: `hks_jax.hks` with its method ``"spectral"``."""
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, times)
-    scale = None if normalisation == "raw" else normaliser(pairs, times, normalisation)
-    return spectral_diagonal(pairs, Heat(times), scale)
-
-
-def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
-    """Return the factor at each time that `hks` multiplies the raw signature with."""
-    if normalisation == "raw":
-        return jnp.ones_like(times)
-    if normalisation == "heat-trace":
-        return 1 / spectral_trace(pairs, Heat(times))
-    if normalisation == "volume":
-        return jnp.broadcast_to(volume_of(pairs, 'normalisation="volume"'), times.shape)
-    if normalisation == "flat":
-        return (4 * math.pi * times) ** (dimension_of(pairs, 'normalisation="flat"') / 2)
-    raise ValueError(f'normalisation: got {normalisation!r}; expected "raw", "heat-trace", "volume" or "flat"')
 
 
 def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:

@@ -12,10 +12,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 from scipy.special import gammainccinv
 
+from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import spectral_diagonal
-from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.times import require_pairs
 
 _LEAST_EXPONENT, _GREATEST_EXPONENT = 0.5, 8.0
 """Between a strip, which is a line to all eigenfunctions that were computed, and a corner of Dirichlet sides in 3D."""

@@ -1,32 +1,11 @@
-"""Times and energies: checks, and the defaults of Sun et al. and of Aubry et al."""
-
-from typing import Any
+"""What signatures need of pairs, and the default times and energies of Sun et al. and of Aubry et al."""
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.traced import is_traced
-
-
-def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
-    """Return times as an array (n,); raise ValueError unless they are 1-D, positive and finite."""
-    require_real(name, times)
-    try:
-        array = jnp.asarray(times, dtype)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: got {times!r}; expected a 1-D array of positive numbers") from None
-    if array.ndim != 1 or array.size == 0:
-        raise ValueError(f"{name}: got shape {array.shape}; expected a non-empty 1-D array; wrap one time as [t]")
-    if not is_traced(array):
-        values = np.asarray(array)
-        bad = ~(np.isfinite(values) & (values > 0))
-        if bad.any():
-            raise ValueError(f"{name}: got {values[bad][0]}; expected positive finite times")
-    return array
 
 
 def require_pairs(pairs: Eigenpairs) -> Eigenpairs:

@@ -11,13 +11,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.masks import mask_for
 from hks_jax.fem.resolution import Resolution
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import sum_of
 from hks_jax.signatures.tail import beyond_by_weyl, resolving
-from hks_jax.signatures.times import checked_times, dimension_of, require_pairs
+from hks_jax.signatures.times import dimension_of, require_pairs
 from hks_jax.traced import is_traced
 
 TAIL_LIMIT = 0.01

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal
-from hks_jax.signatures.times import checked_times, require_pairs
+from hks_jax.signatures.times import require_pairs
 from hks_jax.signatures.truncation import truncation, warn_if_truncated
 from hks_jax.traced import is_traced
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.fem.colouring import axis_colours
 from hks_jax.fem.nodal import NodalPencil, lump, to_columns, to_rows
+from hks_jax.fem.space import axis_colours
 from hks_jax.fem.stencil import Stencil
 
 _COLUMNS = 16

@@ -21,7 +21,7 @@ from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
 from hks_jax.plot.orientation import LETTERS
-from hks_jax.signatures.heat import Normalisation
+from hks_jax.signatures.hks import Normalisation
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
 """The page's scripts, in the order in which they need one another."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hks_jax.checks import require_number
+from hks_jax.checks import checked_times, require_number
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.assembly import MassKind, assemble
@@ -17,11 +17,10 @@ from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.heat_series import heat_coefficients
-from hks_jax.signatures.times import checked_times
-from hks_jax.spectrum_free.chebyshev import coloured_diagonal
-from hks_jax.spectrum_free.choice import Method, choose_method, plan, require_fewer_vectors, require_grid
 from hks_jax.spectrum_free.colours import Colouring
-from hks_jax.spectrum_free.selected_inversion import selected_inversion
+from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_fewer_vectors, require_grid
+from hks_jax.spectrum_free.probing import coloured_diagonal
+from hks_jax.spectrum_free.rational import selected_inversion
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
 
 

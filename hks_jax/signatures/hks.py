@@ -11,19 +11,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
-from hks_jax.checks import require_number
+from hks_jax.checks import checked_times, require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.signatures.heat import Normalisation, hks_of_pairs, normaliser
-from hks_jax.signatures.times import checked_times, require_pairs
-from hks_jax.signatures.truncation import truncation
-from hks_jax.spectrum_free.choice import Unattainable, choose_method, least_work, work
-from hks_jax.spectrum_free.hks import hks_spectrum_free
+from hks_jax.signatures.filters import Heat
+from hks_jax.signatures.spectral import spectral_diagonal, spectral_trace
+from hks_jax.signatures.times import dimension_of, require_pairs, volume_of
+from hks_jax.signatures.truncation import truncation, warn_if_truncated
+from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
+from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, work
 from hks_jax.traced import is_traced
 
 _DEARER = 10.0
 """The comparison may take so many times the work of the times that need it."""
 
+Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
 HKSMethod = Literal["spectral", "spectrum-free", "auto"]
 
 
@@ -223,3 +225,24 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
         spectral = hks_of_pairs(pairs, times)
     gap = jnp.abs(spectral - _without(pencil, times, tolerance, settings or "selected-inversion"))
     return jnp.nanmax(gap) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)
+
+
+def hks_of_pairs(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> Float[Array, "n_times *shape"]:
+    """Compute the heat kernel signature as a sum over eigenpairs: `hks_jax.hks` with its method ``"spectral"``."""
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    warn_if_truncated(pairs, times)
+    scale = None if normalisation == "raw" else normaliser(pairs, times, normalisation)
+    return spectral_diagonal(pairs, Heat(times), scale)
+
+
+def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
+    """Return the factor at each time that `hks` multiplies the raw signature with."""
+    if normalisation == "raw":
+        return jnp.ones_like(times)
+    if normalisation == "heat-trace":
+        return 1 / spectral_trace(pairs, Heat(times))
+    if normalisation == "volume":
+        return jnp.broadcast_to(volume_of(pairs, 'normalisation="volume"'), times.shape)
+    if normalisation == "flat":
+        return (4 * math.pi * times) ** (dimension_of(pairs, 'normalisation="flat"') / 2)
+    raise ValueError(f'normalisation: got {normalisation!r}; expected "raw", "heat-trace", "volume" or "flat"')

@@ -1,10 +1,21 @@
-"""Near-best rational approximations of exp(−x) on x ≥ 0 by the Carathéodory–Fejér method."""
+"""The diagonal of exp(−tM⁻¹K)M⁻¹ by rational approximation and selected inversion.
+
+exp(−x) ≈ Re Σ w/(x − z) by the Carathéodory–Fejér method, so the diagonal is that of Re Σ w (tK − zM)⁻¹.
+"""
 
 from functools import lru_cache
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Array, Complex, Float
 from scipy.linalg import hankel
+
+from hks_jax.compilation import jit_quickly
+from hks_jax.linear.dissection import Dissection
+from hks_jax.linear.operators import Operator, PatternedOperator, shifted
+from hks_jax.linear.selected_inversion import diagonal_of_inverse
 
 _TERMS, _SAMPLES, _SCALE = 75, 1024, 9.0
 
@@ -45,3 +56,37 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
     upper = poles.imag > 0
     # exp(y) = Re Σ 2w/(y − p); y = −x gives −2w/(x + p).
     return -poles[upper], -2 * weights[upper]
+
+
+def pole_pairs(dtype: Any) -> int:
+    """Return how many pairs of poles approximate the exponential to rounding."""
+    return 7 if jnp.finfo(dtype).bits > 32 else 4
+
+
+@jit_quickly()
+def selected_inversion(
+    stiffness: PatternedOperator, mass: Operator, times: Float[Array, " m"], dissection: Dissection
+) -> Float[Array, "m n_dof"]:
+    """Return the diagonal at each time.
+
+    Args:
+        stiffness: K.
+        mass: M, with no entries where K has none.
+        times: t.
+        dissection: the elimination tree of K's pattern.
+    """
+    poles, weights = exponential_poles(pole_pairs(times.dtype))
+    complex_type = np.result_type(times.dtype, np.complex64)
+
+    # One pole at a time, also in the transpose: what it needs is computed again.
+    @jax.checkpoint
+    def term(inputs: tuple[Array, Array, Array]) -> Array:
+        time, pole, weight = inputs
+        diagonal = diagonal_of_inverse(dissection, shifted(stiffness, mass, pole / time.astype(complex_type)))
+        return jnp.real(weight * diagonal) / time
+
+    def at(time: Array) -> Array:
+        some = jnp.broadcast_to(time, poles.shape), jnp.asarray(poles, complex_type), jnp.asarray(weights, complex_type)
+        return jnp.sum(jax.lax.map(term, some), axis=0)
+
+    return jax.lax.map(at, times)

@@ -14,7 +14,7 @@ from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.selected_inversion import inversion_cost
 from hks_jax.spectrum_free.colours import Colouring, choose, least_mass_degree, rounding_error
-from hks_jax.spectrum_free.selected_inversion import pole_pairs
+from hks_jax.spectrum_free.rational import pole_pairs
 from hks_jax.spectrum_free.spectrum_bounds import Bounds, bounds, mass_bound
 from hks_jax.traced import is_traced
 
