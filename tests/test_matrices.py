@@ -392,3 +392,12 @@ def test_an_empty_interval_has_signatures_and_derivatives():
     np.testing.assert_array_equal(hj.diffusion_distance(pairs, [1.0], [0]), 0)
     gradient = jax.grad(lambda p: jnp.sum(hj.hks(hj.eigsh(p, interval=(-50.0, -49.0)), [1.0])))(pencil)
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient))
+
+
+def test_counts_take_matrices_and_the_checks_of_eigenpairs():
+    K, M = sp.diags([1.0, 2.0, 2.0, 5.0]).tocsr(), sp.diags([1.0, 1.0, 1.0, 2.0]).tocsr()
+    assert int(hj.count_eigenvalues((K, M), 2.2)) == 3
+    assert int(hj.count_eigenvalues(K, 1.5)) == 1
+    indefinite = sp.csr_matrix(np.diag([1.0, 1, 1, 1]) + 2 * np.eye(4, k=1) + 2 * np.eye(4, k=-1))
+    with pytest.raises(ValueError, match="M: it has 1 negative|M: it has 2 negative"):
+        hj.count_eigenvalues((K, indefinite), 1.0)

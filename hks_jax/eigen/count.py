@@ -1,6 +1,7 @@
 """How many eigenvalues lie below a number, without computing any."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +9,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import require_number
 from hks_jax.compilation import jit_quickly
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.quality import largest
-from hks_jax.fem.assembly import MassKind, assemble
+from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil
+from hks_jax.fem.pencil import AnyPencil, Pencil
+from hks_jax.fem.space import MatrixSpace
+from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import factorise, try_out
+from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
@@ -30,7 +32,7 @@ Count = tuple[Int[Array, ""], Bool[Array, ""]]
 
 
 def count_eigenvalues(
-    domain: TensorField | SimplicialMesh | SymmetricPencil | MirrorPencil,
+    domain: Any,
     below: Float[Array, ""] | float,
     boundary: BoundarySpec = "neumann",
     mass: MassKind = "consistent",
@@ -43,7 +45,7 @@ def count_eigenvalues(
     of a part of the domain, it is counted on both sides of σ. Traceable.
 
     Args:
-        domain: a tensor field, a mesh, or a pencil from `assemble` or `sparse_pencil`.
+        domain: what `eigenpairs` takes: a tensor field, a mesh, a pencil, K, or (K, M).
         below: σ, in 1/(metric length)²; not itself an eigenvalue, where the count is uncertain.
         boundary: see `assemble`; belongs to the pencil if one is given.
         mass: likewise.
@@ -52,10 +54,30 @@ def count_eigenvalues(
         How many eigenvalues are less than σ; traced, −1 where that is uncertain.
 
     Raises:
-        ValueError: σ is not a finite number, or cannot be told from an eigenvalue; with the counts beside it.
+        ValueError: σ is not a finite number, or cannot be told from an eigenvalue, with the counts beside it; what
+            `eigenpairs` refuses of the domain.
     """
     require_number("below", below, above=-math.inf)
-    pencil = domain if isinstance(domain, SymmetricPencil | MirrorPencil) else assemble(domain, boundary, mass)
+    return count_below(checked_pencil(domain, boundary, mass), below)
+
+
+def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
+    """Return the pencil of a domain as a user gives it; of matrices, where concrete, M is tested for definiteness."""
+    pencil = pencil_of(domain, boundary, mass)
+    for part in jax.lax.stop_gradient(pencil).parts:
+        if not isinstance(part.space, MatrixSpace) or isinstance(part.mass, DiagonalOperator) or is_traced(part):
+            continue
+        assert isinstance(part.mass, PatternedOperator)
+        ones, zero = jnp.ones(part.size, part.mass.dtype), jnp.zeros((), part.mass.dtype)
+        negative, sound = certain_count(SymmetricPencil(part.mass, DiagonalOperator(ones)), zero)
+        if int(negative) or not sound:
+            what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
+            raise ValueError(f"M: it has {what}, by the inertia of its factorisation; expected positive definite")
+    return pencil
+
+
+def count_below(pencil: AnyPencil, below: Float[Array, ""] | float) -> Int[Array, ""]:
+    """Count the eigenvalues of a pencil below a number; see `count_eigenvalues`."""
     shift = jnp.asarray(below, pencil.parts[0].stiffness.dtype)
     count, sound = _total(pencil, shift)
     if is_traced((count, sound)):
@@ -79,7 +101,7 @@ def count_eigenvalues(
     )
 
 
-def _total(pencil: SymmetricPencil | MirrorPencil, shift: Float[Array, ""]) -> Count:
+def _total(pencil: AnyPencil, shift: Float[Array, ""]) -> Count:
     """Return how many eigenvalues of all parts are below, and whether that is certain."""
     counts = [certain_count(part, shift) for part in pencil.parts]
     return sum((count for count, _ in counts), jnp.zeros((), int)), jnp.all(jnp.stack([sound for _, sound in counts]))
@@ -121,10 +143,10 @@ def count_once(
     return factor.negative, try_out(factor, pencil, shift, probes).sound
 
 
-def _smallest_scale(pencil: SymmetricPencil | MirrorPencil) -> Float[Array, ""]:
+def _smallest_scale(pencil: AnyPencil) -> Float[Array, ""]:
     """Return the least distance of eigenvalues to expect: what σ near zero is compared with."""
     if isinstance(pencil, AnyPencil) and pencil.measured:
         assert pencil.volume is not None
         return 1 / pencil.volume ** (2 / pencil.space.dimension)
-    assert isinstance(pencil, SymmetricPencil)
+    assert isinstance(pencil, Pencil)
     return 1e-6 * largest(pencil)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.count import certain_count, count_eigenvalues
+from hks_jax.eigen.count import certain_count, count_below
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -125,7 +125,7 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
     if not float(low) < float(high):
         raise ValueError(f"interval: got ({float(low):g}, {float(high):g}); expected (a, b) with a < b, both finite")
     try:
-        below, above = (count_eigenvalues(pencil, end) for end in (low, high))
+        below, above = (count_below(pencil, end) for end in (low, high))
     except ValueError as error:
         raise ValueError(f"interval: {str(error).removeprefix('below: ')}") from None
     held = above - below

@@ -2,16 +2,12 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.experimental.sparse import BCOO, BCSR
-from scipy.sparse import issparse
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.choice import choose_solver
-from hks_jax.eigen.count import certain_count
+from hks_jax.eigen.count import checked_pencil
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
@@ -19,13 +15,9 @@ from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice, check_choice, truncate
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, silent
-from hks_jax.fem.assembly import MassKind, assemble
+from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.space import MatrixSpace
-from hks_jax.fem.sparse_input import require_null_space, sparse_pencil
-from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 
@@ -85,7 +77,7 @@ def eigenpairs(
         AccuracyWarning: unconverged pairs, a bound that is not confirmed, or a multiple eigenvalue that k cuts (where
             values are concrete).
     """
-    pencil = _pencil(domain, boundary, mass)
+    pencil = checked_pencil(domain, boundary, mass)
     check_choice(multiplet)
     report = progress or silent
     if interval is not None:
@@ -156,44 +148,6 @@ def eigsh(
     return eigenpairs(
         K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress, interval=interval
     )
-
-
-def _pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
-    """Return the pencil that a domain, or what a user gives in its place, stands for; checked where it is theirs."""
-    matrix = issparse(domain) or isinstance(domain, BCOO | BCSR | Operator | np.ndarray | jax.Array | list)
-    given = matrix or isinstance(domain, SymmetricPencil | MirrorPencil | tuple)
-    if not given:
-        return assemble(domain, boundary, mass)
-    if boundary != "neumann" or mass != "consistent":
-        raise ValueError("boundary, mass: a pencil has them already; give them to `assemble` instead")
-    if matrix:
-        domain = sparse_pencil(domain)
-    elif isinstance(domain, tuple):
-        if len(domain) != 2:
-            raise ValueError(f"domain: got a tuple of {len(domain)}; expected a pair (K, M)")
-        domain = sparse_pencil(*domain)
-    elif not isinstance(domain, AnyPencil):
-        domain = sparse_pencil(domain)
-    if isinstance(domain, Pencil) and isinstance(domain.space, MatrixSpace):
-        matrices = domain.stiffness, domain.mass
-        symmetric = [m.symmetric_part() if isinstance(m, SparseOperator) else m for m in matrices]
-        domain = eqx.tree_at(lambda p: (p.stiffness, p.mass), domain, symmetric)
-    for part in jax.lax.stop_gradient(domain).parts:
-        require_null_space(part)
-        if isinstance(part.space, MatrixSpace) and not is_traced(part):
-            _check_mass(part)
-    return domain
-
-
-def _check_mass(pencil: Pencil) -> None:
-    if isinstance(pencil.mass, DiagonalOperator):
-        return
-    assert isinstance(pencil.mass, PatternedOperator)
-    ones = DiagonalOperator(jnp.ones(pencil.size, pencil.mass.dtype))
-    negative, sound = certain_count(SymmetricPencil(pencil.mass, ones), jnp.zeros((), pencil.mass.dtype))
-    if int(negative) or not sound:
-        what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
-        raise ValueError(f"M: it has {what}, by the inertia of its factorisation; expected positive definite")
 
 
 def _lowest(

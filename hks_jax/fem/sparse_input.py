@@ -3,6 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,9 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_matrix, issparse
 
 from hks_jax.checks import real_array, require_number
-from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.assembly import MassKind, assemble
+from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.operators import DiagonalOperator, Operator, SparseOperator
 from hks_jax.linear.pattern import SparsePattern
@@ -87,6 +90,26 @@ def sparse_pencil(
     space = MatrixSpace(tuple(shape or (n,)), dimension)
     null_space = None if null_vectors is None else NullSpace(_checked_null_vectors(pencil, null_vectors))
     return Pencil(pencil.stiffness, pencil.mass, None, volume, space, null_space=null_space)
+
+
+def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
+    """Return the pencil of a field, a mesh, a matrix K or a pair (K, M); or the one that is given, checked."""
+    matrix = issparse(domain) or isinstance(domain, BCOO | BCSR | Operator | np.ndarray | jax.Array | list)
+    if not matrix and not isinstance(domain, SymmetricPencil | MirrorPencil | tuple):
+        return assemble(domain, boundary, mass)
+    if boundary != "neumann" or mass != "consistent":
+        raise ValueError("boundary, mass: a pencil has them already; give them to `assemble` instead")
+    if isinstance(domain, tuple) and len(domain) != 2:
+        raise ValueError(f"domain: got a tuple of {len(domain)}; expected a pair (K, M)")
+    if not isinstance(domain, Pencil | MirrorPencil):
+        domain = sparse_pencil(*domain) if isinstance(domain, tuple) else sparse_pencil(domain)
+    if isinstance(domain, Pencil) and isinstance(domain.space, MatrixSpace):
+        matrices = domain.stiffness, domain.mass
+        symmetric = [m.symmetric_part() if isinstance(m, SparseOperator) else m for m in matrices]
+        domain = eqx.tree_at(lambda p: (p.stiffness, p.mass), domain, symmetric)
+    for part in jax.lax.stop_gradient(domain).parts:
+        require_null_space(part)
+    return domain
 
 
 def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[Array, "m n"]:

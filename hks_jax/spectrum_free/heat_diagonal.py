@@ -10,11 +10,12 @@ from jaxtyping import Array, Float
 from hks_jax.checks import checked_times, require_number
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.assembly import MassKind, assemble
+from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import GridSpace
+from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.heat_series import heat_coefficients
 from hks_jax.spectrum_free.colours import Colouring
@@ -109,15 +110,6 @@ def colouring(
     settings = plan(pencil, times, tolerance, memory, slack)
     require_fewer_vectors(settings, pencil)
     return settings
-
-
-def pencil_of(domain: TensorField | SimplicialMesh | AnyPencil, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
-    """Return the pencil of a domain."""
-    if not isinstance(domain, AnyPencil):
-        return assemble(domain, boundary, mass)
-    if boundary != "neumann" or mass != "consistent":
-        raise ValueError("boundary, mass: a pencil has them already; give them to `assemble` instead")
-    return domain
 
 
 def _diagonal(
