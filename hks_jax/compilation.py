@@ -1,12 +1,13 @@
-"""Compiling for CPUs in half the time."""
+"""Compiling for CPUs in half the time, or not at all."""
 
 import os
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hks_jax.traced import is_traced
 
@@ -33,6 +34,29 @@ def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[
             # Nothing comes of an operation but a tracer where all operations are part of a computation to come.
             within = is_traced((args, kwargs, jnp.zeros(())))
             return usual(*args, **kwargs) if within or not _understood() else quick(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Return a decorator for functions of few numbers, which take the module of arrays, NumPy's or JAX's, first.
+
+    With concrete values on a CPU they are computed by NumPy, for which nothing is compiled; else by `jax.jit` with the
+    settings. What comes out are JAX's arrays.
+    """
+
+    def decorate(function: Callable[..., T]) -> Callable[..., T]:
+        compiled = jax.jit(partial(function, jnp), **settings)
+
+        @wraps(function)
+        def call(*args: Any) -> T:
+            if is_traced((args, jnp.zeros(()))) or jax.default_backend() != "cpu" or jax.process_count() > 1:
+                return compiled(*args)
+            known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
+            with np.errstate(all="ignore"):
+                return jax.tree.map(jnp.asarray, function(np, *known))
 
         return call
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import unsolved
 from hks_jax.eigen.complement.interior import InteriorAdjoint
@@ -142,7 +143,7 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
 
 
 # What else were kept for the transpose would be copies of the eigenvectors.
-@partial(jax.jit, static_argnames=("adjoint", "telling"))
+@jit_quickly(static_argnames=("adjoint", "telling"))
 @partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(
     adjoint: Adjoint,

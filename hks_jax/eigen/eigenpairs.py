@@ -1,6 +1,5 @@
 """Eigenpairs, and what is known of their quality."""
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import numpy_where_known
 from hks_jax.describe import describe_array
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.fem.space import FunctionSpace
@@ -222,42 +222,26 @@ class Eigenpairs(eqx.Module):
         return "\n".join(lines + self.messages())
 
 
-def multiplet_gap(
-    values: Float[Array, "*k"], origin: Float[Array, ""], tolerance: Float[Array, ""]
-) -> Float[Array, "*k"]:
-    """Return the gaps up to which the next eigenvalues count as copies."""
+def multiplet_gap(xp: Any, values: Any, origin: Any, tolerance: Any) -> Any:
+    """Return the gaps (*k) up to which the next eigenvalues (*k) count as copies; by NumPy or by JAX."""
     finfo = jnp.finfo(values.dtype)
-    return tolerance * jnp.maximum(jnp.maximum(values - origin, finfo.eps * jnp.abs(values)), finfo.tiny)
+    return tolerance * xp.maximum(xp.maximum(values - origin, finfo.eps * xp.abs(values)), finfo.tiny)
 
 
-@jax.jit
-def _last(values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, ""]:
-    return values[jnp.sum(kept) - 1]
+@numpy_where_known()
+def _last(xp: Any, values: Any, kept: Any) -> Any:
+    return values[xp.sum(kept) - 1]
 
 
-@partial(jax.jit, static_argnames="optional")
-def _unconfirmed(
-    values: Float[Array, " k"],
-    kept: Bool[Array, " k"],
-    bound: Float[Array, ""],
-    origin: Float[Array, ""],
-    multiplet_tolerance: Float[Array, ""],
-    optional: bool,
-) -> Bool[Array, ""]:
-    last = _last(values, kept)
-    needed = last - 2 * multiplet_tolerance * (last - origin)
+@numpy_where_known(static_argnums=5)
+def _unconfirmed(xp: Any, values: Any, kept: Any, bound: Any, origin: Any, tolerance: Any, optional: bool) -> Any:
+    last = values[xp.sum(kept) - 1]
+    needed = last - 2 * tolerance * (last - origin)
     return bound < needed if optional else ~(bound >= needed)
 
 
-@jax.jit
-def _cut_multiplet(
-    values: Float[Array, " k"],
-    kept: Bool[Array, " k"],
-    next_eigenvalue: Float[Array, ""],
-    origin: Float[Array, ""],
-    multiplet_tolerance: Float[Array, ""],
-) -> Int[Array, ""]:
-    last = _last(values, kept)
-    tolerance = multiplet_gap(last, origin, multiplet_tolerance)
-    together = jnp.sum(kept & (values >= last - tolerance))
-    return jnp.where(next_eigenvalue - last <= tolerance, together, 0)
+@numpy_where_known()
+def _cut_multiplet(xp: Any, values: Any, kept: Any, following: Any, origin: Any, tolerance: Any) -> Any:
+    last = values[xp.sum(kept) - 1]
+    gap = multiplet_gap(xp, last, origin, tolerance)
+    return xp.where(following - last <= gap, xp.sum(kept & (values >= last - gap)), 0)

@@ -1,13 +1,11 @@
 """Where to truncate a spectrum: multiple eigenvalues are kept whole or left out."""
 
-from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, multiplet_gap
 
 MultipletChoice = Literal["report", "drop", "complete"]
@@ -37,27 +35,21 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
     return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), pairs, chosen)
 
 
-@partial(jax.jit, static_argnames=("k", "multiplet"))
+@numpy_where_known(static_argnums=(4, 5))
 def _choose(
-    values: Float[Array, " n"],
-    following: Float[Array, ""],
-    origin: Float[Array, ""],
-    multiplet_tolerance: Float[Array, ""],
-    k: int,
-    multiplet: MultipletChoice,
-) -> tuple[Bool[Array, " n"], Float[Array, ""]]:
-    """Return which pairs are kept, and the eigenvalue after them."""
+    xp: Any, values: Any, following: Any, origin: Any, tolerance: Any, k: int, multiplet: MultipletChoice
+) -> tuple[Any, Any]:
+    """Return which pairs (n) are kept, and the eigenvalue after them."""
     size = len(values)
-    sequence = jnp.append(values, following)
-    index = jnp.arange(size)
-    tolerance = multiplet_gap(values, origin, multiplet_tolerance)
-    complete_up_to = jnp.diff(sequence) > tolerance
+    sequence = xp.append(values, following)
+    index = xp.arange(size)
+    complete_up_to = xp.diff(sequence) > multiplet_gap(xp, values, origin, tolerance)
     if multiplet == "report":
-        count = jnp.asarray(k)
+        count = xp.asarray(k)
     else:
-        count = jnp.max(jnp.where(complete_up_to & (index < k), index + 1, 0))
+        count = xp.max(xp.where(complete_up_to & (index < k), index + 1, 0))
         if multiplet == "complete":
-            more = jnp.min(jnp.where(complete_up_to & (index >= k - 1), index + 1, size + 1))
-            count = jnp.where(more <= size, more, count)
-        count = jnp.where(count > 0, count, k)
+            more = xp.min(xp.where(complete_up_to & (index >= k - 1), index + 1, size + 1))
+            count = xp.where(more <= size, more, count)
+        count = xp.where(count > 0, count, k)
     return index < count, sequence[count]

@@ -1,6 +1,6 @@
 """From a tensor field or a mesh to its stiffness and mass: one element's integrals, mapped over all elements."""
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
 from typing import Literal
 
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation
@@ -101,10 +102,10 @@ def _assemble_grid(field: TensorField, space: GridSpace, mass: MassKind) -> Penc
     element = tensor_product_element(space.dimension).stretched(spacing)
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
-    arrays = tensors, domain, elements, couplings_for(tensors, space), gradients, weights
-    stiffness, consistent, lumped, volume = _grid_integrals(*arrays, space.periodic, field.interpolation)
-    chosen = _chosen_mass(mass, space, StencilOperator(coefficients=consistent, space=space), lumped)
-    stiffness = StencilOperator(coefficients=stiffness, space=space)
+    couplings, settings = couplings_for(tensors, space), (space.periodic, field.interpolation)
+    *stencils, lumped, volume = _grid_integrals(tensors, domain, elements, couplings, gradients, weights, *settings)
+    stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in stencils)
+    chosen = _chosen_mass(mass, space, consistent, lumped)
     metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
     return Pencil(stiffness, chosen, metric, volume, space, null_space=_constants(space, tensors))
 
@@ -126,12 +127,12 @@ def _chosen_mass(
     return consistent if mass == "consistent" else DiagonalOperator(entries=space.restrict(lumped))
 
 
-@partial(jax.jit, static_argnames=("periodic", "interpolation"))
+@jit_quickly(static_argnames=("periodic", "interpolation"))
 def _grid_integrals(
     tensors: Float[Array, "*shape d d"],
-    domain: Bool[Array, "*shape"],
-    elements: Bool[Array, "*elements"],
-    couplings: Bool[Array, "offsets *shape"] | None,
+    domain: Bool[np.ndarray | Array, "*shape"],
+    elements: Bool[np.ndarray | Array, "*elements"],
+    couplings: Bool[np.ndarray | Array, "offsets *shape"] | None,
     gradients: Float[np.ndarray | Array, "q n d"],
     weights: Float[np.ndarray | Array, " q"],
     periodic: tuple[bool, ...],
@@ -189,7 +190,7 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
     return total
 
 
-@partial(jax.jit, static_argnames=("space", "mass"))
+@jit_quickly(static_argnames=("space", "mass"))
 def _assemble_mesh(mesh: SimplicialMesh, space: MeshSpace, mass: MassKind) -> Pencil:
     metric, element = mesh.metric, simplex_element(space.dimension)
     cells, n_vertices = space.triangulation.cells, space.triangulation.n_vertices

@@ -1,6 +1,5 @@
 """How well a grid or a mesh resolves a metric: the nodal numbers behind estimates of the discretisation error."""
 
-from functools import partial
 from itertools import combinations
 
 import equinox as eqx
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.fem.masks import mask_for
@@ -81,7 +81,7 @@ def dispersion(
 # element lacks: with p of covariance A⁻¹ it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, in units of what p has along one axis. That is for
 # √t above the length on which A varies. Below it the error is of the same size, but no such sum of neighbours.
 def turning(
-    tensors: Float[Array, "*shape d d"], domain: Bool[Array, "*shape"], periodic: tuple[bool, ...]
+    tensors: Float[Array, "*shape d d"], domain: Bool[np.ndarray | Array, "*shape"], periodic: tuple[bool, ...]
 ) -> Float[Array, "*shape"]:
     """Return the relative error of eigenvalues because the tensors vary between neighbours that are in the domain."""
     root = jnp.sqrt(spd.determinant(tensors))[..., None, None]
@@ -102,7 +102,7 @@ def turning(
 # density √|T| by half the trace of T⁻¹ times that: tr T⁻¹∂ₐ²T for T interpolated, ∂ₐ²log|T| for its logarithm.
 def swelling(
     tensors: Float[Array, "*shape d d"],
-    domain: Bool[Array, "*shape"],
+    domain: Bool[np.ndarray | Array, "*shape"],
     periodic: tuple[bool, ...],
     interpolation: Interpolation,
 ) -> Float[Array, ""]:
@@ -122,18 +122,18 @@ def swelling(
     return jnp.abs(total)
 
 
-def _neighbours(domain: Bool[Array, "*shape"], axis: int, wraps: bool) -> Bool[Array, "*shape"]:
+def _neighbours(domain: Bool[np.ndarray | Array, "*shape"], axis: int, wraps: bool) -> Bool[Array, "*shape"]:
     """Tell which nodes are in the domain with the next one along the axis."""
-    pairs = domain & jnp.roll(domain, -1, axis)
+    pairs = jnp.logical_and(domain, jnp.roll(domain, -1, axis))
     if wraps:
         return pairs
     n = domain.shape[axis]
     return pairs & (jnp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@partial(jax.jit, static_argnames=("periodic", "lumped"))
+@jit_quickly(static_argnames=("periodic", "lumped"))
 def _of_grid(
-    metric: SampledMetric, domain: Bool[Array, "*shape"], periodic: tuple[bool, ...], lumped: bool
+    metric: SampledMetric, domain: Bool[np.ndarray | Array, "*shape"], periodic: tuple[bool, ...], lumped: bool
 ) -> Resolution:
     assert metric.spacing is not None
     tensors = spd.positive_or_nan(spd.identity_unless(domain, metric.tensors))
@@ -154,7 +154,7 @@ The medians over the nodes of squares, spheres, boxes and balls, cut regularly o
 """
 
 
-@partial(jax.jit, static_argnames=("n_vertices", "lumped"))
+@jit_quickly(static_argnames=("n_vertices", "lumped"))
 def _of_mesh(
     metric: Float[Array, "n d d"], cells: Int[np.ndarray | Array, "n corners"], n_vertices: int, lumped: bool
 ) -> Resolution:

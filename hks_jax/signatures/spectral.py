@@ -10,6 +10,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.first_order import first_order_only
@@ -146,7 +147,7 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
 
 
 # The transpose computes again what it needs: kept, that would be two copies of the eigenvectors.
-@partial(jax.jit, static_argnames=("fixed", "copies"))
+@jit_quickly(static_argnames=("fixed", "copies"))
 @partial(jax.checkpoint, static_argnums=(4, 5))
 def _tangent(
     contraction: Contraction,

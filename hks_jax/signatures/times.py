@@ -1,9 +1,12 @@
 """What signatures need of pairs, and the default times and energies of Sun et al. and of Aubry et al."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.traced import is_traced
 
@@ -57,15 +60,13 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance)
 
 
-@jax.jit
-def _ends(
-    values: Float[Array, " k"], kept: Bool[Array, " k"], tolerance: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    def mean_of_copies(value: Array) -> Array:
-        copies = kept & (jnp.abs(values - value) <= tolerance * value)
-        return jnp.sum(jnp.where(copies, values, 0)) / jnp.sum(copies, dtype=values.dtype)
+@numpy_where_known()
+def _ends(xp: Any, values: Any, kept: Any, tolerance: Any) -> tuple[Any, Any]:
+    def mean_of_copies(value: Any) -> Any:
+        copies = kept & (xp.abs(values - value) <= tolerance * value)
+        return xp.sum(xp.where(copies, values, 0)) / xp.sum(copies, dtype=values.dtype)
 
-    return mean_of_copies(values[jnp.argmax(values > 0)]), mean_of_copies(values[jnp.sum(kept) - 1])
+    return mean_of_copies(values[xp.argmax(values > 0)]), mean_of_copies(values[xp.sum(kept) - 1])
 
 
 def _n_positive(pairs: Eigenpairs) -> int:

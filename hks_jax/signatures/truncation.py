@@ -1,7 +1,6 @@
 """What a truncated spectrum on a grid of finite spacing can resolve, time by time."""
 
 from collections.abc import Sequence
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -12,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import checked_times
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.masks import mask_for
 from hks_jax.fem.resolution import Resolution
@@ -109,10 +109,10 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     )
 
 
-@partial(jax.jit, static_argnames="dimension")
+@jit_quickly(static_argnames="dimension")
 def _truncation(
     resolution: Resolution | None,
-    free: Bool[Array, "*shape"],
+    free: Bool[np.ndarray | Array, "*shape"],
     values: Float[Array, " k"],
     kept: Bool[Array, " k"],
     next_eigenvalue: Float[Array, ""],
@@ -139,7 +139,10 @@ def _truncation(
 # factor 1 + v is that of the metric times (1 + v)^(2/d), which divides the signature by 1 + v and eigenvalues by
 # (1 + v)^(2/d): an error of v(1 − s). Where k pairs are too few for t, what lies beyond them counts with s = 1.
 def _resolution_bias(
-    resolution: Resolution, free: Bool[Array, "*shape"], times: Float[Array, " n"], slope: Float[Array, " n"]
+    resolution: Resolution,
+    free: Bool[np.ndarray | Array, "*shape"],
+    times: Float[Array, " n"],
+    slope: Float[Array, " n"],
 ) -> tuple[Float[Array, "n nodes"], Float[Array, "n nodes"]]:
     """Return the estimated relative error by the spacing, and its part that does not fall with t; 0 at other nodes."""
     turning, dispersion = (jnp.where(free, x, 0).ravel() for x in (resolution.turning, resolution.dispersion))
@@ -150,7 +153,7 @@ def _resolution_bias(
     return both / (1 + both), lasting / (1 + lasting)
 
 
-def median_of_shares(x: Float[Array, "n nodes"], free: Bool[Array, "*shape"]) -> Float[Array, " n"]:
+def median_of_shares(x: Float[Array, "n nodes"], free: Bool[np.ndarray | Array, "*shape"]) -> Float[Array, " n"]:
     """Return the median over the free nodes of numbers between 0 and 1, 0 at the others, to 1e-12; NaN where one is.
 
     Bisection: sorting takes ten times as long.
