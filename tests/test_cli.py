@@ -11,19 +11,20 @@ import time
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import nibabel as nib
 import numpy as np
 import pytest
 
 import hks_jax as hj
 from hks_jax import paper
+from hks_jax.cache import cache_folder
 from hks_jax.cli import demo, fit, main, picture
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.arguments import Times, parse_boundary, parse_times
 from hks_jax.cli.bar import bar, duration
 from hks_jax.cli.boundary import default_boundary
-from hks_jax.cli.cache import cache_folder
 from hks_jax.cli.picture import away_from_rim, bounding_box
 from hks_jax.cli.progress import Progress
 from hks_jax.eigen.solver import Status
@@ -335,9 +336,27 @@ def test_caches_are_where_the_platform_has_them():
     assert cache_folder("win32", {"LOCALAPPDATA": "C:/Local"}, home) == Path("C:/Local/hks-jax/Cache")
 
 
+def test_programs_are_kept_where_the_user_says_and_a_folder_that_is_set_stays(tmp_path):
+    name = "jax_compilation_cache_dir"
+    before = jax.config.values[name], jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    try:
+        assert hj.keep_compiled(tmp_path / "other") == Path(before[0])
+        assert not (tmp_path / "other").exists()
+        jax.config.update(name, None)
+        assert hj.keep_compiled(tmp_path / "mine") == tmp_path / "mine"
+        assert jax.config.values[name] == str(tmp_path / "mine")
+        (tmp_path / "file").write_text("")
+        jax.config.update(name, None)
+        assert hj.keep_compiled(tmp_path / "file" / "below") is None
+        assert jax.config.values[name] is None
+    finally:
+        jax.config.update(name, before[0])
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", before[1])
+
+
 @pytest.mark.slow
 def test_the_command_line_keeps_what_it_compiled_and_the_package_nothing(npz, tmp_path):
-    # Compiled as users have it: with the tests' options nothing takes long enough to be kept.
+
     environment = {k: v for k, v in os.environ.items() if k not in ("JAX_COMPILATION_CACHE_DIR", "XLA_FLAGS")}
     environment |= {"XDG_CACHE_HOME": str(tmp_path / "cache"), "HOME": str(tmp_path)}
     folder = cache_folder(sys.platform, environment, tmp_path)

@@ -8,11 +8,12 @@ import threading
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
+import jax
 import numpy as np
 
 from hks_jax import __version__
+from hks_jax.cache import keep_compiled
 from hks_jax.cli import batch, convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum, stats
-from hks_jax.cli.cache import keep_compiled
 from hks_jax.cli.spelling import OPTIONS, as_options
 
 EPILOG = """\
@@ -86,7 +87,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # argparse has printed its message
         return int(stop.code or 0)
     try:
-        keep_compiled(not args.no_cache)
+        if args.no_cache:
+            jax.config.update("jax_enable_compilation_cache", False)
+        else:
+            keep_compiled()
         args.run(args)
     except KeyboardInterrupt:
         return _fail(args, "interrupted", INTERRUPTED)
