@@ -138,7 +138,8 @@ def _solve(
             z = factor.solve_columns(r)
             return z - times(near, products_with_columns(near_images, z))
 
-        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted, clean=clean)
+        product = definite_product(pencil, shifts, beyond)
+        return conjugate_gradients(product, precondition, b, wanted, clean=clean).converged
 
     left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
     first = _group(factors.dissection, values, k, adjoint).first

@@ -114,7 +114,8 @@ def _solve(
         def without_near(x: Float[Array, "n b"]) -> Float[Array, "n b"]:
             return x - times(near, products_with_columns(near_images, x))
 
-        return conjugate_gradients(product, without_near, factor.solve_columns(b), wanted, inner, clean)
+        right = factor.solve_columns(b)
+        return conjugate_gradients(product, without_near, right, wanted, inner, clean).converged
 
     left, wanted = projected(pencil, vectors, rhs, attainable(tolerance, rhs.dtype), amplified)
     first = _group(factors.dissection, values, k, tolerance).first

@@ -79,7 +79,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
                 z = correction(nodal, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
                 return clean(-space.restrict(to_rows(z).reshape(-1, *nodal.shape)).T)
 
-            return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
+            return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted).converged
 
         left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
         one_group = np.zeros(1, int)
