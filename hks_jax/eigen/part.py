@@ -14,7 +14,7 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_within, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
-from hks_jax.eigen.located import LocatedPencil, locate, translated
+from hks_jax.eigen.origin import LocatedPencil, locate, translated
 from hks_jax.eigen.quality import indistinct, largest, quality
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil

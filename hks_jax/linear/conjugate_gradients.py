@@ -108,9 +108,10 @@ def conjugate_gradients(
     """
     xp, n = rhs.__array_namespace__(), len(rhs)
 
-    # In exact arithmetic rᵢᵀPrⱼ = 0. Rounding loses that as soon as an eigenvector at the end of the spectrum is known, and
-    # conjugate gradients then look for it again and again: where eigenvalues fall off over eight decades, that doubles
-    # the number of steps. Where products are dear and n is small, it is cheaper to restore it (Paige 1971; Simon 1984).
+    # In exact arithmetic rᵢᵀPrⱼ = 0. Rounding loses that as soon as an eigenvector at the end of the spectrum is known,
+    # and conjugate gradients then look for it again and again: where eigenvalues fall off over eight decades, that
+    # doubles the number of steps. Where products are dear and n is small it is cheaper to restore it (Paige 1971; Simon
+    # 1984).
     def restarted(both: tuple[Array, Array]) -> tuple[Array, Array]:
         assert clean is not None
         x = clean(both[0])

@@ -27,7 +27,7 @@ from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.common import SINGULAR, attainable, middles_of_gaps
 from hks_jax.eigen.complement.factorised import BLOCK, WINDOW, Factors, Groups, factorise_each, group_blocks, one_of
 from hks_jax.eigen.complement.in_blocks import cleaned, projected, solve_in_blocks, without_known
-from hks_jax.eigen.located import LocatedPencil
+from hks_jax.eigen.origin import LocatedPencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation

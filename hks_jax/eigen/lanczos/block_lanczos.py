@@ -12,12 +12,13 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_count, require_number
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, crowded, first_state, make_room, unfinished
-from hks_jax.eigen.located import LocatedPencil
+from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, first_state, unfinished
+from hks_jax.eigen.origin import LocatedPencil
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
-from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.dissection import dissect
+from hks_jax.linear.loops import when, while_loop
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
@@ -69,26 +70,19 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     def slice(self, problem: Problem, plan: Plan, report: Report = silent) -> SlicingState:
         """Compute the wanted eigenpairs from zero upwards, slice by slice."""
         dissection = dissect(problem.pencil.pattern)
-        if is_traced(problem):
-            return _slice_traced(problem, dissection, plan, self.tolerance)
-        problem = problem._replace(pencil=tabulated(problem.pencil))
-        dissection, state = jax.device_put(dissection), _first_state(problem, plan)
-        while _unfinished(plan, state):
+        if not is_traced(problem):
+            problem = problem._replace(pencil=tabulated(problem.pencil))
+            dissection = jax.device_put(dissection)
+
+        def step(state: SlicingState) -> SlicingState:
             factor, searchable, state = cut(problem, dissection, plan, self.tolerance, state)
-            if searchable:
-                if _crowded(plan, state):
-                    assert state.vectors is not None
-                    state = _make_room(plan, state.vectors, state._replace(vectors=None))
-                state = search(problem, factor, plan, self.tolerance, state)
-            if report is not silent:  # to put numbers into words, the host waits for them
+            state = when(searchable, partial(search, problem, factor, plan, self.tolerance), state)
+            if report is not silent and not is_traced(state):  # to put numbers into words, the host waits for them
                 known, bound = min(int(state.known), plan.wanted), float(state.complete_below)
                 report(f"{known} of {plan.wanted} eigenpairs, all below {bound:.6g}")
-        return state
+            return state
 
-
-_first_state = jit_quickly(static_argnames="plan")(first_state)
-_unfinished = jit_quickly(static_argnames="plan")(unfinished)
-_crowded = jit_quickly(static_argnames="plan")(crowded)
+        return while_loop(partial(unfinished, plan), step, first_state(problem, plan))
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
@@ -109,20 +103,6 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
         weyl(j, pencil.volume, n).astype(dtype) for j in (min(plan.wanted, plan.slice_size) / 2 + 1, plan.slice_size, 1)
     )
     return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype), jnp.zeros((), int))
-
-
-@jit_quickly(static_argnames="plan", donate_argnames="vectors")
-def _make_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: SlicingState) -> SlicingState:
-    return make_room(plan, state._replace(vectors=vectors))
-
-
-def _slice_traced(problem: Problem, dissection: Dissection, plan: Plan, tolerance: float) -> SlicingState:
-    def body(state: SlicingState) -> SlicingState:
-        factor, searchable, state = cut(problem, dissection, plan, tolerance, state)
-        state = jax.lax.cond(searchable & crowded(plan, state), partial(make_room, plan), lambda state: state, state)
-        return jax.lax.cond(searchable, partial(search, problem, factor, plan, tolerance), lambda state: state, state)
-
-    return jax.lax.while_loop(partial(unfinished, plan), body, first_state(problem, plan))
 
 
 @jit_quickly(static_argnames="k")

@@ -6,15 +6,18 @@ converged is known from then on. A last factorisation above the last eigenvalue 
 eigenvalues as are known lie below it. Few vectors at a time keep orthogonalisation cheap, however many are wanted.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, steps_for
+from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, crowded, make_room, steps_for
 from hks_jax.eigen.quality import allowed_defects, indistinct, values_and_defects
 from hks_jax.linear.dissection import Dissection
+from hks_jax.linear.loops import when
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
 from hks_jax.traced import is_traced
 
@@ -31,18 +34,21 @@ _MOVES = 3
 def cut(
     problem: Problem, dissection: Dissection, plan: Plan, tolerance: float, state: SlicingState
 ) -> tuple[Factorisation, Bool[Array, ""], SlicingState]:
-    """Factorise at the state's shift; return with it whether to search there, and the state if not."""
+    """Factorise at the state's shift; return with it whether to search there, and the state, with room for that."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
     trial = try_out(factor, problem.pencil, state.shift, state.noise)
-    searchable, following = _consider(problem, factor.negative, trial, plan, tolerance, state._replace(vectors=None))
-    return factor, searchable, following._replace(vectors=state.vectors)
+    searchable, full, following = _consider(
+        problem, factor.negative, trial, plan, tolerance, state._replace(vectors=None)
+    )
+    return factor, searchable, when(full, partial(make_room, plan), following._replace(vectors=state.vectors))
 
 
 @jit_quickly(static_argnames=("plan", "tolerance"))
 def _consider(
     problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, tolerance: float, state: SlicingState
-) -> tuple[Bool[Array, ""], SlicingState]:
-    """Return whether to search at the state's shift, and the state if not: finished, or with a better shift."""
+) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
+    """Return whether to search at the state's shift, whether to make room for it, and the state: if it is not to be
+    searched, finished or with a better shift."""
     known, below = jnp.sum(state.values < state.shift), negative - problem.negative
     missing = below - known
     complete = trial.sound & (missing == 0)
@@ -70,7 +76,8 @@ def _consider(
         moved=jnp.where(moves, state.moved + 1, 0),
         passes=jnp.where(accurate, state.passes, 2),
     )
-    return ~(finished | too_many | moves), state
+    searchable = ~(finished | too_many | moves)
+    return searchable, searchable & crowded(plan, state), state
 
 
 def _needed(

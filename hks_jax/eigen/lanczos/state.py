@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.linear.pencil import SymmetricPencil
 
 _NODES = 1 << 16
@@ -134,6 +135,7 @@ class SlicingState(NamedTuple):
     finished: Bool[Array, ""]
 
 
+@jit_quickly(static_argnames="plan")
 def first_state(problem: Problem, plan: Plan) -> SlicingState:
     """Return the state in which nothing is known."""
     n, dtype = problem.pencil.size, problem.pencil.stiffness.dtype
@@ -156,6 +158,7 @@ def first_state(problem: Problem, plan: Plan) -> SlicingState:
     )
 
 
+@jit_quickly(static_argnames="plan")
 def unfinished(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
     """Return whether to go on: not all is found, and there are tries left."""
     return ~state.finished & (state.slices < plan.max_slices)
@@ -168,14 +171,18 @@ def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
 
 def make_room(plan: Plan, state: SlicingState) -> SlicingState:
     """Forget the highest of the known eigenpairs, which are more than wanted; if stuck, all above what was reached."""
-    assert state.vectors is not None
+    return _with_room(plan, state.vectors, state._replace(vectors=None))
+
+
+@jit_quickly(static_argnames="plan", donate_argnames="vectors")
+def _with_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: SlicingState) -> SlicingState:
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
     count = jnp.minimum(count, plan.capacity - plan.ritz)
     kept = jnp.arange(plan.capacity) < count
     return state._replace(
         values=jnp.where(kept, state.values[order], jnp.inf),
-        vectors=_reordered(state.vectors, order, kept),
+        vectors=_reordered(vectors, order, kept),
         known=count,
     )
 
