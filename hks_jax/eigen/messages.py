@@ -1,45 +1,15 @@
 """What limits eigenpairs, in sentences."""
 
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
 
 
-@runtime_checkable
-class Solved(Protocol):
-    """Eigenpairs, and what is known of their quality; concrete."""
-
-    @property
-    def eigenvalues(self) -> Float[Array, " k"]:
-        """Ascending; NaN where none was found."""
-
-    @property
-    def residuals(self) -> Float[Array, " k"]:
-        """Relative."""
-
-    @property
-    def converged(self) -> Bool[Array, " k"]:
-        """Whether they are small enough."""
-
-    @property
-    def unconfirmed(self) -> Bool[Array, ""]:
-        """Whether the certificate ends before the last eigenvalue."""
-
-    @property
-    def complete_below(self) -> Float[Array, ""]:
-        """Where it ends."""
-
-    @property
-    def solver_name(self) -> str:
-        """The method."""
-
-
-def messages(pairs: Solved, kept: int, cut: int, other: str) -> list[str]:
+def messages(pairs: Any, kept: int, cut: int, other: str) -> list[str]:
     """Say what limits the pairs; empty if nothing does.
 
     Args:
-        pairs: the pairs.
+        pairs: `Eigenpairs`, concrete.
         kept: how many of them, the first, are the truncated spectrum.
         cut: how many of the last that are kept belong to a multiple eigenvalue that goes on beyond them; 0 if none.
         other: what to use if not fewer pairs.
@@ -48,10 +18,11 @@ def messages(pairs: Solved, kept: int, cut: int, other: str) -> list[str]:
     sentences, last = [], values[kept - 1]
     if bad.any():
         missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(pairs.residuals)[bad], initial=0.0)
+        found = f", worst relative residual of the others {worst:.1e}" if missing < bad.sum() else ""
+        better = "" if values.dtype == np.float64 else "float64, "
         sentences.append(
-            f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found, worst "
-            f"relative residual of the others {worst:.1e}) with the {pairs.solver_name} solver. "
-            f"Use float64, fewer pairs, or {other}"
+            f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found{found}) with the "
+            f"{pairs.solver_name} solver. Use {better}fewer pairs, or {other}"
         )
     if bool(pairs.unconfirmed):
         bound = float(pairs.complete_below)

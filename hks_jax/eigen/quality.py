@@ -1,4 +1,4 @@
-"""How well eigenpairs are known: their defects, and what rounding alone makes of eigenvalues."""
+"""How well eigenpairs are known: their residuals, and what rounding alone makes of eigenvalues."""
 
 import jax
 import jax.numpy as jnp
@@ -6,15 +6,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import row_blocks
+from hks_jax.linear.products import products_with_columns, row_blocks
 
 _EXCUSED = 0.01
 """The relative residual that rounding excuses at most."""
+_ALIKE = 0.1
+"""The inner product of normalised vectors from which on they count as one."""
 _ROWS = 8
 """How many vectors to look at together: what is computed from them stays in the cache."""
 
 
-def values_and_defects(
+def values_and_residuals(
     pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Return λ, if not given the Rayleigh quotient φᵀKφ / φᵀMφ, and ‖Kφ − λMφ‖ / ‖Mφ‖ of each vector."""
@@ -31,8 +33,25 @@ def values_and_defects(
             quotients = jax.lax.dynamic_slice_in_dim(values, start, size)
         return quotients, jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
-    all_values, defects = jax.lax.map(measure, jnp.asarray(starts))
-    return all_values[place], defects[place]
+    all_values, residuals = jax.lax.map(measure, jnp.asarray(starts))
+    return all_values[place], residuals[place]
+
+
+def repeated(pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"]) -> Bool[Array, " m"]:
+    """Return which vectors are, in large part, among the few before them: eigenvectors found twice."""
+    mass, m = pencil.mass.of_columns(), len(vectors)
+    size, width = min(_ROWS, m), min(2 * _ROWS, m)
+    starts, place = row_blocks(m, size)
+
+    def compare(start: Array) -> Bool[Array, " b"]:
+        first = jnp.maximum(start + size - width, 0)
+        rows = jax.lax.dynamic_slice_in_dim(vectors, first, width)
+        own = start + jnp.arange(size)
+        products = products_with_columns(rows, mass(vectors[own].T))
+        before = first + jnp.arange(width)[:, None] < own
+        return jnp.any(before & (jnp.abs(products) > _ALIKE), axis=0)
+
+    return jax.lax.map(compare, jnp.asarray(starts))[place]
 
 
 def quality(
@@ -42,22 +61,26 @@ def quality(
     unit: Float[Array, ""],
     tolerance: float,
 ) -> tuple[Float[Array, " k"], Bool[Array, " k"], Float[Array, " k"]]:
-    """Return residuals relative to the eigenvalues, whether they are small enough, and what rounding alone makes.
+    """Return residuals relative to the eigenvalues, whether pairs converged, and what rounding alone makes.
 
-    Eigenvalues smaller than ``unit`` are measured by it.
+    They converged if residuals are small enough, and vectors orthogonal to those before.
+
+    Eigenvalues smaller than ``unit`` are measured by it; where both are zero, by the size of K.
     """
-    _, defects = values_and_defects(pencil, vectors, values)
+    _, residuals = values_and_residuals(pencil, vectors, values)
     scale = jnp.maximum(jnp.abs(values), jnp.abs(unit))
-    scale, rounding = jnp.where(scale > 0, scale, 1), indistinct(pencil, values.dtype)
-    return defects / scale, defects <= allowed_defects(scale, rounding, tolerance), rounding / scale
+    size, rounding = largest(pencil), indistinct(pencil, values.dtype)
+    scale = jnp.where(scale > 0, scale, jnp.where(size > 0, size, 1))
+    small = (residuals <= allowed_residuals(scale, rounding, tolerance)) & ~repeated(pencil, vectors)
+    return residuals / scale, small, rounding / scale
 
 
-def allowed_defects(scale: Float[Array, "*m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, "*m"]:
-    """Return the defects ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
+def allowed_residuals(scale: Float[Array, "*m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, "*m"]:
+    """Return the residuals ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
 
     Args:
         scale: what their residuals are relative to: the size of λ, or of a typical eigenvalue if that is larger.
-        rounding: the defects that rounding alone may make; it excuses a relative residual of a per cent at most, beyond
+        rounding: the residuals that rounding alone may make; it excuses a relative residual of a per cent at most, beyond
             which the pair is not known, whatever the reason.
         tolerance: the relative residual asked for.
     """

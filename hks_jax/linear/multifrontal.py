@@ -92,7 +92,7 @@ def factorise(
 
 # What is factorised is F = A + E with A = K − σM. If the spectral radius of EF⁻¹ is below one, F − tE = (1 − tEF⁻¹)F is
 # singular for no t in [0, 1], so that no eigenvalue crosses zero on the way: F and A have the same inertia. With
-# x = F⁻¹b the defect b − Ax is EF⁻¹b, so that solving again with the defect is a step of the power method. Already the
+# x = F⁻¹b the residual b − Ax is EF⁻¹b, so that solving again with the residual is a step of the power method. Already the
 # first decides if it is tiny: b is random, and the share of any direction in it hardly less than 1/√n.
 @jit_quickly()
 def try_out(
@@ -127,8 +127,8 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
     norms = jnp.sqrt(jnp.diagonal(products))
     # Of a matrix this small the inverse is as good, and a long triangular solve is slow.
     inverse = lapack.inverse_cholesky(products / norms / norms[:, None]) / norms
-    defects, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
-    return jnp.max(defects / images)
+    residuals, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
+    return jnp.max(residuals / images)
 
 
 @jit_quickly()

@@ -161,18 +161,18 @@ def _converge(
 class Pace:
     """How long a subspace iteration still takes, from the convergence and the cost of the rounds so far.
 
-    The largest defect falls by about the same factor in every round, and a round takes time in proportion to the
+    The largest residual falls by about the same factor in every round, and a round takes time in proportion to the
     products that its polynomials have. Nothing is estimated before one round is over.
     """
 
     def __init__(self, excess: float) -> None:
-        """Begin with the largest defect, as a multiple of what counts as converged."""
+        """Begin with the largest residual, as a multiple of what counts as converged."""
         self._excess, self._factor = excess, math.nan
         self._work, self._seconds = math.nan, math.nan
         self._begin = time.perf_counter()
 
     def round_done(self, excess: float, work: int) -> None:
-        """Remember a round of so many products, and the defect after it."""
+        """Remember a round of so many products, and the residual after it."""
         now = time.perf_counter()
         self._factor, self._excess = self._excess / excess if excess > 0 else math.inf, excess
         self._work, self._seconds, self._begin = work, now - self._begin, now

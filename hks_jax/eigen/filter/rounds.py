@@ -23,7 +23,7 @@ from hks_jax.eigen.filter.subspace import (
     to_own_rows,
     to_slabs,
 )
-from hks_jax.eigen.quality import allowed_defects
+from hks_jax.eigen.quality import allowed_residuals
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns, to_rows
@@ -71,7 +71,7 @@ class FilterState(NamedTuple):
     Attributes:
         values: (m,) Ritz values θ, ascending.
         vectors: (m, nodes) M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab.
-        defects: (m,) ‖Kx − θMx‖/‖Mx‖.
+        residuals: (m,) ‖Kx − θMx‖/‖Mx‖.
         lumped_values: (m,) xᵀKx / xᵀDx with the lumped mass D.
         terms: further terms of the mass's inverse that were needed so far.
         rounds: rounds so far on this grid.
@@ -79,7 +79,7 @@ class FilterState(NamedTuple):
 
     values: Float[Array, " m"]
     vectors: Float[Array, "m nodes"]
-    defects: Float[Array, " m"]
+    residuals: Float[Array, " m"]
     lumped_values: Float[Array, " m"]
     terms: Int[Array, ""]
     rounds: Int[Array, ""]
@@ -122,18 +122,18 @@ class GridFilter(eqx.Module):
         return self.pencil.cut(self.plan.mesh)
 
     def allowed(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, " m"]:
-        """Return the defects up to which pairs count as converged."""
+        """Return the residuals up to which pairs count as converged."""
         scale = jnp.maximum(state.values, state.values[self.plan.n_null])
-        return allowed_defects(scale, rounding, self.plan.tolerance)
+        return allowed_residuals(scale, rounding, self.plan.tolerance)
 
     def unconverged(self, rounding: Float[Array, ""], state: FilterState) -> Int[Array, ""]:
         """Return how many of the wanted pairs have not converged."""
-        return jnp.sum(~(state.defects <= self.allowed(rounding, state))[: self.plan.wanted])
+        return jnp.sum(~(state.residuals <= self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
     def excess(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, ""]:
-        """Return the largest defect of the wanted pairs, as a multiple of what counts as converged."""
-        return jnp.max((state.defects / self.allowed(rounding, state))[: self.plan.wanted])
+        """Return the largest residual of the wanted pairs, as a multiple of what counts as converged."""
+        return jnp.max((state.residuals / self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
     def from_random(self, volume: Float[Array, ""]) -> FilterState:
@@ -214,7 +214,7 @@ class GridFilter(eqx.Module):
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
-        left = spare | (True if rounding is None else ~(state.defects <= self.allowed(rounding, state)))
+        left = spare | (True if rounding is None else ~(state.residuals <= self.allowed(rounding, state)))
         # The spare vectors need no more than the last wanted one.
         goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)
@@ -261,8 +261,8 @@ class GridFilter(eqx.Module):
         slabs, block = self.slabs, self.plan.block
         own = self.pencil.own(slabs)
         values, vectors = rayleigh_ritz(own, slabs, block, vectors)
-        defects, lumped_values = measured(own, slabs, block, values, vectors)
-        return FilterState(values, vectors, defects, lumped_values, terms, rounds)
+        residuals, lumped_values = measured(own, slabs, block, values, vectors)
+        return FilterState(values, vectors, residuals, lumped_values, terms, rounds)
 
     def _begin(self, rows: Float[Array, "own nodes"]) -> FilterState:
         """Return the first state on this grid, from this device's rows."""

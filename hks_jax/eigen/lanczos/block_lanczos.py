@@ -11,9 +11,11 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.compilation import jit_quickly
+from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, first_state, unfinished
 from hks_jax.eigen.origin import LocatedPencil
+from hks_jax.eigen.quality import repeated
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
@@ -26,11 +28,16 @@ SLICE = 170
 """Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
 
 
+_DENSE = 3000
+"""Unknowns up to which all pairs are computed where slicing fails."""
+
+
 class BlockLanczos(Eigensolver[SymmetricPencil]):
     """Spectrum slicing: shift-invert block Lanczos on nested-dissection factorisations, all in JAX.
 
     For grids and meshes, 2D above all (in 3D the factors fill in). The same code runs on CPUs and accelerators, and is
-    traceable whole. Called plainly it can be interrupted, and reports progress, between two slices.
+    traceable whole. Called plainly it can be interrupted, and reports progress, between two slices; and only then finds
+    any number of copies of an eigenvalue, if need be, up to 3000 unknowns, by computing all pairs.
 
     Attributes:
         tolerance: relative residual that counts as converged.
@@ -55,7 +62,13 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         plan = self.plan(k, min(pencil.n_null, k))
         state = self.slice(expected(pencil, plan), plan, report)
         assert state.vectors is not None
-        return (*_lowest(state.values, state.vectors, k), state.complete_below)
+        values, vectors, bound = _lowest(pencil, state.values, state.vectors, state.complete_below, k)
+        if is_traced(bound) or (state.finished and not jnp.isnan(bound)) or pencil.size > _DENSE:
+            return values, vectors, bound
+        report("not all found: computing all pairs")
+        first = int(pencil.negative) if isinstance(pencil, LocatedPencil) else 0
+        values, vectors, bound = Dense().lowest(pencil, first + k)
+        return values[first:], vectors[first:], bound
 
     def max_pairs(self, n_dof: int) -> int:
         """Return how many pairs leave room for a Lanczos basis."""
@@ -107,10 +120,16 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
 
 @jit_quickly(static_argnames="k")
 def _lowest(
-    values: Float[Array, " capacity"], vectors: Float[Array, "capacity n_dof"], k: int
-) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    """Return the lowest known pairs; NaN where there are fewer than k."""
+    pencil: SymmetricPencil,
+    values: Float[Array, " capacity"],
+    vectors: Float[Array, "capacity n_dof"],
+    bound: Float[Array, ""],
+    k: int,
+) -> RawPairs:
+    """Return the lowest known pairs, NaN where there are fewer than k, and the bound, NaN if one was found twice."""
     order = jnp.argsort(values)[:k]
     values, vectors = values[order], vectors[order]
     known = jnp.isfinite(values)
-    return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan)
+    if values.dtype == jnp.float32:  # in double precision the projections keep all apart
+        bound = jnp.where(jnp.any(repeated(pencil, vectors) & known), jnp.nan, bound)
+    return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound

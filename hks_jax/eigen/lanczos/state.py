@@ -108,13 +108,16 @@ class SlicingState(NamedTuple):
         known: how many there are.
         shift: where to cut next.
         below: eigenvalues from zero to the shift, by the inertia of the factorisation there; −1 if that is not trusted.
+        multiple: whether many of them are not known, and copies of one eigenvalue.
+        far: the last shift below which there were too many to search there,
+        far_below: and how many; 0 before there is one.
         reached: known up to this without a gap, as far as is known.
         complete_below: every eigenvalue below it is known, by the inertia of a factorisation.
         start: (n_dof, block) where Lanczos starts next.
         noise: (n_dof, block) independent normal numbers.
         slices: factorisations so far.
         moved: how often in a row the shift was moved because the factorisation was inaccurate there.
-        passes: how often to solve: once, or again with the defect.
+        passes: how often to solve: once, or again with the residual.
         stuck: whether the last search found nothing of what is missing.
         finished: whether all is found and certified.
     """
@@ -124,6 +127,9 @@ class SlicingState(NamedTuple):
     known: Int[Array, ""]
     shift: Float[Array, ""]
     below: Int[Array, ""]
+    multiple: Bool[Array, ""]
+    far: Float[Array, ""]
+    far_below: Int[Array, ""]
     reached: Float[Array, ""]
     complete_below: Float[Array, ""]
     start: Float[Array, "n_dof block"]
@@ -146,6 +152,9 @@ def first_state(problem: Problem, plan: Plan) -> SlicingState:
         known=jnp.zeros((), int),
         shift=problem.first,
         below=jnp.full((), -1, int),
+        multiple=jnp.zeros((), bool),
+        far=jnp.zeros((), dtype),
+        far_below=jnp.zeros((), int),
         reached=jnp.zeros((), dtype),
         complete_below=jnp.zeros((), dtype),
         start=noise,
