@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import unsolved
-from hks_jax.eigen.complement.interior import InteriorAdjoint
+from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
+from hks_jax.eigen.complement.factorised import InteriorAdjoint
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct

@@ -21,8 +21,8 @@ def messages(pairs: Any, kept: int, cut: int, other: str) -> list[str]:
         found = f", worst relative residual of the others {worst:.1e}" if missing < bad.sum() else ""
         better = "" if values.dtype == np.float64 else "float64, "
         sentences.append(
-            f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found{found}) with the "
-            f"{pairs.solver_name} solver. Use {better}fewer pairs, or {other}"
+            f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found{found}) with "
+            f"the {pairs.solver_name} solver. Use {better}fewer pairs, or {other}"
         )
     if bool(pairs.unconfirmed):
         bound = float(pairs.complete_below)

@@ -16,42 +16,33 @@ _ROWS = 8
 """How many vectors to look at together: what is computed from them stays in the cache."""
 
 
-def values_and_residuals(
+def measure_pairs(
     pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Return λ, if not given the Rayleigh quotient φᵀKφ / φᵀMφ, and ‖Kφ − λMφ‖ / ‖Mφ‖ of each vector."""
+) -> tuple[Float[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
+    """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether a vector is in large part among the few before it: one found twice.
+
+    If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared.
+    """
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
-    m, size = len(vectors), min(_ROWS, len(vectors))
+    m, size, width = len(vectors), min(_ROWS, len(vectors)), min(2 * _ROWS, len(vectors))
     starts, place = row_blocks(m, size)
 
-    def measure(start: Array) -> tuple[Array, Array]:
+    def measure(start: Array) -> tuple[Array, Array, Array]:
         columns = jax.lax.optimization_barrier(jax.lax.dynamic_slice_in_dim(vectors, start, size).T)
         force, image = stiffness(columns), mass(columns)
         if values is None:
             quotients = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
+            twice = jnp.zeros(size, bool)
         else:
             quotients = jax.lax.dynamic_slice_in_dim(values, start, size)
-        return quotients, jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
+            first = jnp.maximum(start + size - width, 0)
+            products = products_with_columns(jax.lax.dynamic_slice_in_dim(vectors, first, width), image)
+            before = first + jnp.arange(width)[:, None] < start + jnp.arange(size)
+            twice = jnp.any(before & (jnp.abs(products) > _ALIKE), axis=0)
+        residuals = jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
+        return quotients, residuals, twice
 
-    all_values, residuals = jax.lax.map(measure, jnp.asarray(starts))
-    return all_values[place], residuals[place]
-
-
-def repeated(pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"]) -> Bool[Array, " m"]:
-    """Return which vectors are, in large part, among the few before them: eigenvectors found twice."""
-    mass, m = pencil.mass.of_columns(), len(vectors)
-    size, width = min(_ROWS, m), min(2 * _ROWS, m)
-    starts, place = row_blocks(m, size)
-
-    def compare(start: Array) -> Bool[Array, " b"]:
-        first = jnp.maximum(start + size - width, 0)
-        rows = jax.lax.dynamic_slice_in_dim(vectors, first, width)
-        own = start + jnp.arange(size)
-        products = products_with_columns(rows, mass(vectors[own].T))
-        before = first + jnp.arange(width)[:, None] < own
-        return jnp.any(before & (jnp.abs(products) > _ALIKE), axis=0)
-
-    return jax.lax.map(compare, jnp.asarray(starts))[place]
+    return jax.tree.map(lambda of_blocks: of_blocks[place], jax.lax.map(measure, jnp.asarray(starts)))
 
 
 def quality(
@@ -63,15 +54,14 @@ def quality(
 ) -> tuple[Float[Array, " k"], Bool[Array, " k"], Float[Array, " k"]]:
     """Return residuals relative to the eigenvalues, whether pairs converged, and what rounding alone makes.
 
-    They converged if residuals are small enough, and vectors orthogonal to those before.
-
-    Eigenvalues smaller than ``unit`` are measured by it; where both are zero, by the size of K.
+    They converged if residuals are small enough, and vectors orthogonal to those before. Eigenvalues smaller than
+    ``unit`` are measured by it; where both are zero, by the size of K.
     """
-    _, residuals = values_and_residuals(pencil, vectors, values)
+    _, residuals, twice = measure_pairs(pencil, vectors, values)
     scale = jnp.maximum(jnp.abs(values), jnp.abs(unit))
     size, rounding = largest(pencil), indistinct(pencil, values.dtype)
     scale = jnp.where(scale > 0, scale, jnp.where(size > 0, size, 1))
-    small = (residuals <= allowed_residuals(scale, rounding, tolerance)) & ~repeated(pencil, vectors)
+    small = (residuals <= allowed_residuals(scale, rounding, tolerance)) & ~twice
     return residuals / scale, small, rounding / scale
 
 
@@ -80,7 +70,7 @@ def allowed_residuals(scale: Float[Array, "*m"], rounding: Float[Array, ""], tol
 
     Args:
         scale: what their residuals are relative to: the size of λ, or of a typical eigenvalue if that is larger.
-        rounding: the residuals that rounding alone may make; it excuses a relative residual of a per cent at most, beyond
+        rounding: the residuals that rounding alone may make; it excuses a relative one of a per cent at most, beyond
             which the pair is not known, whatever the reason.
         tolerance: the relative residual asked for.
     """

@@ -92,8 +92,8 @@ def factorise(
 
 # What is factorised is F = A + E with A = K − σM. If the spectral radius of EF⁻¹ is below one, F − tE = (1 − tEF⁻¹)F is
 # singular for no t in [0, 1], so that no eigenvalue crosses zero on the way: F and A have the same inertia. With
-# x = F⁻¹b the residual b − Ax is EF⁻¹b, so that solving again with the residual is a step of the power method. Already the
-# first decides if it is tiny: b is random, and the share of any direction in it hardly less than 1/√n.
+# x = F⁻¹b the residual b − Ax is EF⁻¹b, so that solving again with it is a step of the power method. Already the first
+# decides if it is tiny: b is random, and the share of any direction in it hardly less than 1/√n.
 @jit_quickly()
 def try_out(
     factor: Factorisation, pencil: SymmetricPencil, shift: Float[Array, ""], b: Float[Array, "n_dof b"]

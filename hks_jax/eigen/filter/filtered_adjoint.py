@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
-from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import amplification, attainable, definite_product, first_beyond
-from hks_jax.eigen.complement.in_blocks import projected, solve_in_blocks, without_known
+from hks_jax.eigen.complement.adjoint import Adjoint, amplification, attainable, definite_product, first_beyond
+from hks_jax.eigen.complement.blockwise import projected, solve_in_blocks, without_known
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 from hks_jax.fem.pencil import Pencil

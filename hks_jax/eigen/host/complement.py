@@ -1,7 +1,7 @@
 """Solves with K − λᵢM on the complement of known eigenvectors, on the host.
 
 Conjugate gradients, preconditioned with SciPy's factorisations of K − σM: the method of
-`hks_jax.eigen.complement.common`.
+`hks_jax.eigen.complement.adjoint`.
 """
 
 import os
@@ -19,9 +19,9 @@ from scipy.sparse.linalg import SuperLU
 from threadpoolctl import threadpool_limits
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import (
+from hks_jax.eigen.complement.adjoint import (
     SINGULAR,
+    Adjoint,
     amplification,
     attainable,
     first_beyond,

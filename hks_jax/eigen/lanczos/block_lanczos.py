@@ -15,7 +15,7 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, first_state, unfinished
 from hks_jax.eigen.origin import LocatedPencil
-from hks_jax.eigen.quality import repeated
+from hks_jax.eigen.quality import measure_pairs
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
@@ -100,7 +100,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
     """Return whether Weyl's law says where a spectrum begins and how dense it is; else inertia has to find out."""
-    return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
+    return isinstance(pencil, Pencil) and pencil.measure_pairs and pencil.null_space is not None
 
 
 @jit_quickly(static_argnames="plan")
@@ -131,5 +131,5 @@ def _lowest(
     values, vectors = values[order], vectors[order]
     known = jnp.isfinite(values)
     if values.dtype == jnp.float32:  # in double precision the projections keep all apart
-        bound = jnp.where(jnp.any(repeated(pencil, vectors) & known), jnp.nan, bound)
+        bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & known), jnp.nan, bound)
     return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound

@@ -16,7 +16,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.columns import orthonormal
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
 from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, crowded, make_room, steps_for
-from hks_jax.eigen.quality import allowed_residuals, indistinct, values_and_residuals
+from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.loops import when
@@ -218,7 +218,7 @@ def _accept(
     shift, index, dtype = state.shift, jnp.arange(plan.capacity), vectors.dtype
     near = shift + 1 / theta
 
-    values, residuals = values_and_residuals(problem.pencil, vectors)
+    values, residuals, _ = measure_pairs(problem.pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
     scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
     # Where nothing converged, as on a domain much longer than wide, it is rounding that is worse than usual: the
