@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 
 from hks_jax.traced import is_traced
 
@@ -16,6 +17,15 @@ def while_loop(going_on: Callable[[State], Any], step: Callable[[State], State],
         return jax.lax.while_loop(going_on, step, state)
     while going_on(state):
         state = step(state)
+    return state
+
+
+def for_each(count: int, step: Callable[[Any, State], State], state: State) -> State:
+    """Return what steps, given their numbers, make of a state; `jax.lax.fori_loop` where any of it is traced."""
+    if is_traced(state):
+        return jax.lax.fori_loop(0, count, step, state)
+    for number in range(count):
+        state = step(jnp.asarray(number), state)
     return state
 
 

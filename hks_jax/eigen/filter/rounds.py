@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
@@ -28,6 +27,7 @@ from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns, to_rows
 from hks_jax.linear.accelerators import row_by_row
+from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
 """How far one round damps what is not wanted: much more, and the lumped mass in the filter is what limits it."""
@@ -172,36 +172,33 @@ class GridFilter(eqx.Module):
         layout = _layout(self.slabs)
         return shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
 
-    @partial(jax.jit, donate_argnames="state")
-    def improve(self, rounding: Float[Array, ""] | None, state: FilterState) -> FilterState:
-        """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz."""
+    def improve_told(
+        self, rounding: Float[Array, ""] | None, state: FilterState, done: Callable[[int, int], Any] | None = None
+    ) -> FilterState:
+        """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz.
+
+        Called plainly, on one device, it can be interrupted between two blocks, and tells after each how many products
+        are done of all. `improve` is compiled whole.
+        """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
         def run(grid: GridFilter, rounding: Float[Array, ""] | None, state: FilterState) -> FilterState:
             numbers = own_blocks(slabs, plan.size // plan.block)
             chosen = grid.choose(rounding, state)
-            step = partial(grid.filter_block, chosen, state.values)
-            rows = to_own_rows(slabs, plan.block, state.vectors)
-            filtered = jax.lax.fori_loop(0, numbers.size, lambda own, rows: step(numbers[own], own, rows), rows)
+
+            def step(own: Array, rows: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
+                rows = grid.filter_block(chosen, state.values, numbers[own], own, rows)
+                if done is not None and chosen.degrees[own]:
+                    jax.block_until_ready(rows)
+                    done(int(chosen.degrees[: own + 1].sum()), int(chosen.degrees.sum()))
+                return rows
+
+            filtered = for_each(numbers.size, step, to_own_rows(slabs, plan.block, state.vectors))
             return grid.ritz(to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
 
         return shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
 
-    def improve_in_steps(
-        self, rounding: Float[Array, ""], state: FilterState, done: Callable[[int, int], Any]
-    ) -> FilterState:
-        """Do what `improve` does on one device, so that it can be interrupted between two blocks.
-
-        Tell after each block how many products are done of all.
-        """
-        chosen = self.choose(rounding, state)
-        degrees, vectors = np.asarray(chosen.degrees), state.vectors
-        for number in np.flatnonzero(degrees):
-            at = jnp.asarray(number)
-            vectors = self.filter_block(chosen, state.values, at, at, vectors)
-            jax.block_until_ready(vectors)
-            done(int(degrees[: number + 1].sum()), int(degrees.sum()))
-        return self.ritz(vectors, chosen.terms, state.rounds + 1)
+    improve = jax.jit(improve_told, donate_argnames="state")
 
     @jax.jit
     def choose(self, rounding: Float[Array, ""] | None, state: FilterState) -> Filtering:

@@ -100,7 +100,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
     """Return whether Weyl's law says where a spectrum begins and how dense it is; else inertia has to find out."""
-    return isinstance(pencil, Pencil) and pencil.measure_pairs and pencil.null_space is not None
+    return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
 
 
 @jit_quickly(static_argnames="plan")
