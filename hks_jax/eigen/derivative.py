@@ -18,8 +18,8 @@ from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.linear import lapack
+from hks_jax.linear.batches import one_by_one
 from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.one_by_one import one_by_one
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products
 from hks_jax.traced import is_traced

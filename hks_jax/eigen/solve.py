@@ -10,7 +10,7 @@ from jax.experimental.sparse import BCOO, BCSR
 from scipy.sparse import issparse
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.eigen.choice import choose_solver
+from hks_jax.eigen.automatic import choose_solver
 from hks_jax.eigen.count import certain_count
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs

@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
-from hks_jax.linear.level import Level
-from hks_jax.linear.merging import Merged
+from hks_jax.linear.elimination_tree import Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import batched, batched_with_columns, gram, times, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses

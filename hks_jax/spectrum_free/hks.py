@@ -15,8 +15,8 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import GridSpace
+from hks_jax.linear.chebyshev import heat_coefficients
 from hks_jax.linear.dissection import dissect
-from hks_jax.linear.heat_series import heat_coefficients
 from hks_jax.signatures.times import checked_times
 from hks_jax.spectrum_free.chebyshev import coloured_diagonal
 from hks_jax.spectrum_free.choice import Method, choose_method, plan, require_fewer_vectors, require_grid

@@ -13,7 +13,7 @@ from hks_jax.checks import require_count, require_number
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, first_state, unfinished
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, first_state, unfinished
 from hks_jax.eigen.origin import LocatedPencil
 from hks_jax.eigen.quality import measure_pairs
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.lanczos.columns import orthonormal
+from hks_jax.eigen.lanczos.block_algebra import orthonormal
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, crowded, make_room, steps_for
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Window, crowded, make_room, steps_for
 from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
@@ -139,7 +139,8 @@ def _nearest(
     missing = int(state.below - jnp.sum(state.values < state.shift))
     count = min(missing + plan.block, plan.ritz, problem.pencil.size - int(state.known))
     x = jax.random.normal(jax.random.key(int(state.slices)), (problem.pencil.size, count), state.shift.dtype)
-    worst = jnp.inf
+    assert state.vectors is not None
+    worst = jnp.full((), jnp.inf)
     for turn in range(_TURNS):
         values, x, residuals = _inverse_iteration(problem.pencil, shifted, state.vectors, state.known, x)
         before, worst = worst, jnp.max(residuals[:missing])

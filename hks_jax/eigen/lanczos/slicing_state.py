@@ -180,6 +180,7 @@ def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
 
 def make_room(plan: Plan, state: SlicingState) -> SlicingState:
     """Forget the highest of the known eigenpairs, which are more than wanted; if stuck, all above what was reached."""
+    assert state.vectors is not None
     return _with_room(plan, state.vectors, state._replace(vectors=None))
 
 
