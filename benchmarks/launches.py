@@ -33,7 +33,7 @@ import hks_jax as hj  # noqa: E402
 from hks_jax.eigen.filter.rounds import FilterState, GridFilter  # noqa: E402
 from hks_jax.eigen.lanczos import recurrence, slicing  # noqa: E402
 from hks_jax.eigen.lanczos.block_lanczos import expected  # noqa: E402
-from hks_jax.eigen.lanczos.state import first_state, make_room  # noqa: E402
+from hks_jax.eigen.lanczos.slicing_state import first_state, make_room  # noqa: E402
 from hks_jax.fem.nodal import nodal_pencil  # noqa: E402
 from hks_jax.fem.pencil import Pencil  # noqa: E402
 from hks_jax.inverse import optimise  # noqa: E402
@@ -81,7 +81,11 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
 
     apart = state._replace(vectors=None)
     trial = jax.eval_shape(try_out, factor, pencil, shift, state.noise)
-    window = jax.eval_shape(lambda problem, state: slicing._window(problem, plan, state), problem, state)
+
+    def look(problem: Any, state: Any) -> Any:
+        return slicing._window(problem, plan, state, plan.window)
+
+    window = jax.eval_shape(look, problem, state)
     ritz = (
         jax.ShapeDtypeStruct((plan.ritz,), np.float64),
         jax.ShapeDtypeStruct((plan.ritz, pencil.size), np.float64),
@@ -94,7 +98,8 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
         return slicing._accept(problem, plan, TOLERANCE, ritz, interval, state)
 
     def steps(pencil: Any, factor: Any, shift: Any, going: Any, first: Any) -> Any:
-        return recurrence._advance_by_two(pencil, factor, shift, going, plan.window, first, 1)
+        shifted = recurrence.ShiftedSolve(factor, shift, None)
+        return recurrence._advance(pencil, shifted, going, plan.window, True, first, first + 2)
 
     yield "factorisation", nodes, k, lambda: (_eliminate, (dissection, entries, None))
     yield "two Lanczos steps", nodes, k, lambda: (jax.jit(steps, donate_argnums=3), (pencil, factor, shift, going, 0))
@@ -110,7 +115,12 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     yield "making room", nodes, k, lambda: (jax.jit(partial(make_room, plan), donate_argnums=0), (state,))
     yield "trial of it", nodes, k, lambda: (try_out, (factor, pencil, shift, state.noise))
     yield "decisions", nodes, k, lambda: (consider, (problem, factor.negative, trial, apart))
-    yield "window", nodes, k, lambda: (lambda *given: slicing._window(given[0], plan, given[1]), (problem, state))
+    yield (
+        "window",
+        nodes,
+        k,
+        lambda: (lambda *given: slicing._window(given[0], plan, given[1], plan.window), (problem, state)),
+    )
     yield "first block", nodes, k, lambda: (begin, (pencil, state.start, known))
     yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, (window.low, window.high), apart))
     order = jax.ShapeDtypeStruct((plan.ritz,), int)

@@ -53,18 +53,18 @@ def main() -> None:
     solver.solve()
     seconds = time.perf_counter() - start
     vector, image, mass = K.createVecRight(), K.createVecRight(), K.createVecRight()
-    values, defects = [], []
+    values, residuals = [], []
     for i in range(solver.getConverged()):
         value = solver.getEigenpair(i, vector).real
         K.mult(vector, image)
         M.mult(vector, mass)
         image.axpy(-value, mass)
         values.append(value)
-        defects.append(image.norm() / mass.norm())
+        residuals.append(image.norm() / mass.norm())
     order = np.argsort(values)
-    values, defects = np.asarray(values)[order], np.asarray(defects)[order]
+    values, residuals = np.asarray(values)[order], np.asarray(residuals)[order]
     peak = int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1e6
-    worst = float(np.max(defects / np.maximum(values, values[1])))
+    worst = float(np.max(residuals / np.maximum(values, values[1])))
     print(json.dumps({"seconds": seconds, "peak_GB": peak, "worst_residual": worst, "eigenvalues": values.tolist()}))
 
 

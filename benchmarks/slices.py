@@ -22,7 +22,7 @@ from machine import RESULTS, write  # noqa: E402
 import hks_jax as hj  # noqa: E402
 from hks_jax.eigen.lanczos.block_lanczos import expected  # noqa: E402
 from hks_jax.eigen.lanczos.slicing import cut, search  # noqa: E402
-from hks_jax.eigen.lanczos.state import crowded, first_state, make_room, unfinished  # noqa: E402
+from hks_jax.eigen.lanczos.slicing_state import first_state, unfinished  # noqa: E402
 from hks_jax.fem.pencil import Pencil  # noqa: E402
 from hks_jax.linear.dissection import dissect  # noqa: E402
 
@@ -66,7 +66,6 @@ def count(pencil: Pencil, k: int) -> tuple[int, int, bool]:
     while unfinished(plan, state):
         factor, searchable, state = cut(problem, dissection, plan, TOLERANCE, state)
         if searchable:
-            state = make_room(plan, state) if crowded(plan, state) else state
             state, searches = search(problem, factor, plan, TOLERANCE, state), searches + 1
     return int(state.slices) - slices - 1, searches - slices, bool(state.finished)
 

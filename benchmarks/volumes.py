@@ -48,8 +48,8 @@ def measure_here(name: str, n: int, k: int, memory: float) -> None:
     worst = 0.0
     for value, vector in zip(values, vectors, strict=True):
         image = np.asarray(pencil.mass.apply(vector))
-        defect = np.linalg.norm(np.asarray(pencil.stiffness.apply(vector)) - value * image)
-        worst = max(worst, float(defect / np.linalg.norm(image) / max(value, values[1])))
+        residual = np.linalg.norm(np.asarray(pencil.stiffness.apply(vector)) - value * image)
+        worst = max(worst, float(residual / np.linalg.norm(image) / max(value, values[1])))
     print(json.dumps(found | {"worst_residual": worst, "eigenvalues": values.tolist()}))
 
 

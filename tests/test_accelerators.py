@@ -10,9 +10,9 @@ from fields import random_spd
 from scipy.spatial import ConvexHull
 
 import hks_jax as hj
-from hks_jax.eigen.lanczos import columns
+from hks_jax.eigen.lanczos import block_algebra
 from hks_jax.fem.stencil import Stencil
-from hks_jax.linear import accelerators, column_kernels, merging
+from hks_jax.linear import accelerators, column_kernels, elimination_tree
 from hks_jax.linear.chebyshev import chebyshev_iteration
 from hks_jax.linear.column_kernels import orthonormal, parts_of_products, remainder
 from hks_jax.linear.dissection import dissect
@@ -30,8 +30,8 @@ def as_on_an_accelerator(monkeypatch):
 def residual_and_orthogonality(pairs):
     K, M = (np.asarray(matrix.to_dense()) for matrix in (pairs.pencil.stiffness, pairs.pencil.mass))
     vectors, values = np.asarray(pairs.vectors), np.asarray(pairs.eigenvalues)
-    defect = np.abs(vectors @ K - values[:, None] * (vectors @ M)).max() / np.abs(values).max()
-    return defect, np.abs(vectors @ M @ vectors.T - np.eye(pairs.k)).max()
+    residual = np.abs(vectors @ K - values[:, None] * (vectors @ M)).max() / np.abs(values).max()
+    return residual, np.abs(vectors @ M @ vectors.T - np.eye(pairs.k)).max()
 
 
 @pytest.mark.slow
@@ -42,8 +42,8 @@ def test_block_lanczos_in_several_slices(rng, as_on_an_accelerator, traced):
     pairs = jax.jit(solve)(field) if traced else solve(field)
     assert pairs.complete_below > pairs.eigenvalues[-1]
     assert pairs.converged.all()
-    defect, orthogonality = residual_and_orthogonality(pairs)
-    assert defect < 1e-9
+    residual, orthogonality = residual_and_orthogonality(pairs)
+    assert residual < 1e-9
     assert orthogonality < 1e-9
 
 
@@ -97,13 +97,13 @@ def pencil_of(rng, domain):
 def test_merged_levels_solve_as_the_tree_does(rng, monkeypatch, domain, traffic):
     pencil = pencil_of(rng, domain)
     tree = dissect(pencil.pattern)
-    monkeypatch.setattr(merging, "_TRAFFIC", traffic)
-    groups = merging.divided(tree.levels, pencil.size)
+    monkeypatch.setattr(elimination_tree, "_TRAFFIC", traffic)
+    groups = elimination_tree.divided(tree.levels, pencil.size)
     assert (len(groups) < len(tree.levels)) == (traffic > 100)
     assert (len(groups) == 1) == (traffic > 1e4)
     matrix, rhs = pencil.shifted(jnp.asarray(40.0)), jnp.asarray(rng.standard_normal((3, pencil.size)))
     plain = factorise(tree, matrix)
-    several = factorise(tree._replace(merged=merging.merged(tree.levels, pencil.size)), matrix)
+    several = factorise(tree._replace(merged=elimination_tree.merged(tree.levels, pencil.size)), matrix)
     assert several.negative == plain.negative
     exact = np.linalg.solve(pencil.stiffness.to_dense() - 40 * pencil.mass.to_dense(), rhs.T).T
     for factor in (plain, several):
@@ -129,15 +129,15 @@ def test_the_recurrence_by_kernels_is_the_plain_one(rng, monkeypatch):
     pencil = pencil_of(rng, "mask")
     mass = pencil.mass.of_columns()
     x, before = (jnp.asarray(rng.standard_normal((pencil.size, 4))) for _ in range(2))
-    block, image, factor = columns.orthonormal(mass, before)
-    plain = columns.recur(block, image, before, factor, x), columns.without(block, image, x)
+    block, image, factor = block_algebra.orthonormal(mass, before)
+    plain = block_algebra.recur(block, image, before, factor, x), block_algebra.without(block, image, x)
     for name in ("parts_of_products", "remainder", "orthonormal"):
         monkeypatch.setattr(column_kernels, name, partial(getattr(column_kernels, name), interpret=True))
-    monkeypatch.setattr(columns, "_one_of", lambda by_kernels, plain, x: by_kernels())
-    by_kernels = columns.recur(block, image, before, factor, x), columns.without(block, image, x)
+    monkeypatch.setattr(block_algebra, "_one_of", lambda by_kernels, plain, x: by_kernels())
+    by_kernels = block_algebra.recur(block, image, before, factor, x), block_algebra.without(block, image, x)
     for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(by_kernels), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    y, image, factor = columns.orthonormal(mass, before)
+    y, image, factor = block_algebra.orthonormal(mass, before)
     np.testing.assert_allclose(y.T @ mass(y), np.eye(4), atol=1e-14)
     np.testing.assert_allclose(image, mass(y), atol=1e-14)
     np.testing.assert_allclose(y @ factor.T, before, atol=1e-13)

@@ -12,10 +12,10 @@ import scipy.linalg
 from fields import flat, random_spd
 
 import hks_jax as hj
-from hks_jax.eigen.lanczos import basis as bases
+from hks_jax.eigen.lanczos import krylov_basis as bases
 from hks_jax.eigen.lanczos.block_lanczos import expected
 from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.state import Plan, crowded, first_state, make_room
+from hks_jax.eigen.lanczos.slicing_state import Plan, crowded, first_state, make_room
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import factorise
 

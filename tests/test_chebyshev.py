@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
 
-from hks_jax.linear.chebyshev import chebyshev_iteration, chebyshev_recurrence
-from hks_jax.linear.heat_series import coefficient_tails, heat_coefficients, least_degree
+from hks_jax.linear.chebyshev import (
+    chebyshev_iteration,
+    chebyshev_recurrence,
+    coefficient_tails,
+    heat_coefficients,
+    least_degree,
+)
 from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
 
 

@@ -259,7 +259,7 @@ def test_rounds_in_steps_give_the_same_and_say_what_is_left(monkeypatch):
 
 
 def test_what_is_left_of_rounds_that_converge_evenly(monkeypatch):
-    """Four rounds of 10 s each divide the defect by ten; the last two filter half as many pairs."""
+    """Four rounds of 10 s each divide the residual by ten; the last two filter half as many pairs."""
     clock = iter([0.0, 10.0, 20.0])
     monkeypatch.setattr(chebyshev_filter.time, "perf_counter", lambda: next(clock))
     left = chebyshev_filter.Pace(9e3)

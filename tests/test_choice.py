@@ -8,7 +8,7 @@ from fields import flat
 
 import hks_jax as hj
 from hks_jax.eigen import choice
-from hks_jax.eigen.choice import choose_for_fit, choose_solver
+from hks_jax.eigen.automatic import choose_for_fit, choose_solver
 
 
 def single(pencil):

@@ -13,7 +13,7 @@ from differences import directional, heat_kernel_by_contour
 from fields import random_spd
 
 import hks_jax as hj
-from hks_jax.eigen.complement.common import attainable
+from hks_jax.eigen.complement.adjoint import attainable
 from hks_jax.eigen.complement.factorised import group_blocks
 from hks_jax.linear.dissection import dissect
 

@@ -114,9 +114,9 @@ def test_mass_orthonormal_with_true_residuals(rng, solver):
     pairs = hj.eigenpairs(field, 12, solver=solver)
     K, M, phi = pairs.pencil.stiffness.to_dense(), pairs.pencil.mass.to_dense(), pairs.vectors.T
     np.testing.assert_allclose(phi.T @ M @ phi, np.eye(12), atol=1e-11)
-    defect = np.linalg.norm(K @ phi - M @ phi * pairs.eigenvalues, axis=0) / np.linalg.norm(M @ phi, axis=0)
+    residual = np.linalg.norm(K @ phi - M @ phi * pairs.eigenvalues, axis=0) / np.linalg.norm(M @ phi, axis=0)
     scale = np.maximum(pairs.eigenvalues, pairs.eigenvalues[1])
-    np.testing.assert_allclose(pairs.residuals, defect / scale, rtol=1e-3, atol=1e-14)
+    np.testing.assert_allclose(pairs.residuals, residual / scale, rtol=1e-3, atol=1e-14)
     assert pairs.residuals.max() < 1e-10
     assert pairs.eigenfunctions.shape == (12, 9, 10)
 

@@ -49,8 +49,8 @@ def check(pairs, K, M, exact):
     vectors = np.asarray(pairs.vectors)
     weighted = vectors if M is None else (M @ vectors.T).T
     np.testing.assert_allclose(vectors @ weighted.T, np.eye(pairs.k), atol=1e-7)
-    defect = (K @ vectors.T).T - np.asarray(pairs.eigenvalues)[:, None] * weighted
-    assert np.linalg.norm(defect, axis=1).max() < 1e-6 * spread
+    residual = (K @ vectors.T).T - np.asarray(pairs.eigenvalues)[:, None] * weighted
+    assert np.linalg.norm(residual, axis=1).max() < 1e-6 * spread
     assert pairs.converged.all()
     assert pairs.complete_below >= pairs.eigenvalues[-1]
     assert pairs.result == hj.RESULTS.successful

@@ -16,7 +16,7 @@ from scipy.special import ive
 import hks_jax as hj
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.fem.space import GridSpace
-from hks_jax.linear.heat_series import coefficient_sizes, heat_coefficients
+from hks_jax.linear.chebyshev import coefficient_sizes, heat_coefficients
 from hks_jax.spectrum_free.plan import choose_method, work
 from hks_jax.spectrum_free.rational import exponential_poles
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound

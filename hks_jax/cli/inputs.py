@@ -6,7 +6,7 @@ from pathlib import Path
 from hks_jax.cli.arguments import parse_boundary
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_file_argument, add_options, image_suffix, read
-from hks_jax.eigen.choice import SOLVERS
+from hks_jax.eigen.automatic import SOLVERS
 from hks_jax.io import TensorVolume
 from hks_jax.io.repair import require_valid
 

@@ -11,17 +11,16 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import unsolved
-from hks_jax.eigen.complement.interior import InteriorAdjoint
+from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
+from hks_jax.eigen.complement.factorised import InteriorAdjoint
 from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear import lapack
+from hks_jax.linear.batches import one_by_one
 from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.one_by_one import one_by_one
 from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products

@@ -182,10 +182,11 @@ class Eigenpairs(eqx.Module):
         sentences, last = [], values[kept - 1]
         if bad.any():
             missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
+            found = f", worst relative residual of the others {worst:.1e}" if missing < bad.sum() else ""
+            better = "" if values.dtype == np.float64 else "float64, "
             sentences.append(
-                f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found, worst "
-                f"relative residual of the others {worst:.1e}) with the {self.solver_name} solver. "
-                f"Use float64, fewer pairs, or {other}"
+                f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found{found}) "
+                f"with the {self.solver_name} solver. Use {better}fewer pairs, or {other}"
             )
         if bool(self.unconfirmed):
             bound = float(self.complete_below)

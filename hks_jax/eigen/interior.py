@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.located import LocatedPencil, lowered, translated
+from hks_jax.eigen.origin import LocatedPencil, lowered, translated
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report
 
 

@@ -14,7 +14,7 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
-from hks_jax.eigen.located import LocatedPencil, locate, translated
+from hks_jax.eigen.origin import LocatedPencil, locate, translated
 from hks_jax.eigen.quality import indistinct, largest, quality
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
@@ -61,7 +61,8 @@ def solve_lowest(
     moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spacing)
     found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
     values = jax.lax.stop_gradient(found[0])
-    if not is_traced(values) and (spread := values[-1] - values[0]) > 0 and values[0] > _FAR * spread:
+    if not is_traced(values) and _is_far(moved, values):
+        spread = values[-1] - values[0]
         # Once more, from an origin nearer to the spectrum: distances from one so far below would lose their digits.
         origin, first = origin + values[0] - spread, origin + values[-1]
         moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spread / number)
@@ -71,6 +72,12 @@ def solve_lowest(
         frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
         found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method, name if method is solver else method.name)
+
+
+def _is_far(pencil: SymmetricPencil, values: Float[Array, " k"]) -> bool:
+    """Return whether eigenvalues, distances from an origin, lose digits by that; copies of one have none to lose."""
+    spread = values[-1] - values[0]
+    return bool((spread > indistinct(pencil, values.dtype)) & (values[0] > _FAR * spread))
 
 
 class Interval(NamedTuple):

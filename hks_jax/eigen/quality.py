@@ -1,4 +1,4 @@
-"""How well eigenpairs are known: their defects, and what rounding alone makes of eigenvalues."""
+"""How well eigenpairs are known: their residuals, and what rounding alone makes of eigenvalues."""
 
 import jax
 import jax.numpy as jnp
@@ -6,33 +6,43 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import row_blocks
+from hks_jax.linear.products import products_with_columns, row_blocks
 
 _EXCUSED = 0.01
 """The relative residual that rounding excuses at most."""
+_ALIKE = 0.1
+"""The inner product of normalised vectors from which on they count as one."""
 _ROWS = 8
 """How many vectors to look at together: what is computed from them stays in the cache."""
 
 
-def values_and_defects(
+def measure_pairs(
     pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Return λ, if not given the Rayleigh quotient φᵀKφ / φᵀMφ, and ‖Kφ − λMφ‖ / ‖Mφ‖ of each vector."""
+) -> tuple[Float[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
+    """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether a vector is in large part among the few before it: one found twice.
+
+    If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared.
+    """
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
-    m, size = len(vectors), min(_ROWS, len(vectors))
+    m, size, width = len(vectors), min(_ROWS, len(vectors)), min(2 * _ROWS, len(vectors))
     starts, place = row_blocks(m, size)
 
-    def measure(start: Array) -> tuple[Array, Array]:
+    def measure(start: Array) -> tuple[Array, Array, Array]:
         columns = jax.lax.optimization_barrier(jax.lax.dynamic_slice_in_dim(vectors, start, size).T)
         force, image = stiffness(columns), mass(columns)
         if values is None:
             quotients = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
+            twice = jnp.zeros(size, bool)
         else:
             quotients = jax.lax.dynamic_slice_in_dim(values, start, size)
-        return quotients, jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
+            first = jnp.maximum(start + size - width, 0)
+            products = products_with_columns(jax.lax.dynamic_slice_in_dim(vectors, first, width), image)
+            before = first + jnp.arange(width)[:, None] < start + jnp.arange(size)
+            twice = jnp.any(before & (jnp.abs(products) > _ALIKE), axis=0)
+        residuals = jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
+        return quotients, residuals, twice
 
-    all_values, defects = jax.lax.map(measure, jnp.asarray(starts))
-    return all_values[place], defects[place]
+    return jax.tree.map(lambda of_blocks: of_blocks[place], jax.lax.map(measure, jnp.asarray(starts)))
 
 
 def quality(
@@ -42,22 +52,25 @@ def quality(
     unit: Float[Array, ""],
     tolerance: float,
 ) -> tuple[Float[Array, " k"], Bool[Array, " k"], Float[Array, " k"]]:
-    """Return residuals relative to the eigenvalues, whether they are small enough, and what rounding alone makes.
+    """Return residuals relative to the eigenvalues, whether pairs converged, and what rounding alone makes.
 
-    Eigenvalues smaller than ``unit`` are measured by it.
+    They converged if residuals are small enough, and vectors orthogonal to those before. Eigenvalues smaller than
+    ``unit`` are measured by it; where both are zero, by the size of K.
     """
-    _, defects = values_and_defects(pencil, vectors, values)
+    _, residuals, twice = measure_pairs(pencil, vectors, values)
     scale = jnp.maximum(jnp.abs(values), jnp.abs(unit))
-    scale, rounding = jnp.where(scale > 0, scale, 1), indistinct(pencil, values.dtype)
-    return defects / scale, defects <= allowed_defects(scale, rounding, tolerance), rounding / scale
+    size, rounding = largest(pencil), indistinct(pencil, values.dtype)
+    scale = jnp.where(scale > 0, scale, jnp.where(size > 0, size, 1))
+    small = (residuals <= allowed_residuals(scale, rounding, tolerance)) & ~twice
+    return residuals / scale, small, rounding / scale
 
 
-def allowed_defects(scale: Float[Array, "*m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, "*m"]:
-    """Return the defects ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
+def allowed_residuals(scale: Float[Array, "*m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, "*m"]:
+    """Return the residuals ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
 
     Args:
         scale: what their residuals are relative to: the size of λ, or of a typical eigenvalue if that is larger.
-        rounding: the defects that rounding alone may make; it excuses a relative residual of a per cent at most, beyond
+        rounding: the residuals that rounding alone may make; it excuses a relative one of a per cent at most, beyond
             which the pair is not known, whatever the reason.
         tolerance: the relative residual asked for.
     """

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.eigen.choice import choose_solver
+from hks_jax.eigen.automatic import choose_solver
 from hks_jax.eigen.count import checked_pencil
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.doubled import merge, solve_doubled

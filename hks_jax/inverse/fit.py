@@ -14,7 +14,7 @@ import numpy as np
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.choice import choose_for_fit
+from hks_jax.eigen.automatic import choose_for_fit
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec

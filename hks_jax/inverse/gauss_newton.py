@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.checks import require_count, require_number
 from hks_jax.inverse.smoothing import Euclidean, InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Values
-from hks_jax.linear.orthogonal_residuals import orthogonal_conjugate_gradients
+from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 _TIGHTER, _LONGER = 30, 3
 """By what the linear systems are solved more exactly in steps that may be the last."""
@@ -108,18 +108,19 @@ class DampedDescent(eqx.Module):
         adjoint, damping = jacobian.transpose(), self.damping / step_size
 
         # J and Jᵀ stand in the program once: they are most of what there is to compile.
-        def normal(x: Array, first: Bool[Array, ""]) -> Array:
+        def normal(x: Array, first: Bool[Array, ""]) -> tuple[Array, float]:
             x = x.reshape(shape)
             image = adjoint.mv(jax.lax.cond(first, lambda: residual, lambda: jacobian.mv(x)))
-            return jnp.ravel(image + damping * self.inner_product.apply(x))  # x = 0 at first
+            return (image + damping * self.inner_product.apply(x)).reshape(-1, 1), 0.0  # x = 0 at first
 
         def precondition(r: Array) -> Array:
-            return jnp.ravel(self.preconditioner.precondition(r.reshape(shape), damping))
+            return self.preconditioner.precondition(r.reshape(shape), damping).reshape(-1, 1)
 
         tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
         most = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
         most = jnp.where(needed & ~self.done(step_size, state), most, 0)
-        solution = orthogonal_conjugate_gradients(normal, precondition, jnp.ravel(state.values), tolerance, most)
+        column = state.values.reshape(-1, 1)
+        solution = conjugate_gradients(normal, precondition, column, tolerance[None], most=most, orthogonal=True)
         x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
         promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
         return -x, eqx.tree_at(lambda s: (s.gradient, s.promised), state, (gradient, promised))

@@ -1,44 +1,96 @@
-"""Preconditioned conjugate gradients, a block of columns at once, each with a matrix of its own."""
+"""Preconditioned conjugate gradients, a block of columns at once, each with a matrix of its own; in JAX or NumPy."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-MAX_ITERATIONS = 200
+from hks_jax.linear.loops import when, while_loop
+from hks_jax.linear.products import products_with_columns, times
+
+Array = Any
+"""NumPy's or JAX's, the same for all arguments and the result."""
+
+_MOST_STEPS = 200
 _RESTARTS = 3
+_KEPT, _MEMORY = 400, 4e8
+"""Residuals that are kept orthogonal at most, and bytes that they may take."""
+
+
+class Solution(NamedTuple):
+    """What conjugate gradients have come to.
+
+    Attributes:
+        x: the solutions so far; NaN where a product is.
+        errors: estimates of their relative errors, in units of those wanted; above 1 an iteration did not converge.
+        rhs: the right-hand sides.
+        steps: how many there were.
+    """
+
+    x: Float[Array, "n b"]
+    errors: Float[Array, " b"]
+    rhs: Float[Array, "n b"]
+    steps: Int[Array, ""]
+
+    @property
+    def converged(self) -> Float[Array, "n b"]:
+        """The solutions; NaN where the error asked for is not reached."""
+        xp = self.x.__array_namespace__()
+        return xp.where(self.errors <= 1, self.x, xp.nan)
 
 
 class _Iteration(NamedTuple):
-    """The state of conjugate gradients for one block of columns."""
+    """The state of conjugate gradients for one block of columns; r and p are zero for those that are done.
 
-    x: Float[Array, "n_dof b"]
-    r: Float[Array, "n_dof b"]
-    p: Float[Array, "n_dof b"]
+    Attributes:
+        x: the solutions so far.
+        rhs: the right-hand sides.
+        r: their residuals.
+        z: these, preconditioned.
+        p: the next directions.
+        first: rᵀz at the beginning,
+        energy: and now.
+        change: the energy relative to that before.
+        errors: see `Solution`.
+        going: which columns go on.
+        fresh: whether the next step is the first, or the first after a restart.
+        starts: how many restarts there were.
+        steps: how many steps; −1 before the right-hand side is known.
+        kept: the residuals of all steps, divided by √(rᵀz), and z likewise; None where none are kept.
+    """
+
+    x: Float[Array, "n b"]
+    rhs: Float[Array, "n b"]
+    r: Float[Array, "n b"]
+    z: Float[Array, "n b"]
+    p: Float[Array, "n b"]
     first: Float[Array, " b"]
     energy: Float[Array, " b"]
+    change: Float[Array, " b"]
     errors: Float[Array, " b"]
     going: Bool[Array, " b"]
     fresh: Bool[Array, ""]
     starts: Int[Array, ""]
     steps: Int[Array, ""]
+    kept: tuple[Float[Array, "m n"], Float[Array, "m n"]] | None
 
 
-def _dot(x: Float[Array, "n_dof b"], y: Float[Array, "n_dof b"]) -> Float[Array, " b"]:
-    return jnp.sum(x * y, axis=0)
+def _dot(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
+    return (x * y).sum(axis=0)
 
 
 def conjugate_gradients(
-    product: Callable[[Array], tuple[Array, Array]],
+    product: Callable[..., tuple[Array, Array]],
     precondition: Callable[[Array], Array],
-    rhs: Float[Array, "n_dof b"],
+    rhs: Float[Array, "n b"],
     wanted: Float[Array, " b"],
     inner: Callable[[Array, Array], Array] = _dot,
     clean: Callable[[Array], Array] | None = None,
-) -> Float[Array, "n_dof b"]:
-    """Solve Aᵢxᵢ = rhsᵢ for a block of columns; NaN where the error asked for is not reached.
+    most: Int[Array, ""] | int = _MOST_STEPS,
+    orthogonal: bool = False,
+) -> Solution:
+    """Solve Aᵢxᵢ = rhsᵢ for a block of columns.
 
     Args:
         product: x ↦ Aᵢxᵢ, and for each column the energy xᵢᵀAᵢxᵢ below which Aᵢ counts as singular.
@@ -49,42 +101,91 @@ def conjugate_gradients(
             symmetric and positive definite; energies are measured with it.
         clean: x ↦ its part in the subspace in which all this is so. Where rounding has led out of it, which an energy
             that is not positive tells, the iteration starts again from there.
+        most: steps after which to stop all the same.
+        orthogonal: for one ill-conditioned matrix whose products are dear; b = 1, in JAX. Residuals stay orthogonal in
+            spite of rounding. ``product(x, first)`` then returns the right-hand side where ``first``, so that what it
+            has in common with Ax is compiled once, and of ``rhs`` the shape counts.
     """
+    xp, n = rhs.__array_namespace__(), len(rhs)
 
-    def going_on(state: _Iteration) -> Bool[Array, ""]:
-        return jnp.any(state.going) & (state.steps < MAX_ITERATIONS)
-
-    def restarted(x: Float[Array, "n_dof b"]) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"]]:
+    # In exact arithmetic rᵢᵀPrⱼ = 0. Rounding loses that as soon as an eigenvector at the end of the spectrum is known,
+    # and conjugate gradients then look for it again and again: where eigenvalues fall off over eight decades, that
+    # doubles the number of steps. Where products are dear and n is small it is cheaper to restore it (Paige 1971; Simon
+    # 1984).
+    def restarted(both: tuple[Array, Array]) -> tuple[Array, Array]:
         assert clean is not None
-        x = clean(x)
+        x = clean(both[0])
         return x, rhs - product(x)[0]
 
-    # The residual, preconditioned, tells the error before a step. That the step reduces it as the one before did saves
-    # the preconditioner, which costs the most, once more than it takes steps.
-    def step(state: _Iteration) -> _Iteration:
-        x, r, p, first, before, errors, going, fresh, starts, steps = state
-        z = precondition(r)
-        energy = inner(r, z)
-        first = jnp.where(steps == 0, energy, first)
-        change = jnp.where(going & ~fresh, energy / before, 0)
-        p = jnp.where(going, z + change * p, p)
-        image, least = product(p)
-        curvature = inner(p, image)
-        regular = (curvature > least) & (energy > 0)
-        length = jnp.where(going & regular, energy / jnp.where(regular, curvature, 1), 0)
-        reduction = jnp.where(fresh, 1, jnp.sqrt(jnp.minimum(jnp.abs(change), 1)))
-        error = jnp.where(regular, jnp.sqrt(jnp.abs(energy) / first) * reduction / wanted, jnp.inf)
-        errors = jnp.where(going, error, errors)
-        x, r = x + length * p, r - length * image
-        again = jnp.asarray(False)
-        if clean is not None:
-            again = jnp.any(going & ~regular) & ~fresh & (starts < _RESTARTS)
-            x, r = jax.lax.cond(again, lambda: restarted(x), lambda: (x, r))
-        going = going & (regular | again) & (error > 1)
-        return _Iteration(x, r, p, first, energy, errors, going, again, starts + again.astype(int), steps + 1)
+    def relative(energy: Array, first: Array) -> Array:
+        return xp.sqrt(xp.abs(energy) / xp.where(first > 0, first, 1)) / wanted
 
-    asked, none, zero = jnp.isfinite(wanted), jnp.ones_like(wanted), jnp.zeros((), int)
-    errors = jnp.where(asked, jnp.inf, 0)
-    start = _Iteration(jnp.zeros_like(rhs), rhs, rhs, none, none, errors, asked, jnp.asarray(True), zero, zero)
-    end = jax.lax.while_loop(going_on, step, start)
-    return jnp.where(end.errors <= 1, end.x, jnp.nan)
+    def direct(state: _Iteration) -> _Iteration:
+        z = precondition(state.r)
+        energy, begin = inner(state.r, z), state.steps == (-1 if orthogonal else 0)
+        change = xp.where(state.going & ~state.fresh, energy / state.energy, 0)
+        p = xp.where(state.going, z + change * state.p, 0)
+        z = z if orthogonal else state.z
+        return state._replace(z=z, p=p, first=xp.where(begin, energy, state.first), energy=energy, change=change)
+
+    def advance(state: _Iteration) -> tuple[_Iteration, Bool[Array, " b"]]:
+        p, begin = state.p, state.steps < 0
+        image, least = product(p, begin) if orthogonal else product(p)
+        curvature = inner(p, image)
+        regular = ~((curvature <= least) | (state.energy <= 0)) | begin
+        length = xp.where(state.going & regular, state.energy / xp.where(regular & ~begin, curvature, 1), 0)
+        length = xp.where(begin, -1, length)
+        x, r, again = state.x + length * p, state.r - length * image, begin
+        kept = state.kept
+        if kept is not None:
+            # When all places are taken the last one is used again: what is lost first was known first.
+            at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
+            kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
+            r = r - times(kept[0].T, products_with_columns(kept[1], r))
+        if clean is not None:
+            again = xp.any(state.going & ~regular) & ~state.fresh & (state.starts < _RESTARTS)
+            x, r = when(again, restarted, (x, r))
+        rhs, starts = (
+            xp.where(begin, image, state.rhs) if orthogonal else state.rhs,
+            state.starts + xp.where(again, 1, 0),
+        )
+        return state._replace(x=x, r=r, rhs=rhs, fresh=again, starts=starts, steps=state.steps + 1, kept=kept), regular
+
+    def step(before: _Iteration) -> _Iteration:
+        if orthogonal:
+            state, regular = advance(before)
+            state = direct(state)
+            error = relative(state.energy, state.first)
+        else:
+            before = direct(before)
+            state, regular = advance(before)
+            # The residual, preconditioned, tells the error before a step. That the step reduces it as the one before
+            # did saves the preconditioner, which costs the most, once more than it takes steps.
+            reduction = xp.where(before.fresh, 1, xp.sqrt(xp.minimum(xp.abs(before.change), 1)))
+            error = relative(before.energy, before.first) * reduction
+        errors = xp.where(before.going, xp.where(regular, error, xp.inf), before.errors)
+        going = before.going & (regular | state.fresh) & (errors > 1)
+        # The host takes no products of columns that are zero.
+        return state._replace(r=xp.where(going, state.r, 0), p=xp.where(going, state.p, 0), errors=errors, going=going)
+
+    asked, one, zero = xp.isfinite(wanted), xp.ones_like(wanted), xp.zeros_like(rhs)
+    room = max(min(n, _KEPT, int(_MEMORY / (2 * n * rhs.dtype.itemsize))), 1)
+    start = _Iteration(
+        x=zero,
+        rhs=rhs,
+        r=zero if orthogonal else xp.where(asked, rhs, 0),
+        z=zero,
+        p=zero,
+        first=one,
+        energy=one,
+        change=one,
+        errors=xp.where(asked, xp.inf, 0),
+        going=asked,
+        fresh=xp.asarray(True),
+        starts=xp.asarray(0),
+        steps=xp.asarray(-1 if orthogonal else 0),
+        kept=(jnp.zeros((room, n), rhs.dtype),) * 2 if orthogonal else None,
+    )
+    end = while_loop(lambda state: xp.any(state.going) & (state.steps < most), step, start)
+    failed = xp.isnan(end.errors) & (most > 0)
+    return Solution(xp.where(failed, xp.nan, end.x), end.errors, end.rhs, end.steps)

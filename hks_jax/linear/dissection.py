@@ -15,8 +15,7 @@ from jaxtyping import Int
 
 from hks_jax.linear import accelerators
 from hks_jax.linear.bisection import within_groups
-from hks_jax.linear.level import Level
-from hks_jax.linear.merging import Merged, merged
+from hks_jax.linear.elimination_tree import Level, Merged, merged
 from hks_jax.linear.pattern import Pattern
 
 

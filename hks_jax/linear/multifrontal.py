@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
-from hks_jax.linear.level import Level
-from hks_jax.linear.merging import Merged
+from hks_jax.linear.elimination_tree import Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import batched, batched_with_columns, gram, times, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
@@ -92,8 +91,8 @@ def factorise(
 
 # What is factorised is F = A + E with A = K − σM. If the spectral radius of EF⁻¹ is below one, F − tE = (1 − tEF⁻¹)F is
 # singular for no t in [0, 1], so that no eigenvalue crosses zero on the way: F and A have the same inertia. With
-# x = F⁻¹b the defect b − Ax is EF⁻¹b, so that solving again with the defect is a step of the power method. Already the
-# first decides if it is tiny: b is random, and the share of any direction in it hardly less than 1/√n.
+# x = F⁻¹b the residual b − Ax is EF⁻¹b, so that solving again with it is a step of the power method. Already the first
+# decides if it is tiny: b is random, and the share of any direction in it hardly less than 1/√n.
 @jit_quickly()
 def try_out(
     factor: Factorisation, pencil: SymmetricPencil, shift: Float[Array, ""], b: Float[Array, "n_dof b"]
@@ -127,8 +126,8 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
     norms = jnp.sqrt(jnp.diagonal(products))
     # Of a matrix this small the inverse is as good, and a long triangular solve is slow.
     inverse = lapack.inverse_cholesky(products / norms / norms[:, None]) / norms
-    defects, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
-    return jnp.max(defects / images)
+    residuals, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
+    return jnp.max(residuals / images)
 
 
 @jit_quickly()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.fem.space import GridSpace, axis_colours
-from hks_jax.linear.heat_series import coefficient_tails, least_degree
+from hks_jax.linear.chebyshev import coefficient_tails, least_degree
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
 from hks_jax.static_array import StaticArray
 

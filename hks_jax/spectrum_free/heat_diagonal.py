@@ -16,8 +16,8 @@ from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.sparse_input import pencil_of
+from hks_jax.linear.chebyshev import heat_coefficients
 from hks_jax.linear.dissection import dissect
-from hks_jax.linear.heat_series import heat_coefficients
 from hks_jax.spectrum_free.colours import Colouring
 from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_fewer_vectors, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal

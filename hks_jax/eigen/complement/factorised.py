@@ -1,6 +1,6 @@
 """Solves with K − λᵢM on the complement of known eigenvectors, all in JAX.
 
-The method is that of `hks_jax.eigen.complement.common`: conjugate gradients, preconditioned with a factorisation of
+The method is that of `hks_jax.eigen.complement.adjoint`: conjugate gradients, preconditioned with a factorisation of
 K − σM for each group of neighbouring eigenvalues. Groups are made by index and not by value, so that shapes are static:
 by Weyl's law eigenvalues are spread evenly enough for that. The factorisations depend on the matrices alone, and serve
 all products with a Jacobian at one point.
@@ -8,7 +8,7 @@ all products with a Jacobian at one point.
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,16 +16,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import (
+from hks_jax.eigen.complement.adjoint import (
+    SINGULAR,
+    Adjoint,
     amplification,
     attainable,
     definite_product,
     first_beyond,
     group_numbers,
+    middles_of_gaps,
     shifts_between,
 )
-from hks_jax.eigen.complement.in_blocks import cleaned, projected, solve_in_blocks, without_known
+from hks_jax.eigen.complement.blockwise import cleaned, projected, solve_in_blocks, without_known
+from hks_jax.eigen.origin import LocatedPencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
@@ -41,8 +44,8 @@ _GROWTH = 4e7
 _MEMORY = 5e8
 """Bytes that factorisations may take together."""
 
-
-Factors = tuple[tuple[Array, ...], tuple[Array, ...], Int[Array, " groups"]]
+Shifted = tuple[Factorisation, Float[Array, " groups"]]
+"""Factorisations of K − σM, stacked, and their shifts."""
 
 
 class Groups(NamedTuple):
@@ -55,6 +58,13 @@ class Groups(NamedTuple):
 
     first: Int[np.ndarray, " groups"]
     last: Int[np.ndarray, " groups"]
+
+
+class Takes(NamedTuple):
+    """How to take known eigenvectors out of columns: those next to the shift, or all."""
+
+    near: Callable[[Float[Array, "n b"]], Float[Array, "n b"]]
+    all: Callable[[Float[Array, "n b"]], Float[Array, "n b"]]
 
 
 class FactorisedAdjoint(Adjoint[SymmetricPencil]):
@@ -70,89 +80,157 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     tolerance: float = eqx.field(default=1e-8, static=True)
     solves: int = eqx.field(default=1, static=True)
 
-    def prepare(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Factorisation:
-        """Factorise K − σM for each group of the first k of p eigenvalues; the results are stacked."""
+    def prepare(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Shifted:
+        """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
         # Compiled without the dissection: what a compiled function hands through is copied.
-        return Factorisation(dissection, *_factorise(dissection, pencil, values, k, self))
+        factors, shifts = _factorise(dissection, pencil, values, k, self)
+        return Factorisation(dissection, *factors), shifts
 
     def solve(
         self,
-        prepared: Factorisation,
+        prepared: Shifted,
         pencil: SymmetricPencil,
         values: Float[Array, " p"],
         vectors: Float[Array, "p n_dof"],
         rhs: Float[Array, "k n_dof"],
     ) -> Float[Array, "k n_dof"]:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
-        return _solve(prepared, pencil, values, vectors, rhs, self)
+        return _solve(*prepared, pencil, values, vectors, rhs, self)
+
+    def _groups(self, dissection: Dissection, values: Float[Array, " p"], k: int) -> Groups:
+        distance = partial(self._distance, len(values), k)
+        return group_blocks(dissection, distance, values.dtype, k, self.tolerance, self.solves)
+
+    # What differs where eigenvalues are left on both sides of those that are known follows.
+
+    def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return how far the eigenvalues of rows are from Λ, by Weyl's law in 2D."""
+        return p + 1 - row
+
+    def _shifts(self, pencil: Any, values: Float[Array, " p"], groups: Groups) -> Float[Array, " groups"]:
+        beyond = first_beyond(values)
+        return shifts_between(values, beyond - values[groups.last], beyond - values[groups.first])
+
+    def _amplified(self, pencil: Any, values: Float[Array, " p"], k: int) -> Float[Array, " k"]:
+        """Return how much larger the solutions of rows become than those of others as large."""
+        return amplification(values, k)
+
+    def _solve_block(
+        self, pencil: Any, values: Float[Array, " p"], takes: Takes, *of_block: Any
+    ) -> Float[Array, "n b"]:
+        """Solve for columns, given the factorisation, the columns, the errors wanted, and the eigenvalues."""
+        factor, b, wanted, eigenvalues = of_block
+
+        # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
+        # next to σ above all, which is why no others are taken out before the end, or before that makes it start again.
+        def precondition(r: Array) -> Array:
+            return takes.near(factor.solve_columns(r))
+
+        product = definite_product(pencil, eigenvalues, first_beyond(values))
+        return conjugate_gradients(product, precondition, b, wanted, clean=takes.all).converged
+
+
+# Eigenvalues are left on both sides of the known ones: K − λᵢM is indefinite on the complement. But let a shift σ, like
+# λᵢ, lie between Λ₋, the last eigenvalue that is left below, and Λ₊, the first that is left above. Then every λⱼ that
+# is left lies on the same side of both, and
+#
+#     A = (K − σM)⁻¹ (K − λᵢM)
+#
+# has on the complement the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0. It is symmetric in the inner product xᵀMy. So conjugate
+# gradients in that inner product solve A xᵢ = (K − σM)⁻¹ bᵢ. As A is computed with the very K − λᵢM, the accuracy of
+# the factorisation limits how fast they converge, and not the solution.
+#
+# With the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋) the condition of A is at most the ratio of ω(λᵢ) and ω(σ): for λᵢ < σ, say, the
+# eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). The odds take the place of the distance from
+# Λ, their limit for Λ₋ → −∞: rows are grouped by their odds in geometric progression, and the shift of a group is the
+# geometric mean.
+class InteriorAdjoint(FactorisedAdjoint):
+    """Conjugate gradients in the inner product of M, with a factorisation of K − σM for each group of rows.
+
+    Where `Adjoint` has the lowest eigenvalues, here are the k pairs that the rows belong to, ascending from the origin
+    of a `LocatedPencil`, and then others next to them, on either side and in any order. Where there is no other they
+    are zero vectors, with one of the known eigenvalues. The error is measured in the norm of M.
+    """
+
+    def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return the odds, if eigenvalues are spread evenly, and as many others known on both sides."""
+        others = (p - k) / 2
+        return (k + others - row) / (row + others + 1)
+
+    def _shifts(self, pencil: Any, values: Float[Array, " p"], groups: Groups) -> Float[Array, " groups"]:
+        low, high = _left(pencil, values)
+        odds = (high - values) / (values - low)
+        mean = jnp.sqrt(odds[groups.first] * odds[groups.last])
+        # Where all known are one eigenvalue, there is the gap between it and the origin, above which it is the first.
+        return middles_of_gaps(jnp.sort(values), (high + mean * low) / (1 + mean), values[0] / 2)
+
+    def _amplified(self, pencil: Any, values: Float[Array, " p"], k: int) -> Float[Array, " k"]:
+        low, high = _left(pencil, values)
+        return (high - low) / 2 / jnp.minimum(high - values[:k], values[:k] - low)
+
+    def _solve_block(
+        self, pencil: Any, values: Float[Array, " p"], takes: Takes, *of_block: Any
+    ) -> Float[Array, "n b"]:
+        factor, b, wanted, eigenvalues = of_block
+        stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
+
+        def inner(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
+            return jnp.sum(x * mass(y), axis=0)
+
+        def product(x: Float[Array, "n b"]) -> tuple[Float[Array, "n b"], Float[Array, " b"]]:
+            return factor.solve_columns(stiffness(x) - eigenvalues * mass(x)), SINGULAR * inner(x, x)
+
+        # Of what rounding leaves of the known eigenvectors, A amplifies those next to σ alone.
+        right = factor.solve_columns(b)
+        return conjugate_gradients(product, takes.near, right, wanted, inner, takes.all).converged
+
+
+def _left(pencil: LocatedPencil, values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return estimates of Λ₋ and Λ₊, the eigenvalues next to the known ones that are left."""
+    return jnp.min(values) - pencil.spacing, jnp.max(values) + pencil.spacing
 
 
 @partial(jax.jit, static_argnames=("k", "adjoint"))
 def _factorise(
     dissection: Dissection, pencil: SymmetricPencil, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint
-) -> Factors:
-    groups = _group(dissection, values, k, adjoint)
-    beyond = first_beyond(values)
-    shifts = shifts_between(values, beyond - values[groups.last], beyond - values[groups.first])
-    return factorise_each(dissection, pencil, shifts)
-
-
-def factorise_each(dissection: Dissection, pencil: SymmetricPencil, shifts: Float[Array, " groups"]) -> Factors:
-    """Return the fields of the stacked factorisations of K − σM, without the dissection."""
+) -> tuple[tuple[Any, ...], Float[Array, " groups"]]:
+    """Return the fields of the stacked factorisations of K − σM, without the dissection, and the shifts."""
+    shifts = adjoint._shifts(pencil, values, adjoint._groups(dissection, values, k))
     factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
-    return factors.downward, factors.upward, factors.negative
-
-
-def one_of(factors: Factorisation, group: Int[Array, ""]) -> Factorisation:
-    """Return one of the stacked factorisations."""
-    matrices = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.negative))
-    return Factorisation(factors.dissection, *matrices)
+    return (factors.downward, factors.upward, factors.negative), shifts
 
 
 @partial(jax.jit, static_argnames="adjoint")
 def _solve(
     factors: Factorisation,
+    shifts: Float[Array, " groups"],
     pencil: SymmetricPencil,
     values: Float[Array, " p"],
     vectors: Float[Array, "p n_dof"],
     rhs: Float[Array, "k n_dof"],
     adjoint: FactorisedAdjoint,
 ) -> Float[Array, "k n_dof"]:
-    k, beyond, window = rhs.shape[0], first_beyond(values), min(WINDOW, values.size)
-    tolerance = attainable(adjoint.tolerance, rhs.dtype)
-    clean = without_known(pencil, vectors)
+    k, tolerance, clean = len(rhs), attainable(adjoint.tolerance, rhs.dtype), without_known(pencil, vectors)
 
     def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
-        factor = one_of(factors, group)
-        nearest = jnp.clip(factor.negative - window // 2, 0, values.size - window)
-        near = jax.lax.dynamic_slice_in_dim(vectors, nearest, window)
-        return factor, near.T, pencil.mass.apply(near)
+        fields = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.negative))
+        near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]]
+        return Factorisation(factors.dissection, *fields), near.T, pencil.mass.apply(near)
 
-    def solve_block(group: tuple[Factorisation, Array, Array], b: Array, wanted: Array, shifts: Array) -> Array:
+    def solve_block(group: tuple[Factorisation, Array, Array], *of_block: Array) -> Float[Array, "n_dof b"]:
         factor, near, near_images = group
 
-        # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
-        # next to σ above all, which is why no others are taken out before the end, or before that makes it start again.
-        def precondition(r: Array) -> Array:
-            z = factor.solve_columns(r)
-            return z - times(near, products_with_columns(near_images, z))
+        def without_near(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+            return x - times(near, products_with_columns(near_images, x))
 
-        return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted, clean=clean)
+        return adjoint._solve_block(pencil, values, Takes(without_near, clean), factor, *of_block)
 
-    left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
-    first = _group(factors.dissection, values, k, adjoint).first
+    left, wanted = projected(pencil, vectors, rhs, tolerance, adjoint._amplified(pencil, values, k))
+    first = adjoint._groups(factors.dissection, values, k).first
     x = solve_in_blocks(of_group, solve_block, BLOCK, first, left, wanted, values[:k])
-    return x if _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance else cleaned(pencil, vectors, x)
-
-
-def _group(dissection: Dissection, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint) -> Groups:
-    """Group blocks of rows whose distance from Λ, by Weyl's law in 2D, is of one order."""
-
-    def distance(row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        return values.size + 1 - row
-
-    return group_blocks(dissection, distance, values.dtype, k, adjoint.tolerance, adjoint.solves)
+    definite = not isinstance(adjoint, InteriorAdjoint)
+    return x if definite and _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance else cleaned(pencil, vectors, x)
 
 
 def group_blocks(

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.eigen.complement.adjoint import Adjoint
@@ -24,6 +24,7 @@ from hks_jax.fem.nodal import NodalPencil, nodal_pencil
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.stencil import StencilOperator
+from hks_jax.linear.loops import while_loop
 from hks_jax.traced import is_traced
 
 _FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
@@ -79,10 +80,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
             raise ValueError("solver: chebyshev-filter needs a grid; use 'shift-invert' for a mesh")
         assert isinstance(pencil.space, GridSpace)
         plan = self.plan(k, pencil.space)
-        if is_traced(pencil):
-            values, vectors = _lowest_traced(pencil, plan, self.max_rounds, None)
-        else:
-            values, vectors = _lowest(pencil, plan, self.max_rounds, report)
+        compute = _compiled if is_traced(pencil) else _lowest
+        values, vectors = compute(pencil, plan, self.max_rounds, report)
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
     def guards(self, k: int, n_dof: int) -> int:
@@ -102,77 +101,74 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
 
 def _lowest(
-    pencil: Pencil, plan: Plan, max_rounds: int, report: Report | None
+    pencil: Pencil, plan: Plan, max_rounds: int, report: Report
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    """Return the pairs; without ``report``, in one computation that can be traced."""
     grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in _nested(pencil, plan)]
     grid = grids.pop()
     state, rounds = grid.from_random(pencil.volume), _FIRST_ROUNDS
     while grids:
         for _ in range(rounds):
             state = grid.improve(None, state)
-        if report:
+        if not is_traced(state):
             report(f"grid {' × '.join(map(str, grid.pencil.shape))}")
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
         state = grid.from_coarse(coarse, state)
-    rounding = indistinct(pencil, grid.high.dtype)
-    if report:
-        state = _converge(grid, rounding, state, max_rounds, report)
-    else:
-        state = jax.lax.while_loop(
-            lambda state: (grid.unconverged(rounding, state) > 0) & (state.rounds < max_rounds),
-            lambda state: grid.improve(rounding, state),
-            state,
-        )
+    state = _converge(grid, indistinct(pencil, grid.high.dtype), state, max_rounds, report)
     slabs, vectors = grid.slabs, state.vectors[: plan.wanted]
     vectors = vectors.reshape(plan.wanted, *(grid.pencil.shape if slabs is None else slabs.padded_shape))
     vectors = vectors if slabs is None else slabs.join(vectors, axis=1)
     return state.values[: plan.wanted], pencil.space.restrict(vectors)
 
 
-_lowest_traced = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
+_compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
 
 
 def _converge(
     grid: GridFilter, rounding: Float[Array, ""], state: FilterState, max_rounds: int, report: Report
 ) -> FilterState:
     """Return the state after rounds on the finest grid, each told, and of large problems the blocks of each."""
-    plan = grid.plan
-    in_steps = report is not silent and plan.mesh is None and state.vectors.size >= _LARGE
-    pace = Pace(float(grid.excess(rounding, state)))
-    while (left := int(grid.unconverged(rounding, state))) and state.rounds < max_rounds:
+    plan, told = grid.plan, report is not silent and not is_traced(state)
+    in_steps = told and plan.mesh is None and state.vectors.size >= _LARGE
+    pace = Pace(float(grid.excess(rounding, state)) if told else math.nan)
+
+    def going_on(state: FilterState) -> Bool[Array, ""]:
+        return (grid.unconverged(rounding, state) > 0) & (state.rounds < max_rounds)
+
+    def step(state: FilterState) -> FilterState:
+        if not told:
+            return grid.improve(rounding, state)
+        left = int(grid.unconverged(rounding, state))
         text = f"{plan.wanted - left} of {plan.wanted} pairs, round {int(state.rounds) + 1}"
         report(Status(text, pace.seconds_left()))
         work = 1
-        if in_steps:
 
-            def tell(done: int, of: int, text: str = text) -> None:
-                nonlocal work
-                work = of
-                report(Status(f"{text}, {done / of:.0%} of it filtered", pace.seconds_left(done, of)))
+        def tell(done: int, of: int) -> None:
+            nonlocal work
+            work = of
+            report(Status(f"{text}, {done / of:.0%} of it filtered", pace.seconds_left(done, of)))
 
-            state = grid.improve_in_steps(rounding, state, tell)
-        else:
-            state = grid.improve(rounding, state)
+        state = grid.improve_told(rounding, state, tell) if in_steps else grid.improve(rounding, state)
         pace.round_done(float(grid.excess(rounding, state)), work)
-    return state
+        return state
+
+    return while_loop(going_on, step, state)
 
 
 class Pace:
     """How long a subspace iteration still takes, from the convergence and the cost of the rounds so far.
 
-    The largest defect falls by about the same factor in every round, and a round takes time in proportion to the
+    The largest residual falls by about the same factor in every round, and a round takes time in proportion to the
     products that its polynomials have. Nothing is estimated before one round is over.
     """
 
     def __init__(self, excess: float) -> None:
-        """Begin with the largest defect, as a multiple of what counts as converged."""
+        """Begin with the largest residual, as a multiple of what counts as converged."""
         self._excess, self._factor = excess, math.nan
         self._work, self._seconds = math.nan, math.nan
         self._begin = time.perf_counter()
 
     def round_done(self, excess: float, work: int) -> None:
-        """Remember a round of so many products, and the defect after it."""
+        """Remember a round of so many products, and the residual after it."""
         now = time.perf_counter()
         self._factor, self._excess = self._excess / excess if excess > 0 else math.inf, excess
         self._work, self._seconds, self._begin = work, now - self._begin, now

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
-from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.common import amplification, attainable, definite_product, first_beyond
-from hks_jax.eigen.complement.in_blocks import projected, solve_in_blocks, without_known
+from hks_jax.eigen.complement.adjoint import Adjoint, amplification, attainable, definite_product, first_beyond
+from hks_jax.eigen.complement.blockwise import projected, solve_in_blocks, without_known
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 from hks_jax.fem.pencil import Pencil
@@ -79,7 +78,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
                 z = correction(nodal, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
                 return clean(-space.restrict(to_rows(z).reshape(-1, *nodal.shape)).T)
 
-            return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted)
+            return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted).converged
 
         left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
         one_group = np.zeros(1, int)

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
@@ -23,11 +22,12 @@ from hks_jax.eigen.filter.subspace import (
     to_own_rows,
     to_slabs,
 )
-from hks_jax.eigen.quality import allowed_defects
+from hks_jax.eigen.quality import allowed_residuals
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns, to_rows
 from hks_jax.linear.accelerators import row_by_row
+from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
 """How far one round damps what is not wanted: much more, and the lumped mass in the filter is what limits it."""
@@ -71,7 +71,7 @@ class FilterState(NamedTuple):
     Attributes:
         values: (m,) Ritz values θ, ascending.
         vectors: (m, nodes) M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab.
-        defects: (m,) ‖Kx − θMx‖/‖Mx‖.
+        residuals: (m,) ‖Kx − θMx‖/‖Mx‖.
         lumped_values: (m,) xᵀKx / xᵀDx with the lumped mass D.
         terms: further terms of the mass's inverse that were needed so far.
         rounds: rounds so far on this grid.
@@ -79,7 +79,7 @@ class FilterState(NamedTuple):
 
     values: Float[Array, " m"]
     vectors: Float[Array, "m nodes"]
-    defects: Float[Array, " m"]
+    residuals: Float[Array, " m"]
     lumped_values: Float[Array, " m"]
     terms: Int[Array, ""]
     rounds: Int[Array, ""]
@@ -122,18 +122,18 @@ class GridFilter(eqx.Module):
         return self.pencil.cut(self.plan.mesh)
 
     def allowed(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, " m"]:
-        """Return the defects up to which pairs count as converged."""
+        """Return the residuals up to which pairs count as converged."""
         scale = jnp.maximum(state.values, state.values[self.plan.n_null])
-        return allowed_defects(scale, rounding, self.plan.tolerance)
+        return allowed_residuals(scale, rounding, self.plan.tolerance)
 
     def unconverged(self, rounding: Float[Array, ""], state: FilterState) -> Int[Array, ""]:
         """Return how many of the wanted pairs have not converged."""
-        return jnp.sum(~(state.defects <= self.allowed(rounding, state))[: self.plan.wanted])
+        return jnp.sum(~(state.residuals <= self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
     def excess(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, ""]:
-        """Return the largest defect of the wanted pairs, as a multiple of what counts as converged."""
-        return jnp.max((state.defects / self.allowed(rounding, state))[: self.plan.wanted])
+        """Return the largest residual of the wanted pairs, as a multiple of what counts as converged."""
+        return jnp.max((state.residuals / self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
     def from_random(self, volume: Float[Array, ""]) -> FilterState:
@@ -172,36 +172,33 @@ class GridFilter(eqx.Module):
         layout = _layout(self.slabs)
         return shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
 
-    @partial(jax.jit, donate_argnames="state")
-    def improve(self, rounding: Float[Array, ""] | None, state: FilterState) -> FilterState:
-        """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz."""
+    def improve_told(
+        self, rounding: Float[Array, ""] | None, state: FilterState, done: Callable[[int, int], Any] | None = None
+    ) -> FilterState:
+        """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz.
+
+        Called plainly, on one device, it can be interrupted between two blocks, and tells after each how many products
+        are done of all. `improve` is compiled whole.
+        """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
         def run(grid: GridFilter, rounding: Float[Array, ""] | None, state: FilterState) -> FilterState:
             numbers = own_blocks(slabs, plan.size // plan.block)
             chosen = grid.choose(rounding, state)
-            step = partial(grid.filter_block, chosen, state.values)
-            rows = to_own_rows(slabs, plan.block, state.vectors)
-            filtered = jax.lax.fori_loop(0, numbers.size, lambda own, rows: step(numbers[own], own, rows), rows)
+
+            def step(own: Array, rows: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
+                rows = grid.filter_block(chosen, state.values, numbers[own], own, rows)
+                if done is not None and chosen.degrees[own]:
+                    jax.block_until_ready(rows)
+                    done(int(chosen.degrees[: own + 1].sum()), int(chosen.degrees.sum()))
+                return rows
+
+            filtered = for_each(numbers.size, step, to_own_rows(slabs, plan.block, state.vectors))
             return grid.ritz(to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
 
         return shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
 
-    def improve_in_steps(
-        self, rounding: Float[Array, ""], state: FilterState, done: Callable[[int, int], Any]
-    ) -> FilterState:
-        """Do what `improve` does on one device, so that it can be interrupted between two blocks.
-
-        Tell after each block how many products are done of all.
-        """
-        chosen = self.choose(rounding, state)
-        degrees, vectors = np.asarray(chosen.degrees), state.vectors
-        for number in np.flatnonzero(degrees):
-            at = jnp.asarray(number)
-            vectors = self.filter_block(chosen, state.values, at, at, vectors)
-            jax.block_until_ready(vectors)
-            done(int(degrees[: number + 1].sum()), int(degrees.sum()))
-        return self.ritz(vectors, chosen.terms, state.rounds + 1)
+    improve = jax.jit(improve_told, donate_argnames="state")
 
     @jax.jit
     def choose(self, rounding: Float[Array, ""] | None, state: FilterState) -> Filtering:
@@ -214,7 +211,7 @@ class GridFilter(eqx.Module):
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
-        left = spare | (True if rounding is None else ~(state.defects <= self.allowed(rounding, state)))
+        left = spare | (True if rounding is None else ~(state.residuals <= self.allowed(rounding, state)))
         # The spare vectors need no more than the last wanted one.
         goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)
@@ -261,8 +258,8 @@ class GridFilter(eqx.Module):
         slabs, block = self.slabs, self.plan.block
         own = self.pencil.own(slabs)
         values, vectors = rayleigh_ritz(own, slabs, block, vectors)
-        defects, lumped_values = measured(own, slabs, block, values, vectors)
-        return FilterState(values, vectors, defects, lumped_values, terms, rounds)
+        residuals, lumped_values = measured(own, slabs, block, values, vectors)
+        return FilterState(values, vectors, residuals, lumped_values, terms, rounds)
 
     def _begin(self, rows: Float[Array, "own nodes"]) -> FilterState:
         """Return the first state on this grid, from this device's rows."""

@@ -113,8 +113,8 @@ def measured(
         return tuple(jnp.sum(term, tuple(range(columns.ndim - 1))) for term in terms)
 
     sums = _total(slabs, jax.lax.map(of_block, jnp.arange(values.size // block)))
-    defect, moved, energy, lumped = (s.ravel() for s in sums)
-    return jnp.sqrt(defect / moved), energy / lumped
+    residual, moved, energy, lumped = (s.ravel() for s in sums)
+    return jnp.sqrt(residual / moved), energy / lumped
 
 
 def _total(slabs: Slabs | None, tree: Any) -> Any:

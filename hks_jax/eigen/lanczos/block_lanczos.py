@@ -11,13 +11,16 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.compilation import jit_quickly
+from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, crowded, first_state, make_room, unfinished
-from hks_jax.eigen.located import LocatedPencil
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, first_state, unfinished
+from hks_jax.eigen.origin import LocatedPencil
+from hks_jax.eigen.quality import measure_pairs
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
-from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.dissection import dissect
+from hks_jax.linear.loops import when, while_loop
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
@@ -25,11 +28,16 @@ SLICE = 170
 """Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
 
 
+_DENSE = 3000
+"""Unknowns up to which all pairs are computed where slicing fails."""
+
+
 class BlockLanczos(Eigensolver[SymmetricPencil]):
     """Spectrum slicing: shift-invert block Lanczos on nested-dissection factorisations, all in JAX.
 
     For grids and meshes, 2D above all (in 3D the factors fill in). The same code runs on CPUs and accelerators, and is
-    traceable whole. Called plainly it can be interrupted, and reports progress, between two slices.
+    traceable whole. Called plainly it can be interrupted, and reports progress, between two slices; and only then finds
+    any number of copies of an eigenvalue, if need be, up to 3000 unknowns, by computing all pairs.
 
     Attributes:
         tolerance: relative residual that counts as converged.
@@ -54,7 +62,13 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         plan = self.plan(k, min(pencil.n_null, k))
         state = self.slice(expected(pencil, plan), plan, report)
         assert state.vectors is not None
-        return (*_lowest(state.values, state.vectors, k), state.complete_below)
+        values, vectors, bound = _lowest(pencil, state.values, state.vectors, state.complete_below, k)
+        if is_traced(bound) or (state.finished and not jnp.isnan(bound)) or pencil.size > _DENSE:
+            return values, vectors, bound
+        report("not all found: computing all pairs")
+        first = int(pencil.negative) if isinstance(pencil, LocatedPencil) else 0
+        values, vectors, bound = Dense().lowest(pencil, first + k)
+        return values[first:], vectors[first:], bound
 
     def max_pairs(self, n_dof: int) -> int:
         """Return how many pairs leave room for a Lanczos basis."""
@@ -69,26 +83,19 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     def slice(self, problem: Problem, plan: Plan, report: Report = silent) -> SlicingState:
         """Compute the wanted eigenpairs from zero upwards, slice by slice."""
         dissection = dissect(problem.pencil.pattern)
-        if is_traced(problem):
-            return _slice_traced(problem, dissection, plan, self.tolerance)
-        problem = problem._replace(pencil=tabulated(problem.pencil))
-        dissection, state = jax.device_put(dissection), _first_state(problem, plan)
-        while _unfinished(plan, state):
+        if not is_traced(problem):
+            problem = problem._replace(pencil=tabulated(problem.pencil))
+            dissection = jax.device_put(dissection)
+
+        def step(state: SlicingState) -> SlicingState:
             factor, searchable, state = cut(problem, dissection, plan, self.tolerance, state)
-            if searchable:
-                if _crowded(plan, state):
-                    assert state.vectors is not None
-                    state = _make_room(plan, state.vectors, state._replace(vectors=None))
-                state = search(problem, factor, plan, self.tolerance, state)
-            if report is not silent:  # to put numbers into words, the host waits for them
+            state = when(searchable, partial(search, problem, factor, plan, self.tolerance), state)
+            if report is not silent and not is_traced(state):  # to put numbers into words, the host waits for them
                 known, bound = min(int(state.known), plan.wanted), float(state.complete_below)
                 report(f"{known} of {plan.wanted} eigenpairs, all below {bound:.6g}")
-        return state
+            return state
 
-
-_first_state = jit_quickly(static_argnames="plan")(first_state)
-_unfinished = jit_quickly(static_argnames="plan")(unfinished)
-_crowded = jit_quickly(static_argnames="plan")(crowded)
+        return while_loop(partial(unfinished, plan), step, first_state(problem, plan))
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
@@ -111,26 +118,18 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
     return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype), jnp.zeros((), int))
 
 
-@jit_quickly(static_argnames="plan", donate_argnames="vectors")
-def _make_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: SlicingState) -> SlicingState:
-    return make_room(plan, state._replace(vectors=vectors))
-
-
-def _slice_traced(problem: Problem, dissection: Dissection, plan: Plan, tolerance: float) -> SlicingState:
-    def body(state: SlicingState) -> SlicingState:
-        factor, searchable, state = cut(problem, dissection, plan, tolerance, state)
-        state = jax.lax.cond(searchable & crowded(plan, state), partial(make_room, plan), lambda state: state, state)
-        return jax.lax.cond(searchable, partial(search, problem, factor, plan, tolerance), lambda state: state, state)
-
-    return jax.lax.while_loop(partial(unfinished, plan), body, first_state(problem, plan))
-
-
 @jit_quickly(static_argnames="k")
 def _lowest(
-    values: Float[Array, " capacity"], vectors: Float[Array, "capacity n_dof"], k: int
-) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    """Return the lowest known pairs; NaN where there are fewer than k."""
+    pencil: SymmetricPencil,
+    values: Float[Array, " capacity"],
+    vectors: Float[Array, "capacity n_dof"],
+    bound: Float[Array, ""],
+    k: int,
+) -> RawPairs:
+    """Return the lowest known pairs, NaN where there are fewer than k, and the bound, NaN if one was found twice."""
     order = jnp.argsort(values)[:k]
     values, vectors = values[order], vectors[order]
     known = jnp.isfinite(values)
-    return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan)
+    if values.dtype == jnp.float32:  # in double precision the projections keep all apart
+        bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & known), jnp.nan, bound)
+    return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.lanczos.basis import Basis, begin, combined, within, write
-from hks_jax.eigen.lanczos.columns import orthonormal, recur, without
+from hks_jax.eigen.lanczos.block_algebra import orthonormal, recur, without
+from hks_jax.eigen.lanczos.krylov_basis import Basis, begin, combined, within, write
 from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.multifrontal import Factorisation
 from hks_jax.linear.pencil import SymmetricPencil
@@ -28,8 +28,8 @@ class ShiftedSolve(NamedTuple):
     Attributes:
         factor: the factorisation of K − σM.
         shift: σ.
-        passes: how often to solve: once, or again with the defect, where the factorisation is inaccurate; at most twice
-            on accelerators. None: once, for which nothing else is compiled.
+        passes: how often to solve: once, or twice, where the factorisation is inaccurate, then with the residual. None:
+            once, for which nothing else is compiled.
     """
 
     factor: Factorisation
@@ -73,7 +73,6 @@ def block_lanczos(
 
     Neighbouring blocks are kept orthogonal by the recurrence, and in double precision two at a time by one pass against
     the whole basis, which reads it from memory half as often and leaves it M-orthonormal to rounding.
-    The steps are a loop of XLA's.
 
     Args:
         pencil: K and M.
@@ -88,24 +87,16 @@ def block_lanczos(
         The Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors; zero where there are
         fewer.
     """
-    state = _begin(pencil, start, known, room)
-
-    def advance(state: _Recurrence, first: int, last: int) -> _Recurrence:
-        return _advance(pencil, shifted, state, len(known), first, last)
-
-    if is_traced(shifted):
-        # All of them in one loop: were its length to differ within a batch, each turn would copy all of the state.
-        steps, state = room, advance(state, 0, room)
-    else:
-        steps = int(steps)
-        if shifted.passes is not None and int(shifted.passes) == 1:
-            shifted = shifted._replace(passes=None)
-        if accelerators.at_hand():
-            for done in range(0, steps, 2):
-                state = _advance_by_two(pencil, shifted, state, len(known), done)
-        else:
-            for done in range(0, steps, _STRETCH):
-                state = advance(state, done, min(done + _STRETCH, steps))
+    state, traced = _begin(pencil, start, known, room), is_traced(shifted)
+    # Traced, all of them are one loop: were its length to differ within a batch, each turn would copy all of the state.
+    steps = room if traced else int(steps)
+    if not traced and shifted.passes is not None and int(shifted.passes) == 1:
+        shifted = shifted._replace(passes=None)
+    # On accelerators two steps are a computation without a loop, so that nothing has to wait for the device.
+    alone = accelerators.at_hand() and not traced
+    stretch = room if traced else 2 if alone else _STRETCH
+    for done in range(0, steps, stretch):
+        state = _advance(pencil, shifted, state, len(known), alone, done, min(done + stretch, steps))
     return _ritz_pairs(state, len(known), steps, wanted)
 
 
@@ -124,42 +115,35 @@ def _begin(
     return _Recurrence(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix)
 
 
-@jit_quickly(static_argnames="offset", donate_argnames="state")
+@jit_quickly(static_argnames=("offset", "alone"), donate_argnames="state")
 def _advance(
     pencil: SymmetricPencil,
     shifted: ShiftedSolve,
     state: _Recurrence,
     offset: int,
+    alone: bool,
     first: int | Array,
     last: int | Array,
 ) -> _Recurrence:
-    """Take the steps from the first to before the last; their blocks begin at the basis' row ``offset``."""
-    every = _every(state.blocks.block.dtype)
-    if accelerators.at_hand():
-        # Whether to project is known of every step in two. How often to solve is asked once, and not in each step, for
-        # which the host would wait.
-        def by_two(shifted: ShiftedSolve, state: _Recurrence) -> _Recurrence:
-            steps = _stepping(pencil, shifted, offset)
-            return jax.lax.fori_loop(
-                first // 2, last // 2, lambda two, state: steps(2 * two, state, (every == 1, True)), state
-            )
+    """Take the steps from the first to before the last, or two ``alone``; their blocks begin at row ``offset``."""
+    every, two = _every(state.blocks.block.dtype), accelerators.at_hand()
 
-        assert shifted.passes is not None
-        once = partial(by_two, shifted._replace(passes=None))
-        return jax.lax.cond(_in_any(shifted.passes > 1), partial(by_two, shifted), once, state)
-    steps = _stepping(pencil, shifted, offset)
-    return jax.lax.fori_loop(
-        first, last, lambda number, state: steps(number, state, ((number + 1) % every == 0,)), state
-    )
+    def advance(shifted: ShiftedSolve, state: _Recurrence) -> _Recurrence:
+        steps = _stepping(pencil, shifted, offset)
 
+        def turn(number: Array, state: _Recurrence) -> _Recurrence:
+            if two:  # of every step in two it is known whether to project
+                return steps(2 * number, state, (every == 1, True))
+            return steps(number, state, ((number + 1) % every == 0,))
 
-@jit_quickly(static_argnames="offset", donate_argnames="state")
-def _advance_by_two(
-    pencil: SymmetricPencil, shifted: ShiftedSolve, state: _Recurrence, offset: int, first: int | Array
-) -> _Recurrence:
-    """Take two steps without a loop or a condition, so that nothing has to wait for the device."""
-    steps = _stepping(pencil, shifted, offset)
-    return steps(jnp.asarray(first), state, (_every(state.blocks.block.dtype) == 1, True))
+        ends = (first // 2, last // 2) if two else (first, last)
+        return turn(jnp.asarray(ends[0]), state) if alone else jax.lax.fori_loop(*ends, turn, state)
+
+    if two and not alone and shifted.passes is not None:
+        # How often to solve is asked once, and not in each step, for which the host would wait.
+        once = partial(advance, shifted._replace(passes=None))
+        return jax.lax.cond(_in_any(shifted.passes > 1), partial(advance, shifted), once, state)
+    return advance(shifted, state)
 
 
 def _stepping(
@@ -172,19 +156,20 @@ def _stepping(
     def solve(rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
         if passes is None:
             return factor.solve_columns(rhs)
-        last = passes - 1
 
-        def defect_of(x: Array) -> Array:
+        def residual_of(x: Array) -> Array:
             return rhs - (stiffness(x) - shift * mass(x))
-
-        def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            x, defect = state
-            x = x + factor.solve_columns(defect)
-            return x, jax.lax.cond(done < last, defect_of, lambda _: defect, x)
 
         if accelerators.at_hand():
             x = factor.solve_columns(rhs)
-            return x + factor.solve_columns(defect_of(x))
+            return x + factor.solve_columns(residual_of(x))
+
+        # A loop, so that the solve is compiled once.
+        def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            x, residual = state
+            x = x + factor.solve_columns(residual)
+            return x, jax.lax.cond(done < passes - 1, residual_of, lambda _: residual, x)
+
         return jax.lax.fori_loop(0, passes, refine, (jnp.zeros_like(rhs), rhs))[0]
 
     def step(

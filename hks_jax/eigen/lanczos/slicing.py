@@ -6,16 +6,23 @@ converged is known from then on. A last factorisation above the last eigenvalue 
 eigenvalues as are known lie below it. Few vectors at a time keep orthogonalisation cheap, however many are wanted.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
+from hks_jax.eigen.lanczos.block_algebra import orthonormal
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.state import Plan, Problem, SlicingState, Window, steps_for
-from hks_jax.eigen.quality import allowed_defects, indistinct, values_and_defects
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Window, crowded, make_room, steps_for
+from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
+from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
+from hks_jax.linear.loops import when
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
+from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.products import combine, gram, products_with_columns, times
 from hks_jax.traced import is_traced
 
 _ERROR = 0.1
@@ -27,35 +34,51 @@ _EXCUSE = 30
 _MOVES = 3
 """How often in a row to move a shift at which the inertia is not to be trusted, before it must do."""
 
+_TURNS = 12
+"""Inverse iterations in a search, at most."""
+
+_COPY = 1e-6
+"""How far below an eigenvalue, relative, there is none of its copies."""
+
 
 def cut(
     problem: Problem, dissection: Dissection, plan: Plan, tolerance: float, state: SlicingState
 ) -> tuple[Factorisation, Bool[Array, ""], SlicingState]:
-    """Factorise at the state's shift; return with it whether to search there, and the state if not."""
+    """Factorise at the state's shift; return with it whether to search there, and the state, with room for that."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
     trial = try_out(factor, problem.pencil, state.shift, state.noise)
-    searchable, following = _consider(problem, factor.negative, trial, plan, tolerance, state._replace(vectors=None))
-    return factor, searchable, following._replace(vectors=state.vectors)
+    searchable, full, following = _consider(
+        problem, factor.negative, trial, plan, tolerance, state._replace(vectors=None)
+    )
+    return factor, searchable, when(full, partial(make_room, plan), following._replace(vectors=state.vectors))
 
 
 @jit_quickly(static_argnames=("plan", "tolerance"))
 def _consider(
     problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, tolerance: float, state: SlicingState
-) -> tuple[Bool[Array, ""], SlicingState]:
-    """Return whether to search at the state's shift, and the state if not: finished, or with a better shift."""
+) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
+    """Return whether to search at the state's shift, whether to make room for it, and the state: if it is not to be
+    searched, finished or with a better shift."""
     known, below = jnp.sum(state.values < state.shift), negative - problem.negative
     missing = below - known
     complete = trial.sound & (missing == 0)
-    finished = complete & ((known >= plan.wanted) | (negative == problem.pencil.size))  # all, or there are no more
+    last = jnp.sort(state.values)[plan.wanted - 1]
+    all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # with copies of the last, or less few
+    finished = complete & (all_wanted | (negative == problem.pencil.size))  # or there are no more
     # Where a nearer shift leaves as many, they are copies of one eigenvalue: that is searched, as often as it takes.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
+    multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
+    # Of more copies than are wanted some are enough: the certificate is below them.
+    cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, tolerance, lowest))
     # Another shift costs a factorisation, refined solves more: they are for where it is no better.
     moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
 
-    share = plan.slice_size / (2.5 * jnp.maximum(missing, 1).astype(state.shift.dtype))
-    nearer = state.reached + share * (state.shift - state.reached)
+    # Beyond a wide gap there may be very many at once: then the bracket of what is complete and what is too far is cut.
+    start = jnp.maximum(state.reached, state.complete_below)
+    share = jnp.maximum(plan.slice_size / (2.5 * jnp.maximum(missing, 1).astype(state.shift.dtype)), 1 / 4)
+    nearer = start + share * (state.shift - start)
     # 0.7 of the mean distance of eigenvalues leaves an eigenvalue of a part of the domain behind. Upward where all are
     # known, downward where some are missing.
     down = state.shift - 0.7 * (state.shift - state.reached) / jnp.maximum(missing, 1).astype(state.shift.dtype)
@@ -65,12 +88,16 @@ def _consider(
         slices=state.slices + 1,
         finished=finished,
         complete_below=jnp.where(complete, jnp.maximum(state.shift, state.complete_below), state.complete_below),
-        shift=jnp.where(too_many, nearer, jnp.where(moves, beside, state.shift)),
+        shift=jnp.where(too_many, nearer, jnp.where(cut, last * (1 - _COPY), jnp.where(moves, beside, state.shift))),
         below=jnp.where(trial.sound, below, -1),
+        multiple=multiple,
+        far=jnp.where(too_many, state.shift, state.far),
+        far_below=jnp.where(too_many, below, state.far_below),
         moved=jnp.where(moves, state.moved + 1, 0),
         passes=jnp.where(accurate, state.passes, 2),
     )
-    return ~(finished | too_many | moves), state
+    searchable = ~(finished | too_many | cut | moves)
+    return searchable, searchable & crowded(plan, state), state
 
 
 def _needed(
@@ -78,22 +105,71 @@ def _needed(
 ) -> Float[Array, ""]:
     """Return how small residuals ‖Kφ − λMφ‖/‖Mφ‖ must be if the lowest eigenvalue not known yet is to converge."""
     rounding = excuse * indistinct(problem.pencil, lowest.dtype)
-    return allowed_defects(jnp.maximum(lowest, problem.unit), rounding, tolerance)
+    return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, tolerance)
 
 
 def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float, state: SlicingState) -> SlicingState:
     """Find the eigenpairs around the shift."""
     assert state.vectors is not None
-    # Where one slice is enough nothing is known as a rule, and there are no rows of zeros to stay orthogonal to. Of
-    # several slices the first would have to be compiled apart.
-    nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
-    window = _window(problem, plan, state, 0 if nothing else plan.window)
     shifted = ShiftedSolve(factor, state.shift, state.passes)
-    ritz = block_lanczos(problem.pencil, shifted, state.start, window.vectors, plan.steps, window.steps, plan.ritz)
-    interval = window.low, window.high
-    order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
+    if not is_traced(state.multiple) and state.multiple:
+        order, vectors, following = _nearest(problem, shifted, plan, tolerance, state)
+    else:
+        # Where one slice is enough nothing is known as a rule, and there are no rows of zeros to stay orthogonal to. Of
+        # several slices the first would have to be compiled apart.
+        nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
+        window = _window(problem, plan, state, 0 if nothing else plan.window)
+        ritz = block_lanczos(problem.pencil, shifted, state.start, window.vectors, plan.steps, window.steps, plan.ritz)
+        interval = window.low, window.high
+        order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
+        vectors = ritz[1]
+        if not is_traced(following.stuck) and following.stuck and state.below > 0:
+            order, vectors, following = _nearest(problem, shifted, plan, tolerance, state)
     # Apart, so that nothing else is in memory besides the two arrays of vectors.
-    return following._replace(vectors=_stored(state.vectors, ritz[1], order, state.known))
+    return following._replace(vectors=_stored(state.vectors, vectors, order, state.known))
+
+
+# Lanczos finds no more copies of an eigenvalue than a block has columns, and nothing where there are fewer different
+# eigenvalues than it takes steps. Inverse iteration finds as many as it has vectors, if they are near to the shift: of
+# copies that are more any will do.
+def _nearest(
+    problem: Problem, shifted: ShiftedSolve, plan: Plan, tolerance: float, state: SlicingState
+) -> tuple[Int[Array, " ritz"], Float[Array, "ritz n_dof"], SlicingState]:
+    """Search by inverse iteration, orthogonal to all that is known; see `_accept`. For concrete values."""
+    missing = int(state.below - jnp.sum(state.values < state.shift))
+    count = min(missing + plan.block, plan.ritz, problem.pencil.size - int(state.known))
+    x = jax.random.normal(jax.random.key(int(state.slices)), (problem.pencil.size, count), state.shift.dtype)
+    assert state.vectors is not None
+    worst = jnp.full((), jnp.inf)
+    for turn in range(_TURNS):
+        values, x, residuals = _inverse_iteration(problem.pencil, shifted, state.vectors, state.known, x)
+        before, worst = worst, jnp.max(residuals[:missing])
+        if turn > 2 and not worst < before / 2:
+            break
+    ritz = jnp.pad(1 / (values - state.shift), (0, plan.ritz - count)), jnp.pad(x.T, ((0, plan.ritz - count), (0, 0)))
+    interval = jnp.where(problem.negative > 0, 0, -jnp.inf).astype(values.dtype), jnp.asarray(jnp.inf, values.dtype)
+    order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
+    return order, ritz[1], following
+
+
+@jit_quickly()
+def _inverse_iteration(
+    pencil: SymmetricPencil,
+    shifted: ShiftedSolve,
+    vectors: Float[Array, "m n_dof"],
+    known: Int[Array, ""],
+    x: Float[Array, "n_dof c"],
+) -> tuple[Float[Array, " c"], Float[Array, "n_dof c"], Float[Array, " c"]]:
+    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the first vectors, and their residuals."""
+    stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
+    x = shifted.factor.solve_columns(mass(x))
+    for _ in range(2):
+        parts = jnp.where(jnp.arange(len(vectors))[:, None] < known, products_with_columns(vectors, mass(x)), 0)
+        x, _, _ = orthonormal(mass, x - combine(parts.T, vectors).T)
+    values, mix = lapack.eigh(gram(x, stiffness(x)))
+    x = times(x, mix)
+    image = mass(x)
+    return values, x, jnp.linalg.norm(stiffness(x) - values * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
 
 @jit_quickly(static_argnames=("plan", "rows"))
@@ -143,13 +219,13 @@ def _accept(
     shift, index, dtype = state.shift, jnp.arange(plan.capacity), vectors.dtype
     near = shift + 1 / theta
 
-    values, residuals = values_and_defects(problem.pencil, vectors)
+    values, residuals, _ = measure_pairs(problem.pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
     scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
     # Where nothing converged, as on a domain much longer than wide, it is rounding that is worse than usual: the
     # residuals say so.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
-    allowed = allowed_defects(scale, excuse * indistinct(problem.pencil, dtype), tolerance)
+    allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), tolerance)
     converged = (residuals <= allowed) & (theta != 0)
     # Above the first that did not converge, or farther away than those looked at, some are missing.
     above = near > shift
@@ -198,6 +274,8 @@ def _accept(
         stuck=stuck,
     )
     following = jnp.maximum(_next_shift(problem, plan, state), onward)
+    middle = (jnp.maximum(state.reached, state.complete_below) + state.far) / 2
+    following = jnp.where(state.far_below - known > plan.slice_size, jnp.minimum(following, middle), following)
     return order, state._replace(shift=jnp.where(complete, following, again))
 
 

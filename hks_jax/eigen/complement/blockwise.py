@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hks_jax.eigen.complement.common import norms, wanted_errors
+from hks_jax.eigen.complement.adjoint import norms, wanted_errors
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, even_size, inner_products, products_with_columns, row_blocks
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.linear.pencil import SymmetricPencil
 
 _NODES = 1 << 16
@@ -107,13 +108,16 @@ class SlicingState(NamedTuple):
         known: how many there are.
         shift: where to cut next.
         below: eigenvalues from zero to the shift, by the inertia of the factorisation there; −1 if that is not trusted.
+        multiple: whether many of them are not known, and copies of one eigenvalue.
+        far: the last shift below which there were too many to search there,
+        far_below: and how many; 0 before there is one.
         reached: known up to this without a gap, as far as is known.
         complete_below: every eigenvalue below it is known, by the inertia of a factorisation.
         start: (n_dof, block) where Lanczos starts next.
         noise: (n_dof, block) independent normal numbers.
         slices: factorisations so far.
         moved: how often in a row the shift was moved because the factorisation was inaccurate there.
-        passes: how often to solve: once, or again with the defect.
+        passes: how often to solve: once, or again with the residual.
         stuck: whether the last search found nothing of what is missing.
         finished: whether all is found and certified.
     """
@@ -123,6 +127,9 @@ class SlicingState(NamedTuple):
     known: Int[Array, ""]
     shift: Float[Array, ""]
     below: Int[Array, ""]
+    multiple: Bool[Array, ""]
+    far: Float[Array, ""]
+    far_below: Int[Array, ""]
     reached: Float[Array, ""]
     complete_below: Float[Array, ""]
     start: Float[Array, "n_dof block"]
@@ -134,6 +141,7 @@ class SlicingState(NamedTuple):
     finished: Bool[Array, ""]
 
 
+@jit_quickly(static_argnames="plan")
 def first_state(problem: Problem, plan: Plan) -> SlicingState:
     """Return the state in which nothing is known."""
     n, dtype = problem.pencil.size, problem.pencil.stiffness.dtype
@@ -144,6 +152,9 @@ def first_state(problem: Problem, plan: Plan) -> SlicingState:
         known=jnp.zeros((), int),
         shift=problem.first,
         below=jnp.full((), -1, int),
+        multiple=jnp.zeros((), bool),
+        far=jnp.zeros((), dtype),
+        far_below=jnp.zeros((), int),
         reached=jnp.zeros((), dtype),
         complete_below=jnp.zeros((), dtype),
         start=noise,
@@ -156,6 +167,7 @@ def first_state(problem: Problem, plan: Plan) -> SlicingState:
     )
 
 
+@jit_quickly(static_argnames="plan")
 def unfinished(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
     """Return whether to go on: not all is found, and there are tries left."""
     return ~state.finished & (state.slices < plan.max_slices)
@@ -169,13 +181,18 @@ def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
 def make_room(plan: Plan, state: SlicingState) -> SlicingState:
     """Forget the highest of the known eigenpairs, which are more than wanted; if stuck, all above what was reached."""
     assert state.vectors is not None
+    return _with_room(plan, state.vectors, state._replace(vectors=None))
+
+
+@jit_quickly(static_argnames="plan", donate_argnames="vectors")
+def _with_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: SlicingState) -> SlicingState:
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
     count = jnp.minimum(count, plan.capacity - plan.ritz)
     kept = jnp.arange(plan.capacity) < count
     return state._replace(
         values=jnp.where(kept, state.values[order], jnp.inf),
-        vectors=_reordered(state.vectors, order, kept),
+        vectors=_reordered(vectors, order, kept),
         known=count,
     )
 

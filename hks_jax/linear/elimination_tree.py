@@ -1,8 +1,8 @@
-"""Levels of an elimination tree merged, so that solves on accelerators take fewer steps one after another.
+"""The levels of an elimination tree, and how to merge them, so that solves on accelerators take fewer steps.
 
-The fronts of neighbouring levels that belong together become one, with an explicit inverse. That reads more from
-memory, and launches less: of all ways to divide the levels into groups the one is taken that costs least. Only what
-solves multiply with is merged; the factorisation, and with it the inertia, goes level by level.
+Fronts of neighbouring levels that belong together become one, with an explicit inverse. That reads more from memory,
+and launches less: of all ways to divide the levels into groups the one is taken that costs least. Only what solves
+multiply with is merged; the factorisation, and with it the inertia, goes level by level.
 
 Few explicit inverses in place of many substitutions: F. L. Alvarado, A. Pothen and R. Schreiber, Highly parallel sparse
 triangular solution, in Graph Theory and Sparse Matrix Computation (Springer 1993).
@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Int
 
 from hks_jax.linear.bisection import within_groups
-from hks_jax.linear.level import Level
 
 _TRAFFIC = 20e6
 """Bytes that memory moves in the time of a launch: 4 µs at 4.8 TB/s."""
@@ -24,6 +23,30 @@ _BYTES = 8
 """Of a number."""
 _ALIGNED = 64
 """Of how many nodes large fronts have a multiple: of others XLA would copy the matrices, with zeros around them."""
+
+
+class Level(NamedTuple):
+    """The fronts of one level: each eliminates its own s nodes, and is coupled to r boundary nodes eliminated later.
+
+    Where a front has fewer, indices are padded with the first number that is out of range.
+
+    Attributes:
+        own: (fronts, s) the degrees of freedom eliminated.
+        boundary: (fronts, r) the places of the boundary nodes among the (fronts, s + r) nodes of the level above.
+        children: (c, fronts, s + r) the places of the front's nodes among the (fronts, r) boundary nodes of the level
+            below, as often as nodes have such places: in an elimination tree those of the first child, and those of
+            the second. Empty for cells.
+    """
+
+    own: Int[np.ndarray, "fronts s"]
+    boundary: Int[np.ndarray, "fronts r"]
+    children: Int[np.ndarray, "c fronts s_plus_r"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(fronts, s + r, s): that of the blocks which hold the columns of the own nodes."""
+        fronts, s = self.own.shape
+        return fronts, s + self.boundary.shape[1], s
 
 
 class Merged(NamedTuple):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.count import count_once
 from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.loops import while_loop
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
@@ -78,39 +79,43 @@ def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Float[Array,
     Fewer only where there are no more, or where the next is a multiple one that would be too many. Each factorisation
     is tried out on so many random right-hand sides.
     """
-    return _lowered(pencil, dissect(pencil.pattern), most, probes)
-
-
-@jit_quickly(static_argnames=("most", "probes"))
-def _lowered(
-    pencil: LocatedPencil, dissection: Dissection, most: int, probes: int
-) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    dtype = pencil.stiffness.dtype
+    dissection, dtype = _dissected(pencil), pencil.stiffness.dtype
     tried = jax.random.normal(jax.random.key(0), (pencil.size, probes), dtype)
 
-    def unfinished(state: _Descent) -> Bool[Array, ""]:
-        few = (2 * state.number < most) & (state.number < pencil.negative)
-        narrow = state.far - state.near <= _ALIKE * jnp.maximum(state.near, pencil.spacing)
-        return few & ~narrow & (state.tries < _TRIES)
+    def going_on(state: _Descent) -> Bool[Array, ""]:
+        return _descends(state, pencil.negative, pencil.spacing, most)
 
     def step(state: _Descent) -> _Descent:
-        count, sound = count_once(pencil, dissection, -state.next, tried)
-        passed = pencil.negative - count
-        nearer, farther = sound & (passed <= most), sound & (passed > most)
-        near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
-        far, far_number = jnp.where(farther, state.next, state.far), jnp.where(farther, passed, state.far_number)
-        share = (3 * most // 4 - number) / jnp.maximum(far_number - number, 1)
-        between = near + jnp.clip(share.astype(dtype), 1 / 8, 7 / 8) * (far - near)
-        following = jnp.where(jnp.isfinite(far), between, 4 * near)
-        # Where the count is not to be trusted, try beside.
-        following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
-        return _Descent(near, number, far, far_number, following, state.tries + 1)
+        return _descended(state, *count_once(pencil, dissection, -state.next, tried), pencil.negative, most)
 
-    nothing = jnp.zeros((), dtype)
+    nothing, none = jnp.zeros((), dtype), jnp.zeros((), int)
     first = 3 / 4 * most * pencil.spacing
-    none = jnp.zeros((), int)
-    state = jax.lax.while_loop(unfinished, step, _Descent(nothing, none, nothing + jnp.inf, none, first, none))
+    state = while_loop(going_on, step, _Descent(nothing, none, nothing + jnp.inf, none, first, none))
     return state.near, state.number
+
+
+@partial(jax.jit, static_argnames="most")
+def _descends(state: _Descent, negative: Int[Array, ""], spacing: Float[Array, ""], most: int) -> Bool[Array, ""]:
+    few = (2 * state.number < most) & (state.number < negative)
+    narrow = state.far - state.near <= _ALIKE * jnp.maximum(state.near, spacing)
+    return few & ~narrow & (state.tries < _TRIES)
+
+
+@partial(jax.jit, static_argnames="most")
+def _descended(
+    state: _Descent, count: Int[Array, ""], sound: Bool[Array, ""], negative: Int[Array, ""], most: int
+) -> _Descent:
+    """Return what is known after a count, and where to count next."""
+    passed = negative - count
+    nearer, farther = sound & (passed <= most), sound & (passed > most)
+    near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
+    far, far_number = jnp.where(farther, state.next, state.far), jnp.where(farther, passed, state.far_number)
+    share = (3 * most // 4 - number) / jnp.maximum(far_number - number, 1)
+    between = near + jnp.clip(share.astype(near.dtype), 1 / 8, 7 / 8) * (far - near)
+    following = jnp.where(jnp.isfinite(far), between, 4 * near)
+    # Where the count is not to be trusted, try beside.
+    following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
+    return _Descent(near, number, far, far_number, following, state.tries + 1)
 
 
 class _Search(NamedTuple):
@@ -142,11 +147,8 @@ def locate(
     factorisation is tried out on so many random right-hand sides. Where many are equal within rounding there are more.
     NaN where nothing succeeds.
     """
-    size, dissection = scale(pencil), dissect(pencil.pattern)
+    size, dissection = scale(pencil), _dissected(pencil)
     tried = jax.random.normal(jax.random.key(0), (pencil.size, probes), size.dtype)
-    traced = is_traced(size)
-    # Step by step, the computations are those of the slices that follow: compiled once for both.
-    dissection = dissection if traced else jax.device_put(dissection)
     infinite = jnp.full((), jnp.inf, size.dtype)
     # Just below zero: of a singular K ⪰ 0 there is no eigenvalue below it, and the factorisation is still accurate.
     least = jnp.asarray(float(jnp.finfo(size.dtype).eps) ** _JUST_BELOW, size.dtype) * size
@@ -155,11 +157,8 @@ def locate(
     def step(state: _Search) -> _Search:
         return _narrowed(state, *count_once(pencil, dissection, state.next, tried), size, wanted, pencil.size)
 
-    if traced:
-        state = jax.lax.while_loop(lambda state: _unfinished(state, wanted, least), step, state)
-    else:
-        while _unfinished(state, wanted, least):
-            state = step(state)
+    # Step by step, the computations are those of the slices that follow: compiled once for both.
+    state = while_loop(lambda state: _unfinished(state, wanted, least), step, state)
     known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
     low, first = (jnp.where(known, end, jnp.nan) for end in (state.low, state.first))
     return low, first, state.number
@@ -192,9 +191,14 @@ def _narrowed(
     return _Search(low, high, number, first, jnp.where(sound, following, beside), state.tries + 1)
 
 
+def _dissected(pencil: SymmetricPencil) -> Dissection:
+    dissection = dissect(pencil.pattern)
+    return dissection if is_traced(pencil) else jax.device_put(dissection)
+
+
 @jit_quickly()
 def scale(pencil: SymmetricPencil) -> Float[Array, ""]:
-    """Return the size of the largest eigenvalue, roughly: rows of |K| over the diagonal of M."""
+    """Return the size of the largest eigenvalue, roughly: rows of |K| over the diagonal of M; 1 where all are zero."""
     data, (rows, _) = pencil.stiffness.triplets()
-    sums = jax.ops.segment_sum(jnp.abs(data), rows, pencil.size)
-    return jnp.max(sums / pencil.mass.diagonal())
+    size = jnp.max(jax.ops.segment_sum(jnp.abs(data), rows, pencil.size) / pencil.mass.diagonal())
+    return jnp.where(size > 0, size, 1)
