@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement.adjoint import Adjoint
@@ -73,9 +73,9 @@ def solved(
 # there. The rule takes −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN; and so it does where the gap is
 # below √ε (λ − λ₀), λ₀ the lowest computed, because dividing by it would leave no digits. So dφᵢ is the derivative of
 # an eigenvector only where λᵢ is simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What
-# does not depend on the basis, such as every spectral function, must not be computed from that gauge. For it there is
-# the frame: its derivative has the sum over j > k alone, which no basis of the first k changes
-# (hks_jax/signatures/spectral.py).
+# does not depend on the basis, such as every spectral function, must not be computed from that gauge, and `of_simple`
+# keeps it from users. For it there is the frame: its derivative has the sum over j > k alone, which no basis of the
+# first k changes (hks_jax/signatures/spectral.py).
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver,
@@ -283,3 +283,35 @@ def _frame_within_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     change = tangents[0]
     inside = pencil.among(pencil.apply_mass(change, part), part, vectors, part)
     return vectors, change - combine(inside, vectors)
+
+
+@jax.custom_jvp
+def of_simple(
+    vectors: Float[Array, "k n_dof"],
+    values: Float[Array, " k"],
+    following: Float[Array, ""],
+    kept: Bool[Array, " k"],
+    part: Int[Array, " k"],
+    pencil: Pencil | MirrorPencil,
+) -> Float[Array, "k n_dof"]:
+    """Return the vectors; their derivatives become NaN, where they count, unless the eigenvalue is simple and kept."""
+    return vectors
+
+
+# In Σᵢ f(λᵢ) φᵢ(x)² the copies of an eigenvalue mix by Gᵢⱼ f'(λ) φᵢ φⱼ. The derivatives of f(λᵢ) hold the diagonal of
+# it alone, and equal f(λᵢ) take from dφᵢ whatever rotates copies: no dφᵢ that is finite makes the sum right.
+@of_simple.defjvp
+def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    vectors, values, following, kept, part, pencil = primals
+    size = jnp.maximum(jnp.abs(values), values - values[:1])
+    rounding = jnp.stack([indistinct(each, values.dtype) for each in pencil.parts]).max()
+    least = jnp.maximum(jnp.sqrt(jnp.finfo(values.dtype).eps) * size, rounding)
+    near = (jnp.abs(values[:, None] - values[None]) <= least[:, None]) & (part[:, None] == part[None])
+    fixed = (values == 0) & (pencil.n_fixed > 0)  # no perturbation moves or mixes them
+    multiple = (jnp.sum(near, axis=1) > 1) & ~fixed | (following - values <= least) | ~kept
+
+    def undefined(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        counts = jnp.any(x != 0, axis=1)
+        return jnp.where((multiple & counts)[:, None], jnp.nan, x)
+
+    return vectors, with_transpose(undefined, undefined, tangents[0])

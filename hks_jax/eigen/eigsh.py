@@ -27,7 +27,8 @@ def eigsh(
     ``LinearOperator`` either: K and M are factorised, by nested dissection.
 
     Differentiable with respect to the entries of K and M, forward and reverse, once: exactly at any multiplicity, for
-    signatures and all else that does not depend on the basis within a multiple eigenvalue. Works under `jit` and, with
+    signatures and for sums of eigenvalues over all copies. Eigenvectors have a derivative where their eigenvalue is
+    simple, and else NaN: in place of Σᵢ f(λᵢ) φᵢ(x)² by hand take `spectral_signature`. Works under `jit` and, with
     one pattern, `vmap` over the entries (make the pencil with `sparse_pencil` and map over it). Pairs in an interval
     are differentiated with the interval's ends fixed.
 

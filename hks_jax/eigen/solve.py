@@ -13,6 +13,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.choice import choose_solver
 from hks_jax.eigen.count import certain_count
 from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.mirror import solve_intervals, solve_mirror
@@ -98,6 +99,8 @@ def eigenpairs(
                 "Use a smaller k or a finer grid, or give an interval"
             )
         pairs = _lowest(pencil, int(k), solver, multiplet, throw, report)
+    gauge = pairs.eigenvalues, pairs.next_eigenvalue, pairs.kept, pairs.part, pencil
+    pairs = eqx.tree_at(lambda p: p.vectors, pairs, of_simple(pairs.vectors, *gauge))
     if throw:
         result = jax.lax.stop_gradient(pairs).result
         pairs = result.error_if(pairs, result != RESULTS.successful)
