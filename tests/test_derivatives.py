@@ -342,6 +342,10 @@ def test_second_derivatives_are_right_or_refused(rng):
     # In the times, in the times after the tensors, and by jvp in the tensors after the times, they are right.
     check(lambda t: jax.jvp(lambda T: loss(T, t), (tensors,), (direction,))[1], TIMES, 0.1 * TIMES)
     check(rate, tensors, direction)
+    by_times = jax.jacfwd(lambda t: jax.grad(loss)(tensors, t))(TIMES)
+    inside = jax.jvp(lambda t: jax.grad(loss)(tensors, t), (TIMES,), (jnp.ones(3),))[1]
+    np.testing.assert_allclose(jnp.sum(by_times, axis=-1), inside, rtol=1e-10, atol=1e-10)
+    check(lambda t: jnp.vdot(jax.grad(loss)(tensors, t), direction), TIMES, 0.1 * TIMES)
     pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 20)
     second = jax.hessian(lambda t: jnp.sum(hj.hks(pairs, t)[:, 2, 3]))(TIMES)
     exact = jnp.sum(
