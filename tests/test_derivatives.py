@@ -342,6 +342,10 @@ def test_second_derivatives_are_right_or_refused(rng):
     # In the times, in the times after the tensors, and by jvp in the tensors after the times, they are right.
     check(lambda t: jax.jvp(lambda T: loss(T, t), (tensors,), (direction,))[1], TIMES, 0.1 * TIMES)
     check(rate, tensors, direction)
+    by_times = jax.jacfwd(lambda t: jax.grad(loss)(tensors, t))(TIMES)
+    inside = jax.jvp(lambda t: jax.grad(loss)(tensors, t), (TIMES,), (jnp.ones(3),))[1]
+    np.testing.assert_allclose(jnp.sum(by_times, axis=-1), inside, rtol=1e-10, atol=1e-10)
+    check(lambda t: jnp.vdot(jax.grad(loss)(tensors, t), direction), TIMES, 0.1 * TIMES)
     pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 20)
     second = jax.hessian(lambda t: jnp.sum(hj.hks(pairs, t)[:, 2, 3]))(TIMES)
     exact = jnp.sum(
@@ -397,13 +401,12 @@ def test_eigenvalues_within_a_cluster_are_finite_and_right_in_sum(rng):
         return jnp.sum(pairs_at(T).eigenvalues)
 
     check(total, identity(SHAPE), direction)
+    # The eigenvectors of a multiple eigenvalue have no derivative, which is told by NaN; those of simple ones have.
+    values = np.asarray(pairs_at(identity(SHAPE)).eigenvalues)
     tangent = jax.jvp(lambda T: pairs_at(T).vectors, (identity(SHAPE),), (direction,))[1]
-    assert jnp.isfinite(tangent).all()
-    # Φ stays M-orthonormal to first order, whatever the gauge.
-    gram = jax.jvp(
-        lambda T: (p := pairs_at(T)).vectors @ p.pencil.mass.apply(p.vectors).T, (identity(SHAPE),), (direction,)
-    )
-    np.testing.assert_allclose(gram[1], 0, atol=1e-12)
+    alone = (np.abs(values[:, None] - values) < 1e-6).sum(axis=1) == 1
+    assert 3 < alone.sum() < 10
+    np.testing.assert_array_equal(np.isfinite(tangent).all(axis=1), alone)
 
 
 @pytest.mark.slow

@@ -63,6 +63,7 @@ def test_a_batch_shared_out_is_the_batch(found):
 @pytest.mark.slow
 def test_batches_for_lapack_on_all_devices_at_once(found):
     assert found["inverses"] < 1e-12
+    assert found["exponentials"] < 1e-12
 
 
 def check_eigenpairs(errors):

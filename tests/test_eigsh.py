@@ -108,7 +108,12 @@ def test_every_form_of_a_matrix():
 def loss(pencil, k, weights, solver=SOLVER):
     """What does not depend on the basis of the last multiple eigenvalue, if k does not cut it."""
     pairs = hj.eigsh(pencil, k=k, solver=solver)
-    return jnp.sum(pairs.eigenvalues) + jnp.sum(jnp.sum(pairs.vectors**2, axis=0) * weights)
+    squares = hj.spectral_signature(pairs, one, jnp.zeros(1))
+    return jnp.sum(pairs.eigenvalues) + jnp.sum(squares * weights[None])
+
+
+def one(_, x):
+    return jnp.ones_like(x)
 
 
 SIMPLE = pytest.param(lambda: indefinite(300), 12, marks=pytest.mark.slow)
@@ -128,6 +133,29 @@ def test_gradients_at_simple_and_multiple_eigenvalues(rng, matrices, k):
         along = sum(jnp.vdot(g, c) for g, c in zip(jax.tree.leaves(gradient), jax.tree.leaves(change), strict=True))
         ends = [run(jax.tree.map(lambda p, c, s=s: p + s * h * c, pencil, change))[0] for s in (-1, 1)]
         np.testing.assert_allclose(along, (ends[1] - ends[0]) / (2 * h), rtol=1e-6, atol=2e-6)
+
+
+def test_sums_over_eigenvectors_by_hand_are_right_or_nan():
+    """The 3-cycle, whose second eigenvalue is double until a potential splits it."""
+    pencil = hj.sparse_pencil(3 * np.eye(3) - 1.0)
+
+    def pairs(potential):
+        return hj.eigsh(pencil.with_stiffness(pencil.stiffness.plus(potential)), k=3)
+
+    def by_hand(potential):
+        return jnp.sum(jnp.exp(-(p := pairs(potential)).eigenvalues) * p.vectors[:, 0] ** 2)
+
+    def signature(potential):
+        return hj.hks(pairs(potential), [1.0])[0, 0]
+
+    split = jnp.array([0.0, 0.1, 0.3])
+    np.testing.assert_allclose(jax.grad(by_hand)(split), jax.grad(signature)(split), rtol=1e-9)
+    right = jax.grad(signature)(jnp.zeros(3))
+    np.testing.assert_allclose(right, [-0.27401098, -0.04625686, -0.04625686], rtol=1e-6)
+    assert jnp.isnan(jax.grad(by_hand)(jnp.zeros(3))).all()
+    assert jnp.isnan(jax.jvp(by_hand, (jnp.zeros(3),), (split,))[1])
+    total = jax.grad(lambda potential: jnp.sum(pairs(potential).eigenvalues))(jnp.zeros(3))
+    np.testing.assert_allclose(total, 1, rtol=1e-12)
 
 
 @pytest.mark.slow

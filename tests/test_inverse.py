@@ -141,6 +141,17 @@ def test_by_default_the_truth_explains_a_target_of_all_pairs():
     assert fit.loss < 0.7 * of_the_truth
 
 
+def test_a_fit_may_begin_where_another_has_come_to():
+    """At a metric of more volume, which takes more pairs than the first one was allowed."""
+    grid, times = hj.Grid((15, 15), 1 / 14), np.array([0.006])
+    flat, larger, largest = (hj.TensorField(grid, np.broadcast_to(c * np.eye(2), (15, 15, 2, 2))) for c in (1, 1.2, 3))
+    assert pairs_for(times, hj.assemble(flat), flat) < 225
+    with pytest.warns(hj.AccuracyWarning, match=r"which takes about 6\d eigenpairs; with 225 unknowns 56 are near"):
+        pairs_for(times, hj.assemble(larger), larger)
+    with pytest.raises(ValueError, match=r"which takes about 1\d\d eigenpairs; .* Use times from about 0.01"):
+        pairs_for(times, hj.assemble(largest), largest)
+
+
 @pytest.mark.slow
 def test_more_pairs_are_asked_for_where_the_volume_has_grown():
     """Three times the area of the start: the pairs that were enough there are not."""
@@ -198,6 +209,18 @@ def test_rotations_with_fixed_eigenvalues():
     truth = hj.TensorField(GRID, rotation @ values @ np.swapaxes(rotation, -1, -2))
     fit = hj.fit_metric(signature(truth), TIMES, init, "rotation", k=K)
     assert error(fit, truth) < 0.02
+
+
+@pytest.mark.slow
+def test_a_model_that_cannot_explain_the_target_is_told(rng):
+    """A conformal factor for a metric that is not conformal, with 1 % of noise."""
+    grid, times = hj.Grid((6, 6), 0.2), TIMES[2:]
+    flat, turned = (hj.TensorField(grid, np.broadcast_to(c, (6, 6, 2, 2))) for c in (np.eye(2), np.diag([1.0, 2.0])))
+    target = signature(turned, 36, times) * np.exp(0.01 * rng.standard_normal((2, 6, 6)))
+    with pytest.warns(
+        hj.AccuracyWarning, match=r"noise: the fit (converged|stalled) at residuals of 0\.0\d+, of which"
+    ):
+        hj.fit_metric(target, times, flat, "conformal", k=36, noise=0.01, tolerance=0.05)
 
 
 @pytest.mark.slow

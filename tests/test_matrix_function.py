@@ -153,6 +153,21 @@ def test_parameters_of_f_batched_compute_one_decomposition(rng):
     np.testing.assert_allclose(gradient, np.stack([2 * A, 12 * A @ A]), atol=1e-11)
 
 
+def test_shared_out_to_devices(rng):
+    """One device will do; functions that close over an array, too."""
+    stack, t = jnp.asarray([with_spectrum(rng, SPECTRA["multiple"])] * 2), jnp.asarray(0.3)
+    mesh = jax.make_mesh((1,), ("devices",))
+
+    def kernel(A):
+        return hj.matrix_function(A, lambda x: jnp.exp(-t * x))
+
+    run = jax.value_and_grad(lambda stack: jnp.trace(hj.devices.map_fields(kernel, stack, mesh)[1]))
+    value, gradient = run(stack)
+    expected = linalg.expm(-0.3 * np.asarray(stack[1]))
+    np.testing.assert_allclose(value, np.trace(expected), rtol=1e-13)
+    np.testing.assert_allclose(gradient, np.stack([0 * expected, -0.3 * expected]), atol=1e-13)
+
+
 def test_steps_give_projectors(rng):
     """P on the eigenvalues below c, of which two are equal; its derivative by a contour integral of resolvents."""
     A, E = with_spectrum(rng, SPECTRA["multiple"]), symmetric(rng)

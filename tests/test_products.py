@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hks_jax.linear.linear_map import with_transpose
 from hks_jax.linear.products import batched_with_columns, of_each_row
 
 
@@ -38,3 +39,14 @@ def test_functions_of_each_row_and_what_belongs_to_them_in_derivatives(rng, coun
     of_factors, of_rows = back(jnp.asarray(images))
     np.testing.assert_allclose(of_factors, np.sum(images * np.roll(rows, 1, axis=1), axis=0), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(of_rows, np.roll(factors * images, -1, axis=1), rtol=1e-14)
+
+
+def test_a_transpose_of_ones_own_is_differentiated_by_what_its_cotangents_depend_on(rng):
+    """What `jax.jacfwd` of `jax.grad` takes, for the parameters of a loss."""
+    A, x = jnp.asarray(rng.standard_normal((3, 4))), jnp.asarray(rng.standard_normal(4))
+
+    def loss(x, t):
+        return jnp.sum((t * with_transpose(lambda x: A @ x, lambda y: A.T @ y, x)) ** 3)
+
+    got = jax.jacfwd(lambda t: jax.grad(loss)(x, t))(2.0)
+    np.testing.assert_allclose(got, 9 * 2.0**2 * A.T @ (A @ x) ** 2, rtol=1e-13)

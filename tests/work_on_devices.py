@@ -107,6 +107,18 @@ def inverses(mesh):
     return difference(map_fields(inverse_of_inverse, matrices, mesh), matrices)
 
 
+def exponentials(mesh):
+    """The gradient of tr e^A of matrices on every device; a shard_map marks what differs between devices."""
+    matrices = RNG.standard_normal((mesh.size, 4, 4))
+    matrices = jnp.asarray(matrices + matrices.swapaxes(1, 2))
+    own = jax.sharding.Mesh(mesh.devices, mesh.axis_names)
+    spec = jax.sharding.PartitionSpec(mesh.axis_names[0])
+    function = jax.vmap(lambda a: hj.matrix_function(a, jnp.exp))
+    shared = jax.shard_map(function, mesh=own, in_specs=spec, out_specs=spec)
+    gradient = jax.jit(jax.grad(lambda a: jnp.sum(jnp.trace(shared(a), axis1=1, axis2=2))))(matrices)
+    return difference(gradient, np.stack([scipy.linalg.expm(a) for a in np.asarray(matrices)]))
+
+
 def eigenpairs(mesh, shape, k, block):
     """The same eigenvalues and spectral projections as on one device, and as from a dense solver."""
     x = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij"))
@@ -166,6 +178,7 @@ def main():
         found["heat"] = heat(mesh)
         found["batch"] = batch(mesh)
         found["inverses"] = inverses(mesh)
+        found["exponentials"] = exponentials(mesh)
         found["eigenpairs"] = eigenpairs(mesh, (19, 17), 7, 2)
     else:
         found["halo"] = [halo(mesh, (9, 4), (True, False), gradient=False)]

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly
@@ -17,7 +17,7 @@ from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
-from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.batches import one_by_one
 from hks_jax.linear.linear_map import with_transpose
@@ -74,9 +74,9 @@ def solved(
 # there. The rule takes −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN; and so it does where the gap is
 # below √ε (λ − λ₀), λ₀ the lowest computed, because dividing by it would leave no digits. So dφᵢ is the derivative of
 # an eigenvector only where λᵢ is simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What
-# does not depend on the basis, such as every spectral function, must not be computed from that gauge. For it there is
-# the frame: its derivative has the sum over j > k alone, which no basis of the first k changes
-# (hks_jax/signatures/spectral.py).
+# does not depend on the basis, such as every spectral function, must not be computed from that gauge, and `of_simple`
+# keeps it from users. For it there is the frame: its derivative has the sum over j > k alone, which no basis of the
+# first k changes (hks_jax/signatures/spectral.py).
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver,
@@ -290,3 +290,37 @@ def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]
 def products_with_constants(images: Float[Array, "b n_dof"], vectors: Float[Array, "k n_dof"]) -> Float[Array, "b k"]:
     """Return the inner products, linear in the images: the vectors are constants to derivatives."""
     return with_transpose(partial(inner_products, vectors), lambda mix: combine(mix, vectors), images)
+
+
+@jax.custom_jvp
+def of_simple(
+    vectors: Float[Array, "k n_dof"],
+    values: Float[Array, " k"],
+    following: Float[Array, ""],
+    kept: Bool[Array, " k"],
+    part: Int[Array, " k"] | None,
+    pencil: AnyPencil,
+) -> Float[Array, "k n_dof"]:
+    """Return the vectors; their derivatives become NaN, where they count, unless the eigenvalue is simple and kept."""
+    return vectors
+
+
+# In Σᵢ f(λᵢ) φᵢ(x)² the copies of an eigenvalue mix by Gᵢⱼ f'(λ) φᵢ φⱼ. The derivatives of f(λᵢ) hold the diagonal of
+# it alone, and equal f(λᵢ) take from dφᵢ whatever rotates copies: no dφᵢ that is finite makes the sum right.
+@of_simple.defjvp
+def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    vectors, values, following, kept, part, pencil = primals
+    size = jnp.maximum(jnp.abs(values), values - values[:1])
+    rounding = jnp.stack([indistinct(each, values.dtype) for each in pencil.parts]).max()
+    least = jnp.maximum(jnp.sqrt(jnp.finfo(values.dtype).eps) * size, rounding)
+    near = jnp.abs(values[:, None] - values) <= least[:, None]
+    if part is not None:
+        near &= part[:, None] == part
+    fixed = (values == 0) & (pencil.parts[0].n_fixed > 0)  # no perturbation moves or mixes them
+    multiple = (jnp.sum(near, axis=1) > 1) & ~fixed | (following - values <= least) | ~kept
+
+    def undefined(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+        counts = jnp.any(x != 0, axis=1)
+        return jnp.where((multiple & counts)[:, None], jnp.nan, x)
+
+    return vectors, with_transpose(undefined, undefined, tangents[0])

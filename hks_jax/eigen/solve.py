@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -9,6 +10,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.automatic import choose_solver
 from hks_jax.eigen.count import checked_pencil
 from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
@@ -90,6 +92,8 @@ def eigenpairs(
                 "Use a smaller k or a finer grid, or give an interval"
             )
         pairs = _lowest(pencil, int(k), solver, multiplet, throw, report)
+    gauge = pairs.eigenvalues, pairs.next_eigenvalue, pairs.kept, pairs.part, pencil
+    pairs = eqx.tree_at(lambda p: p.vectors, pairs, of_simple(pairs.vectors, *gauge))
     if throw:
         result = jax.lax.stop_gradient(pairs).result
         pairs = result.error_if(pairs, result != RESULTS.successful)
@@ -120,7 +124,8 @@ def eigsh(
     ``LinearOperator`` either: K and M are factorised, by nested dissection.
 
     Differentiable with respect to the entries of K and M, forward and reverse, once: exactly at any multiplicity, for
-    signatures and all else that does not depend on the basis within a multiple eigenvalue. Works under `jit` and, with
+    signatures and for sums of eigenvalues over all copies. Eigenvectors have a derivative where their eigenvalue is
+    simple, and else NaN: in place of Σᵢ f(λᵢ) φᵢ(x)² by hand take `spectral_signature`. Works under `jit` and, with
     one pattern, `vmap` over the entries (make the pencil with `sparse_pencil` and map over it). Pairs in an interval
     are differentiated with the interval's ends fixed.
 

@@ -112,7 +112,8 @@ def fit_metric(
         The fit. ``fit.result`` says how it ended; nothing is raised when it stalls or is interrupted.
 
     Warns:
-        AccuracyWarning: the misfit is near to what k pairs leave out: the fit matches its own truncation.
+        AccuracyWarning: the misfit is near to what k pairs leave out: the fit matches its own truncation; or it stays
+            above what ``noise`` explains: no metric that the parametrisation has explains the target.
 
     Raises:
         ValueError: a target that is NaN, not positive or of the wrong shape; times that the grid cannot resolve; an
@@ -180,6 +181,13 @@ def fit_metric(
             f"k: {problem.k} eigenpairs leave out what amounts to a misfit of about {left:.1e}, and the fit's is "
             f"{misfit:.1e}: it has fitted its own truncation. Use k=None, or k={more_pairs(problem, values)} or "
             f"more; only if the target was itself computed with {problem.k} pairs is nothing wrong"
+        )
+    elif noise is not None and result in ("converged", "stalled") and misfit > noise**2:
+        warn_of_accuracy(
+            f"noise: the fit {result} at residuals of {(2 * misfit) ** 0.5:.2g}, of which noise explains {noise:.2g}: "
+            "no metric of this parametrisation that it found explains the target. Use another parametrisation, such as "
+            '"log-euclidean", another init or weaker regularisers; or the noise is larger. What the fit added '
+            "to init may be the misfit's and not the metric's"
         )
     history, losses = tuple(log.history), tuple(log.losses)
     field, reached_loss = unknowns.field(values), float(outcome.loss)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
@@ -77,9 +78,21 @@ def pairs_below(eigenvalue: float, pencil: AnyPencil, field: TensorField) -> int
     return math.ceil(1.1 * float(weyl_count(pencil, [eigenvalue], field)[0])) + 4
 
 
-def most_pairs(n_dof: int) -> int:
-    """Return how many eigenpairs of a grid are near enough to those of the manifold to be fitted."""
-    return max(n_dof // 4, min(n_dof, 20))
+def require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
+    """Warn where more eigenpairs are wanted than are near to those of the manifold; refuse more than twice as many.
+
+    A fit may come to a metric of more volume, which takes more of them, and must be able to begin there.
+    """
+    most = _most_pairs(n_dof)
+    if wanted <= most:
+        return
+    message = (
+        f"times: got {what} about {wanted} eigenpairs; with {n_dof} unknowns {most} are near enough to those of the "
+        f"manifold to be fitted. Use {remedy}"
+    )
+    if wanted > min(2 * most, n_dof):
+        raise ValueError(message)
+    warn_of_accuracy(message)
 
 
 def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
@@ -89,18 +102,19 @@ def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
         ValueError: the grid does not resolve that time.
     """
     smallest, n_dof, d = float(np.min(np.asarray(times))), unknowns_of(pencil), pencil.space.dimension
-    most = most_pairs(n_dof)
 
     def count(tail: float) -> int:
         return pairs_below(resolving(tail, d) / smallest, pencil, field)
 
-    if count(_LOST) > most:
-        least = smallest * (count(_LOST) / most) ** (2 / d)
-        raise ValueError(
-            f"times: got {smallest:.4g}, which takes about {count(_LOST)} eigenpairs to resolve to {_LOST:.0%}; with "
-            f"{n_dof} unknowns {most} can be fitted. Use times from about {least:.3g}, or a finer grid"
-        )
+    needed = count(_LOST)
+    least = smallest * (needed / _most_pairs(n_dof)) ** (2 / d)
+    remedy = f"times from about {least:.3g}, or a finer grid"
+    require_resolved(needed, n_dof, f"{smallest:.4g}, which takes", remedy)
     return min(count(TAIL), n_dof)
+
+
+def _most_pairs(n_dof: int) -> int:
+    return max(n_dof // 4, min(n_dof, 20))
 
 
 def unknowns_of(pencil: AnyPencil) -> int:

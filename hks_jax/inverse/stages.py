@@ -10,7 +10,7 @@ import numpy as np
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.inverse.observation import Observation
-from hks_jax.inverse.problem import most_pairs, pairs_below, pairs_for, unknowns_of
+from hks_jax.inverse.problem import pairs_below, pairs_for, require_resolved, unknowns_of
 from hks_jax.inverse.truncated import observed_times
 
 
@@ -50,11 +50,9 @@ def pairs_of_stage(
         assert observation.sigma is not None
         reach = float(jnp.max(observation.times) + 2 * observation.sigma)
         wanted, unknowns = pairs_below(math.exp(reach), pencil, field), unknowns_of(pencil)
-        if k is None and wanted > most_pairs(unknowns):
-            raise ValueError(
-                f"times: got energies up to {float(jnp.max(observation.times)):.4g}, which take about {wanted} "
-                f"eigenpairs; with {unknowns} unknowns {most_pairs(unknowns)} can be fitted. Use lower energies"
-            )
+        if k is None:
+            what = f"energies up to {float(jnp.max(observation.times)):.4g}, which take"
+            require_resolved(wanted, unknowns, what, "lower energies")
     else:
         wanted = pairs_for(observed_times(observation), pencil, field)  # those of this stage
     return wanted if k is None else k

@@ -29,7 +29,7 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
     """
 
     x = jax.tree.map(jnp.asarray, x)  # tangents of users may be numbers
-    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), x)
+    like = jax.tree.map(jnp.zeros_like, x)
     forward = partial(_forward, function, derivative, at, constants)
     return with_transpose(forward, partial(_backward, function, derivative, at, constants, like), x, at)
 
@@ -63,8 +63,9 @@ def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any]
 
     y = zeros(jax.eval_shape(forward, x), x)
     right = (y, jax.tree.map(jnp.add, x, zeros(x, x))), (y, zeros(x, x))
-    (result, _), _ = jax.lax.custom_linear_solve(system, right, solve, symmetric=True)
-    return result
+    (result, rest), others = jax.lax.custom_linear_solve(system, right, solve, symmetric=True)
+    # JAX differentiates a transposed solve all of whose right-hand side, the cotangents, depends on something.
+    return jax.tree.map(jnp.add, result, zeros(result, (rest, others)))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))

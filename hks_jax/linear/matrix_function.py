@@ -58,7 +58,7 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
 
 def _with_parameters(f: Callable[[Array], Any], like: Matrix) -> tuple[Function, Any, Any]:
     """Return f as a function of the real numbers that it closes over, of other arrays, and of x, elementwise in x."""
-    one = jax.ShapeDtypeStruct((), like.dtype)
+    one = jax.eval_shape(lambda a: a[0, 0], like)  # and not its shape alone: a shard_map marks what is its own
     out = jax.eval_shape(f, one)
     if not hasattr(out, "shape") or out.shape != () or jnp.issubdtype(out.dtype, jnp.complexfloating):
         got = f"{out.dtype}{list(out.shape)}" if hasattr(out, "shape") else f"{out}"
@@ -66,12 +66,12 @@ def _with_parameters(f: Callable[[Array], Any], like: Matrix) -> tuple[Function,
             f"f: returned {got} for one eigenvalue; expected a real scalar. For several functions at once use jax.vmap "
             "over their parameters"
         )
-    converted = eqx.filter_closure_convert(lambda x: jnp.asarray(f(x)).astype(like.dtype), one)
-    arrays, static = eqx.partition(converted, eqx.is_array)
-    parameters, others = eqx.partition(jax.tree.map(jnp.asarray, arrays), eqx.is_inexact_array)
+    closed = jax.make_jaxpr(lambda x: jnp.asarray(f(x)).astype(like.dtype))(one)
+    parameters, others = eqx.partition([jnp.asarray(const) for const in closed.consts], eqx.is_inexact_array)
 
     def elementwise(parameters: Any, others: Any, x: Array) -> Array:
-        return jax.vmap(eqx.combine(parameters, others, static))(x.ravel()).reshape(x.shape)
+        consts = eqx.combine(parameters, others)
+        return jax.vmap(lambda x: jax.core.eval_jaxpr(closed.jaxpr, consts, x)[0])(x.ravel()).reshape(x.shape)
 
     return elementwise, parameters, others
 

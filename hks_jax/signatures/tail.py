@@ -68,7 +68,7 @@ def truncation_map(
     An estimate, not a bound. Against all pairs of small grids (2D and 3D, flat, smooth and rough tensors, every
     boundary, from 28 pairs to a third of all) the largest share of a node was 0.25 to 2 times the largest estimate
     where the mean was above 0.1 %, and up to 3 times at a mean of 1e-6. Where the mean was 1 % the largest share was
-    1.1 to 4 times that without Dirichlet sides, and 3 to 20 times beside them.
+    1.1 to 6 times that without Dirichlet sides, and 3 to 20 times beside them.
 
     Args:
         pairs: from `eigenpairs`.

@@ -36,8 +36,8 @@ class Truncation(eqx.Module):
         lasting_bias: (n,) the part of it that does not fall as t grows, because the tensors turn or stretch from node
             to node.
         coarse_fraction: (n,) the fraction of nodes where that bias exceeds 10 %.
-        smallest_time: the least time that the k pairs resolve to 1 % in that mean. The worst node then lacks up to 4 %,
-            beside a Dirichlet side 6 to 20 %.
+        smallest_time: the least time that the k pairs resolve to 1 % in that mean. The worst node then lacks up to 6 %,
+            beside a Dirichlet side up to 20 %.
     """
 
     times: Float[Array, " n"]
