@@ -13,18 +13,15 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.slow
 def test_readme_code_runs_in_an_empty_folder(tmp_path):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) >= 2
+    assert "jax.grad" in "".join(blocks)
     command = [sys.executable, "-W", "error", "-c", "\n".join(blocks)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "120 of 120 converged" in done.stdout
     # K = −∇² log f / 2f of the metric f·I, here −(−40/11)/22
-    lines = done.stdout.splitlines()
-    steps = [line for line in lines if line.startswith("step ")]
-    curvature, signature = map(float, lines[-1 - len(steps)].split())
+    curvature, signature = map(float, done.stdout.splitlines()[-1].split())
     assert abs(curvature - 40 / 11 / 22) < 1e-12
     assert signature > 0
-    assert float(re.search("loss ([^,]+)", steps[-1])[1]) < 1e-8
     assert (tmp_path / "hks.png").stat().st_size > 10_000
 
 
