@@ -23,13 +23,12 @@ DPI = 72
 HEAD = """\
 # Gallery
 
-Every picture of `hks_jax.plot`, and the code that made it. Most functions draw on axes that they are given, so that
-pictures compose; `hks_panels`, `volume_panels`, `time_rows` and `fit_panels` make a figure. `python docs/gallery.py`
-makes this page.
+Every picture of `hks_jax.plot`, with the function of [gallery.py](gallery.py) that draws it. The site shows its code below
+the picture. Most functions draw on given axes, so pictures compose; `hks_panels`, `volume_panels`, `time_rows` and
+`fit_panels` make a figure. `python docs/gallery.py` draws the pictures and writes this page.
+"""
 
-All code below begins with
-
-```python
+IMPORTS = """\
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,7 +38,6 @@ from hks_jax import plot
 from hks_jax.domain.phantom import phantom
 
 jax.config.update("jax_enable_x64", True)
-```
 """
 
 
@@ -64,7 +62,7 @@ def panels() -> Figure:
 
 
 def glyphs() -> Figure:
-    """Unit circles of the metric, coloured by anisotropy or by orientation; as many as fit."""
+    """Unit circles of the metric, coloured by anisotropy or by orientation."""
     field = brain_like()
     figure = plot.new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2)
@@ -134,7 +132,7 @@ def curves() -> Figure:
 
 
 def weyl() -> Figure:
-    """How many eigenvalues there are up to λ, and Weyl's law, which they fall behind where the grid is too coarse."""
+    """The number of eigenvalues up to λ beside Weyl's law; where the grid is too coarse they fall behind."""
     field = hj.examples.figure4_fields(41)["cells"]
     pairs = hj.eigenpairs(field, 250)
     figure = plot.new_figure(7.6, 3.2)
@@ -145,7 +143,7 @@ def weyl() -> Figure:
 
 
 def influence() -> Figure:
-    """How far the boundary reaches: which part of the signature it decides, with lines at 1 % and 10 %."""
+    """The boundary's share of the signature, with lines at 1 % and 10 %."""
     field = brain_like()
     times = np.array([0.4, 1.5, 6.0]) * 1e5
     values = hj.boundary_influence(field, times, 300)
@@ -157,7 +155,7 @@ def influence() -> Figure:
 
 
 def around_one() -> Figure:
-    """4πt·HKS around 1, which it is where the metric is flat: with the rim of a mask above, without it below."""
+    """4πt·HKS, 1 where the metric is flat: above with the rim of a mask, below without it."""
     field = brain_like()
     times = np.array([0.4, 1.5, 6.0]) * 1e5
     pairs = hj.eigenpairs(field, 600, "mean")
@@ -251,7 +249,7 @@ def derivative() -> Figure:
 
 
 def fit() -> Figure:
-    """A metric found from its signature: target, fit and difference over t, the metric, and the way there."""
+    """A metric found from its signature: target, fit and difference over t, the metric, and the loss of each step."""
     grid = hj.Grid(shape=(20, 20), spacing=1 / 19)
     x, y = grid.nodes[..., 0], grid.nodes[..., 1]
     hidden = hj.TensorField(grid, jnp.exp(0.4 * jnp.sin(3 * x) * jnp.cos(2 * y))[..., None, None] * jnp.eye(2))
@@ -301,7 +299,7 @@ def torus() -> Figure:
 
 
 def solid() -> Figure:
-    """Half of a ball of tetrahedra, along whose fibres, helices about its axis, diffusion is fast."""
+    """Half of a ball of tetrahedra with fast diffusion along helices about its axis."""
     ball = hj.examples.ball_mesh(11)
     x, y, z = np.asarray(ball.vertices).T
     along = np.stack([-y, x, 0.4 + 0 * z], axis=-1)
@@ -340,17 +338,25 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
 }
 
 
+def code(name: str) -> str:
+    """Return the code of one picture, or that before all of them, as the site shows it."""
+    if name == "before":
+        helpers = "\n\n".join(inspect.getsource(helper) for helper in (brain_like, signature_at_dot))
+        return f"All code below begins with\n\n```python\n{IMPORTS}\n\n{helpers}```"
+    (draw,) = (draw for draw in ENTRIES.values() if draw.__name__ == name)
+    body = textwrap.dedent(inspect.getsource(draw).split('"""', 2)[2]).strip("\n")
+    body = body.replace("return figure", 'plot.save_figure(figure, "picture.png")')
+    body = body.replace("return plot", "figure = plot")
+    return f"```python\n{body}\n```"
+
+
 def page() -> str:
-    """Return the text of docs/gallery.md."""
-    helpers = "\n\n".join(inspect.getsource(helper) for helper in (brain_like, signature_at_dot))
-    parts = [HEAD, f"```python\n{helpers}```\n"]
+    """Return the text of docs/gallery.md. The build puts the code in place of the comments."""
+    parts = [HEAD, "<!-- gallery: before -->"]
     for title, draw in ENTRIES.items():
-        body = textwrap.dedent(inspect.getsource(draw).split('"""', 2)[2]).strip("\n")
-        body = body.replace("return figure", 'plot.save_figure(figure, "picture.png")').replace(
-            "return plot", "figure = plot"
-        )
         image = f"![{title}](images/gallery/{draw.__name__}.png)"
-        parts += [f"## {title}", f"{draw.__doc__}", image, f"```python\n{body}\n```\n"]
+        text = f"{draw.__doc__} ([{draw.__name__}](gallery.py))"
+        parts += [f"## {title}", text, image, f"<!-- gallery: {draw.__name__} -->"]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
 

@@ -9,8 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
-# The gallery's code is run by docs/gallery.py; a file of the reader's, and addresses of other machines, are not here.
-ELSEWHERE = ("gallery.md",)
+# A file of the reader's, and addresses of other machines, are not here.
 NOT_HERE = ("heart.vtu", "jax.distributed.initialize")
 
 
@@ -20,7 +19,7 @@ def blocks(page):
     return [block for block in found if not any(name in block for name in NOT_HERE)]
 
 
-PAGES = [page for page in sorted((ROOT / "docs").glob("*.md")) if page.name not in ELSEWHERE and blocks(page)]
+PAGES = [page for page in sorted((ROOT / "docs").glob("*.md")) if blocks(page)]
 
 
 @pytest.mark.slow

@@ -4,10 +4,13 @@ README.md becomes the home page, and the notebooks become tutorials. Every page 
 in the repository; they are turned to the site's here.
 """
 
+import importlib.util
 import posixpath
 import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import commands
 import names
@@ -47,8 +50,19 @@ FILES = (
 
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 
+
+@cache
+def gallery() -> ModuleType:
+    """Return docs/gallery.py, which holds the code of the pictures."""
+    spec = importlib.util.spec_from_file_location("gallery", ROOT / "docs" / "gallery.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 MARKERS: dict[str, Callable[[str], str]] = {
     "commands": commands.reference,
+    "gallery": lambda name: gallery().code(name),
     "references": references.listing,
 }
 """What replaces ``<!-- name: argument -->`` in a page, and needs the argument."""
