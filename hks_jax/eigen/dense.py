@@ -6,12 +6,16 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from scipy.linalg import cholesky, eigh, solve_triangular
 
 from hks_jax.checks import require_number
+from hks_jax.eigen.host.matrices import host_matrices
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.standard_form import pencil_eigh
+from hks_jax.traced import is_traced
 
 
 class Dense(Eigensolver[SymmetricPencil]):
@@ -25,8 +29,14 @@ class Dense(Eigensolver[SymmetricPencil]):
         require_number("tolerance", self.tolerance, 1)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs."""
-        return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
+        """Return the k lowest eigenpairs: where values are concrete by SciPy, for which nothing is compiled."""
+        if is_traced((pencil, jnp.zeros(()))) or jax.default_backend() != "cpu":
+            return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
+        data, matrices = host_matrices(pencil)
+        dtype = pencil.stiffness.dtype
+        stiffness, mass = (matrix.toarray() for matrix in matrices(*data))
+        values, vectors = _on_host(stiffness, mass, k)
+        return jnp.asarray(values, dtype), jnp.asarray(vectors, dtype), jnp.asarray(jnp.inf, dtype)
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return all the pairs beyond k: they cost nothing, and leave no complement to solve on."""
@@ -37,3 +47,20 @@ class Dense(Eigensolver[SymmetricPencil]):
 def _dense(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"], k: int) -> RawPairs:
     values, vectors = pencil_eigh(stiffness, mass, k)
     return values, vectors.T, jnp.asarray(jnp.inf, values.dtype)
+
+
+def _on_host(
+    stiffness: Float[np.ndarray, "n n"], mass: Float[np.ndarray, "n n"], k: int
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k n"]]:
+    """Return the k lowest eigenpairs, NaN where K is not finite or M not positive definite."""
+    n = len(stiffness)
+    try:
+        factor = cholesky(mass, lower=True)
+        half = solve_triangular(factor, stiffness, lower=True)
+        reduced = solve_triangular(factor, half.T, lower=True)
+        few = 3 * k < n  # then bisection and relatively robust representations are faster
+        values, modes = eigh(reduced, subset_by_index=[0, k - 1]) if few else eigh(reduced, driver="evd")
+        vectors = solve_triangular(factor, modes[:, :k], lower=True, trans="T")
+    except (np.linalg.LinAlgError, ValueError):
+        return np.full(k, np.nan), np.full((k, n), np.nan)
+    return values[:k], vectors.T
