@@ -10,8 +10,7 @@ from fields import flat, random_spd, turning
 from scipy.linalg import expm
 
 import hks_jax as hj
-from hks_jax.signatures.tail import beyond, beyond_by_weyl
-from hks_jax.signatures.truncation import median_of_shares
+from hks_jax.signatures.truncation import beyond, beyond_by_weyl, median_of_shares
 
 
 @pytest.fixture(scope="module")

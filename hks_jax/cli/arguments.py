@@ -4,7 +4,7 @@ import math
 from argparse import ArgumentTypeError
 from typing import NamedTuple, cast
 
-from hks_jax.domain.indefinite import MAPS, PositiveMap
+from hks_jax.domain.tensor_checks import MAPS, PositiveMap
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.repair import REPAIRS, Repair
 

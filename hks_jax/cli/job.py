@@ -23,9 +23,8 @@ from hks_jax.fem.pencil import AnyPencil
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.hks import HKSMethod, Normalisation, hks, hks_auto
-from hks_jax.signatures.tail import truncation_map
 from hks_jax.signatures.times import default_times, positive_range
-from hks_jax.signatures.truncation import truncation
+from hks_jax.signatures.truncation import truncation, truncation_map
 
 
 class ComputationError(RuntimeError):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hks_jax.claim import claim
+from hks_jax.atomic import claim
 from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.arguments import Times
 from hks_jax.cli.bar import duration

@@ -1,12 +1,15 @@
-"""Checks of tensors, and the messages about them, for grids, meshes and files alike."""
+"""Checks of tensors and deformation gradients, what to do with tensors that are not positive, and the messages."""
 
-from typing import Any, Literal, NoReturn
+import math
+from typing import Any, Literal, NoReturn, get_args
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import real_array
+from hks_jax.checks import real_array, require_number
 from hks_jax.domain import spd
+from hks_jax.domain.grid import Grid
 from hks_jax.traced import is_traced
 
 MetricChoice = Literal["tensor", "inverse", "adjugate"]
@@ -104,3 +107,112 @@ def refuse(
         f"{name}: {int(bad.sum())} of {int(inside.sum())} tensors are {what} (the first at {place} {first}); "
         f"expected symmetric positive definite tensors. {remedy}"
     )
+
+
+def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d d"]:
+    """Return C = FᵀF of gradients (*shape, m, d), m ≥ d; the identity outside the mask.
+
+    Raises:
+        ValueError: wrong shape; square gradients whose determinant is not positive.
+    """
+    gradients = real_array(name, F)
+    d = grid.dimension
+    shape, (m, n) = gradients.shape[:-2], gradients.shape[-2:] if gradients.ndim >= 2 else (0, 0)
+    if shape != grid.shape or n != d or m < d:
+        expected = (*grid.shape, d, d)
+        raise ValueError(
+            f"{name}: got shape {gradients.shape}; expected (*grid.shape, d, d) = {expected}, one gradient per node, "
+            "or more rows than columns for a map into a space of more dimensions"
+        )
+    if m == d and not is_traced(gradients):
+        _require_positive_determinant(name, np.asarray(gradients, np.float64), grid)
+    inside = grid.inside[..., None, None]
+    safe = jnp.where(inside, gradients, jnp.eye(m, d, dtype=gradients.dtype))
+    return jnp.einsum("...ki,...kj->...ij", safe, safe, precision="highest")
+
+
+def _require_positive_determinant(name: str, gradients: Float[np.ndarray, "*shape d d"], grid: Grid) -> None:
+    finite = grid.inside & np.isfinite(gradients).all(axis=(-2, -1))  # others are refused with the metric
+    determinants = np.linalg.det(np.where(finite[..., None, None], gradients, np.eye(grid.dimension)))
+    bad = finite & (determinants <= 0)
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name}: {int(bad.sum())} of {int(grid.inside.sum())} gradients have a determinant that is not positive "
+            f"(the first at node {first}, {determinants[first]:.3g}); expected deformations that turn nothing inside "
+            f"out. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the grid's mask"
+        )
+
+
+PositiveMap = Literal["exp", "shift"]
+
+MAPS: dict[str, str] = {
+    "exp": "exp(S/s), s a stress of your choice",
+    "shift": "S + c·I, c above minus the least eigenvalue",
+}
+"""The choices, for messages."""
+
+NUMBERS = {"exp": "scale", "shift": "shift"}
+"""What the number of each map is called."""
+
+
+def checked_map(how: Any) -> PositiveMap:
+    """Return the name of a map; raise ValueError for any other."""
+    if how not in get_args(PositiveMap):
+        choices = " or ".join(f'"{name}" ({does})' for name, does in MAPS.items())
+        raise ValueError(f"how: got {how!r}; expected {choices}. There is no default: choose one")
+    return how
+
+
+def check_number(name: str, how: PositiveMap, number: Any) -> None:
+    """Raise ValueError unless it is a positive scale, or a finite shift; traced ones pass."""
+    if number is None:
+        raise ValueError(f"number: got None; expected the {NUMBERS[how]} of the map {how!r}, in the units of {name}")
+    require_number("number", number, above=0.0 if how == "exp" else -math.inf)
+
+
+def check_shift(name: str, tensors: Float[np.ndarray, "n d d"], how: PositiveMap, number: Any) -> None:
+    """Raise ValueError unless a shift is above minus the least eigenvalue of the tensors."""
+    least = least_eigenvalue(tensors)
+    if how == "shift" and not float(number) + least > 0:
+        raise ValueError(
+            f"number: got the shift {float(number):g} of {name} whose least eigenvalue is {least:g}; expected more "
+            f"than {-least:g}, so that S + c·I is positive definite"
+        )
+
+
+def check_mapped(
+    tensors: Float[np.ndarray, "n d d"], mapped: Float[np.ndarray, "n d d"], how: PositiveMap, number: Any
+) -> None:
+    """Raise ValueError where the metric that a map gave is singular in its precision."""
+    if not spd.is_spd(mapped).all():
+        values = np.linalg.eigvalsh(tensors.astype(np.float64))
+        raise ValueError(
+            f"number: got the {NUMBERS[how]} {float(number):g} of tensors whose eigenvalues go from {values.min():.4g} "
+            f"to {values.max():.4g}: the metric is singular in {mapped.dtype}; expected a larger number"
+        )
+
+
+def positive_map(
+    name: str, tensors: Float[Array, "*shape d d"], how: PositiveMap, number: Any, inside: Bool[np.ndarray, "*shape"]
+) -> Float[Array, "*shape d d"]:
+    """Return exp(S/s) or S + c·I of symmetric tensors S at the nodes of a grid; the identity outside.
+
+    Raises:
+        ValueError: NaN, infinite or unsymmetric tensors; a number that leaves some of them not positive definite.
+    """
+    check_number(name, how, number)
+    known = not is_traced((tensors, number))
+    if known:
+        require_finite_symmetric(name, np.asarray(tensors), inside, "node")
+        check_shift(name, np.asarray(tensors)[inside], how, number)
+    symmetric = spd.symmetrise(spd.identity_outside(tensors, inside))
+    number = jnp.asarray(number, tensors.dtype)
+    mapped = (
+        spd.exp(symmetric / number)
+        if how == "exp"
+        else symmetric + number * jnp.eye(tensors.shape[-1], dtype=tensors.dtype)
+    )
+    if known:
+        check_mapped(np.asarray(tensors)[inside], np.asarray(mapped)[inside], how, number)
+    return mapped

@@ -13,15 +13,17 @@ from jaxtyping import Array, Float
 from hks_jax.checks import real_array
 from hks_jax.describe import describe_array
 from hks_jax.domain import spd
-from hks_jax.domain.deformation import right_cauchy_green
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.indefinite import PositiveMap, checked_map, positive_map
 from hks_jax.domain.tensor_checks import (
     Interpolation,
     MetricChoice,
+    PositiveMap,
     check_metric_choice,
     checked_interpolation,
+    checked_map,
     checked_tensors,
+    positive_map,
+    right_cauchy_green,
 )
 
 

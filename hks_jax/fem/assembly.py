@@ -17,10 +17,9 @@ from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.fem.elements import Element, at_quadrature, element_matrices, simplex_element, tensor_product_element
-from hks_jax.fem.masks import couplings_for, mask_for
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.resolution import SampledMetric
-from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, couplings_for, grid_space, mask_for, mesh_space
 from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
 from hks_jax.linear.pattern import SparsePattern

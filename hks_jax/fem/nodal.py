@@ -9,9 +9,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.fem.halo import Slabs
-from hks_jax.fem.masks import mask_for
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import GridSpace
+from hks_jax.fem.space import GridSpace, mask_for
 from hks_jax.fem.stencil import Stencil, StencilOperator
 from hks_jax.linear.chebyshev import chebyshev_iteration
 from hks_jax.linear.operators import DiagonalOperator

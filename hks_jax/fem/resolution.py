@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import Interpolation
-from hks_jax.fem.masks import mask_for
-from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
+from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, mask_for
 
 
 class SampledMetric(eqx.Module):

@@ -19,7 +19,7 @@ from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.single_precision import residuals_of
 from hks_jax.inverse.unknowns import Unknowns, Values
-from hks_jax.signatures.tail import resolving
+from hks_jax.signatures.truncation import resolving
 
 TAIL = 1e-6
 """What part of the heat trace at the smallest time may lie beyond the pairs that are computed."""

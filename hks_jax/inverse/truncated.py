@@ -15,8 +15,7 @@ from hks_jax.fem.assembly import assemble
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.problem import TAIL, Problem, losses_of, pairs_below, unknowns_of
 from hks_jax.inverse.unknowns import Values
-from hks_jax.signatures.tail import resolving, truncation_map
-from hks_jax.signatures.truncation import truncation
+from hks_jax.signatures.truncation import resolving, truncation, truncation_map
 
 _NEAR = 0.1
 """A misfit is near to what truncation leaves where that is more than this part of it: a third of the residuals."""

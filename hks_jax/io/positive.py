@@ -4,8 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from hks_jax.domain.indefinite import NUMBERS, PositiveMap, check_mapped, check_number, check_shift, checked_map
-from hks_jax.domain.tensor_checks import require_finite_symmetric
+from hks_jax.domain.tensor_checks import (
+    NUMBERS,
+    PositiveMap,
+    check_mapped,
+    check_number,
+    check_shift,
+    checked_map,
+    require_finite_symmetric,
+)
 from hks_jax.io.repair import find_invalid, without_background
 from hks_jax.io.volume import TensorVolume
 

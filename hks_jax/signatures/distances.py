@@ -1,17 +1,20 @@
-"""Spectral distances and embeddings."""
+"""Spectral distances and embeddings, and the geodesic distance by Varadhan's formula."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.fem.space import FunctionSpace
 from hks_jax.signatures.filters import Filter, Heat, Power
-from hks_jax.signatures.spectral import source_indices, spectral_squared_distances
+from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_squared_distances
 from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
-from hks_jax.signatures.truncation import warn_if_truncated
+from hks_jax.signatures.truncation import truncation, warn_if_truncated
 from hks_jax.traced import is_traced
 
 
@@ -85,3 +88,121 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
         n = int((jax.lax.stop_gradient(pairs.eigenvalues) <= 0).sum())
     values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)[n:]
     return pairs.space.extend(pairs.vectors[n:] / jnp.sqrt(values[:, None]))
+
+
+MARGIN = 10.0
+"""How many times what lies beyond k a kernel must be: its logarithm is then off by at most about 0.1."""
+GRID_LIMIT = 0.1
+"""The largest relative error of a squared distance that the spacing may cause."""
+
+
+def varadhan_distance(
+    pairs: Eigenpairs, times: Any, sources: Any, normalised: bool = True
+) -> Float[Array, "n_times n_sources *shape"]:
+    """Estimate the geodesic distance by Varadhan's formula: d(x_s, x)² is the limit of −4t log k_t(x_s, x) as t → 0.
+
+    Varadhan 1967; Zobel, Reininghaus and Hotz, section 2. At a positive t the kernel is (4πt)^(−n/2) exp(−d²/4t)
+    (u₀ + O(t)) in n dimensions. Divided by its diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), it has no power of t
+    before it and is at most 1: the error of d² is −4t log u₀ + O(t²), none on a flat domain away from its sides. The
+    formula as it stands errs by 2nt log 4πt besides.
+
+    Small times need fine grids and many pairs. At the distance d linear elements err by d²h²/48t² of d² (h: the
+    distance of neighbours), so that t must be about d·h or more; and exp(−d²/4t) must stand out from what lies beyond k
+    and from rounding. Where the kernel's estimated error exceeds a tenth of it, or the grid's error of d² a tenth, the
+    result is NaN, not a guess. Larger times reach further, at the cost of an error that grows with t.
+
+    Args:
+        pairs: from `eigenpairs`; more of them reach further. Distances are those within the domain: around holes of its
+            mask, across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
+        times: (n_times,) positive, in (metric length)²; about d·h for distances d.
+        sources: node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers (n_sources,).
+        normalised: whether to divide by the diagonal. False is the formula as it stands, which depends on the unit of
+            length and has no root, NaN, where k_t > 1.
+
+    Returns:
+        (n_times, n_sources, *shape) in metric length; if normalised, 0 at the source. NaN outside the mask, at
+        Dirichlet nodes, and where times, pairs and grid do not resolve the distance.
+
+    Raises:
+        ValueError: bad times; sources out of range, outside the mask or at Dirichlet nodes.
+
+    Warns:
+        AccuracyWarning: how many distances are NaN, and what limits them; and as `hks`, times too small for k or
+            for the grid.
+    """
+    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    warn_if_truncated(pairs, times)
+    nodes, space = source_indices(pairs, sources), pairs.space
+    if not space.free.ravel()[nodes].all():
+        raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is zero; choose others")
+
+    # Zero, not NaN, outside the mask: as 0·NaN it would reach the derivatives.
+    kernel = jnp.where(space.domain, spectral_columns(pairs, Heat(times), nodes), 0)
+    diagonal = jnp.where(space.domain, spectral_diagonal(pairs, Heat(times)), 0)
+    scale = _broadcast(diagonal.reshape(times.size, -1)[:, nodes], space) * diagonal[:, None]
+    relative = kernel / jnp.sqrt(jnp.where(scale > 0, scale, 1))
+
+    by_pairs, by_grid = _least_kernels(pairs, times, nodes)
+    _warn_of_distance(pairs, times, relative, by_pairs, by_grid)
+    defined = relative > jnp.maximum(by_pairs, by_grid)
+    if normalised:
+        # At distance zero the root has no derivative, and rounding may leave the kernel just off 1: there it is set.
+        zero = (relative >= 1) | (np.arange(space.domain.size).reshape(space.node_shape) == _broadcast(nodes, space))
+    else:
+        relative, zero = kernel, kernel == 1
+        defined &= kernel <= 1
+    ratio = jnp.where(defined & ~zero, relative, jnp.exp(-1.0))
+    distance = jnp.sqrt(-4 * _broadcast(times[:, None], space) * jnp.log(ratio))
+    return jnp.where(defined, jnp.where(zero, 0, distance), jnp.nan)
+
+
+def _broadcast(values: Any, space: FunctionSpace) -> Any:
+    """Give values, one for each source or time, an axis of length one for each of the nodes'."""
+    return values.reshape(*values.shape, *[1] * len(space.node_shape))
+
+
+# What truncation, inexact eigenvectors and rounding leave in the normalised kernel is, by Cauchy and Schwarz, about
+# what they leave in the diagonal: the tail's share, and the mean of the residuals, weighted as in the trace.
+#
+# Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
+# kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴: of
+# first order in h² the squared distance errs by d²h² (d² − 4t)/48t². Lumped, it is −d²h² (d² − 12t)/48t².
+# Where it matters, d² is several t, and it is d²h²/48t² of d²: with d² = 4t log 1/k, h²/12t · log 1/k.
+def _least_kernels(
+    pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
+) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
+    """Return the least normalised kernel that the pairs resolve, and the least that the grid resolves."""
+    pairs, times = jax.lax.stop_gradient((pairs, times))
+    space, resolution = pairs.space, pairs.pencil.resolution
+    if resolution is None:
+        raise ValueError("pairs: the distance needs the spacing of nodes, which matrices from elsewhere do not have")
+    weights = jnp.where(pairs.kept, jnp.exp(-times[:, None] * pairs.eigenvalues), 0)
+    residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0), axis=1) / jnp.sum(weights, axis=1)
+    error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
+    at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
+    # The spacing along the way is not known: that at its ends, or the domain's mean if that is larger.
+    along = jnp.maximum(
+        jnp.maximum(at_nodes, _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
+    )
+    by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along)
+    return _broadcast(error[:, None], space), by_grid
+
+
+def _warn_of_distance(
+    pairs: Eigenpairs, times: Float[Array, " m"], relative: Array, by_pairs: Array, by_grid: Array
+) -> None:
+    """Warn (AccuracyWarning) of nodes that are too far, where values are concrete."""
+    relative, by_pairs, by_grid = jax.lax.stop_gradient((relative, by_pairs, by_grid))
+    if is_traced((relative, by_pairs, by_grid)):
+        return
+    free = pairs.space.free
+    too_small = ~np.asarray(relative > by_pairs)[..., free]
+    far = too_small | ~np.asarray(relative > by_grid)[..., free]
+    if far.any():
+        worst = int(np.argmax(far.mean(axis=(1, 2))))
+        remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
+        warn_of_accuracy(
+            f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
+            f"{float(times[worst]):.4g}: so far from a source the heat kernel is not resolved. Use larger times, or "
+            f"{remedy}"
+        )

@@ -1,14 +1,17 @@
-"""Heat flow of functions on a domain."""
+"""Heat flow of functions on a domain, and the scale space that it makes."""
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.ndimage import gaussian_filter1d
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import checked_times, require_real
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import spectral_flow
@@ -73,3 +76,80 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
             f"times: the heat flow at t = {float(jnp.min(times)):.4g} lacks up to {left:.1%} of a function's norm, "
             f"which lies beyond the computed eigenpairs. Use times from about {enough:.4g}, or more eigenpairs",
         )
+
+
+def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape"]]:
+    """Return the trace, the determinant and the anisotropy of the tensors at the nodes.
+
+    The anisotropy is (λ₁ − λ₂)/(λ₁ + λ₂) in 2D and the fractional anisotropy (Basser and Pierpaoli 1996) in 3D, both 0
+    for multiples of the identity and below 1.
+
+    Args:
+        field: the tensors on a grid. Of an array T (*shape, d, d) take ``TensorField(Grid(shape), T)``; of diffusion
+            tensors D, whose invariants are not those of the metric, ``TensorField(grid, D)`` or
+            ``from_diffusion(grid, D, "tensor")``.
+
+    Returns:
+        ``"trace"``, ``"determinant"`` and ``"anisotropy"``, each (*shape), NaN outside the mask; on the host.
+
+    Raises:
+        TypeError: anything but a field.
+    """
+    if not isinstance(field, TensorField):
+        raise TypeError(
+            f"field: got {type(field).__name__}; expected hks_jax.TensorField. Of an array T (*shape, d, d) pass "
+            "TensorField(Grid(shape), T)"
+        )
+    tensors = np.asarray(field.domain_tensors, np.float64)
+    d = field.grid.dimension
+    trace = np.trace(tensors, axis1=-2, axis2=-1)
+    deviator = tensors - trace[..., None, None] / d * np.eye(d)
+    size = np.sum(np.square(deviator), axis=(-2, -1))
+    scale = np.square(trace) / 2 if d == 2 else np.sum(np.square(tensors), axis=(-2, -1)) / 1.5
+    scalars = {"trace": trace, "determinant": np.linalg.det(tensors), "anisotropy": np.sqrt(size / scale)}
+    return {name: np.where(field.grid.inside, values, np.nan) for name, values in scalars.items()}
+
+
+def gaussian_scale_space(
+    field: TensorField, times: Any, functions: Any
+) -> Float[np.ndarray, "n_times *functions_and_shape"]:
+    """Blur functions by Gaussians, the same in all directions and everywhere, as far as heat spreads on average.
+
+    Heat that diffuses for the time t in a flat metric s·I has the standard deviation √(2t/s) in coordinates; here s is
+    the mean of |T|^(1/d) over the domain. Masks are kept by dividing by the blurred mask, and reflection continues the
+    functions beyond the sides of the grid: a constant stays what it is.
+
+    Args:
+        field: the metric, for its scale, its grid and its mask.
+        times: (n_times,) positive, in (metric length)².
+        functions: (*shape), or several (…, *shape); values outside the mask are not used.
+
+    Returns:
+        (n_times, *functions.shape), NaN outside the mask; on the host.
+
+    Raises:
+        ValueError: times that are not positive; functions of another shape.
+    """
+    grid, d = field.grid, field.grid.dimension
+    require_real("times", times)
+    require_real("functions", functions)
+    t, u = np.asarray(times, np.float64), np.asarray(functions, np.float64)
+    if t.ndim != 1 or not (np.isfinite(t) & (t > 0)).all():
+        raise ValueError(f"times: got {times}; expected a vector of positive numbers")
+    if u.shape[u.ndim - d :] != grid.shape:
+        raise ValueError(f"functions: got shape {u.shape}; expected {grid.shape}, or more axes before it")
+    inside = grid.inside
+    determinant = np.linalg.det(np.asarray(field.domain_tensors, np.float64)[inside])
+    scale = float(np.mean(determinant ** (1 / d)))
+    blurred = [_blur(np.where(inside, u, 0), inside, math.sqrt(2 * one / scale), grid.spacing) for one in t]
+    return np.where(inside, np.stack(blurred), np.nan)
+
+
+def _blur(u: np.ndarray, inside: np.ndarray, sigma: float, spacing: tuple[float, ...]) -> np.ndarray:
+    weight = inside.astype(float)
+    for axis, h in enumerate(spacing):
+        # Three times the side, and nothing varies any more; wider kernels only take longer.
+        nodes = min(sigma / h, 3.0 * inside.shape[axis])
+        weight = gaussian_filter1d(weight, nodes, axis=axis, mode="mirror")
+        u = gaussian_filter1d(u, nodes, axis=axis - len(spacing), mode="mirror")
+    return u / np.where(inside, weight, 1)

@@ -1,17 +1,21 @@
-"""The heat kernel, its trace, and the scale-invariant signature."""
+"""Signatures of one filter each: heat kernel, trace, scale-invariant, wave kernel, and functions of your own."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import checked_times
+from hks_jax.checks import checked_times, require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.signatures.filters import Derivative, Heat
+from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import positive_range, require_pairs
+from hks_jax.signatures.times import default_energies, positive_range, require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
+from hks_jax.traced import is_traced
 
 
 def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:
@@ -79,3 +83,81 @@ def scale_invariant_hks(
     # d/dτ at t = exp τ is t d/dt, known in closed form: no differences needed.
     slope = spectral_diagonal(pairs, Derivative(Heat(times), Heat(times))) / signature
     return jnp.abs(jnp.fft.rfft(slope, axis=0))[:n_frequencies] / times.size
+
+
+def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Array, "n_energies *shape"]:
+    """Compute the wave kernel signature (Aubry, Schlickewei and Cremers 2011, eq. 9).
+
+    WKS(e, x) = Σᵢ φᵢ(x)² exp(−(e − log λᵢ)²/2σ²) / Σᵢ exp(−(e − log λᵢ)²/2σ²) over the positive λᵢ.
+
+    Args:
+        pairs: from `eigenpairs`.
+        energies: (n,) values of log λ; default: `default_energies`, 100 of them.
+        sigma: the width σ > 0 in log λ; default: the one that belongs to the default energies.
+
+    Returns:
+        (n_energies, *shape) in 1/(metric length)^d; NaN outside the mask.
+
+    Raises:
+        ValueError: only one of energies and sigma given, wrong shape, sigma ≤ 0, no positive eigenvalue.
+    """
+    if (energies is None) != (sigma is None):
+        raise ValueError("energies, sigma: give both or neither; `default_energies(pairs, n)` returns a pair of them")
+    positive_range(pairs)
+    if energies is None:
+        energies, sigma = default_energies(pairs)
+    require_real("energies", energies)
+    require_real("sigma", sigma)
+    energies, sigma = (jnp.asarray(value, pairs.eigenvalues.dtype) for value in (energies, sigma))
+    if energies.ndim != 1 or energies.size == 0 or (not is_traced(energies) and not np.isfinite(energies).all()):
+        raise ValueError(f"energies: got {energies}; expected a non-empty 1-D array of finite values of log λ")
+    if sigma.ndim != 0:
+        raise ValueError(f"sigma: got shape {sigma.shape}; expected one positive width in log λ")
+    require_number("sigma", sigma)
+    # The largest exponent is taken out of both sums: they do not underflow far outside of the spectrum.
+    offset = _largest_exponents(*jax.lax.stop_gradient((energies, sigma, pairs.eigenvalues, pairs.kept)))
+    bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
+    return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
+
+
+@jax.jit
+def _largest_exponents(
+    energies: Float[Array, " n"], sigma: Float[Array, ""], values: Float[Array, " k"], kept: Bool[Array, " k"]
+) -> Float[Array, " n"]:
+    positive = kept & (values > 0)
+    logs = jnp.log(jnp.where(positive, values, 1))
+    exponents = jnp.where(positive, -jnp.square((energies[:, None] - logs) / sigma) / 2, -jnp.inf)
+    return jnp.max(exponents, axis=1)
+
+
+def spectral_signature(
+    pairs: Eigenpairs, function: Callable[[Any, Array], Array], parameters: Any, sources: Any = None
+) -> Float[Array, "m *shape"]:
+    """Compute Σᵢ f(θ, λᵢ) φᵢ(x)², or with sources Σᵢ f(θ, λᵢ) φᵢ(x_s) φᵢ(x), for any f and each of m parameters θ.
+
+    The heat kernel signature is ``spectral_signature(pairs, lambda t, x: jnp.exp(-t * x), times)``. Derivatives with
+    respect to the tensors and to θ are exact at eigenvalues of any multiplicity.
+
+    Args:
+        pairs: from `eigenpairs`.
+        function: maps (θ, λ) to f, elementwise in λ (any shape), differentiable by JAX on λ > 0. What is traced must
+            come in by θ and not by closure. Every new function object compiles anew: define it once.
+        parameters: θ, a pytree of floating point arrays with a leading axis m.
+        sources: None for the diagonal; else node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers.
+
+    Returns:
+        (m, *shape), or (m, n_sources, *shape) with sources; NaN outside the mask.
+
+    Raises:
+        ValueError: parameters without a common leading axis; bad sources.
+    """
+    dtype = require_pairs(pairs).eigenvalues.dtype
+    require_real("parameters", parameters)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
+    shapes = [leaf.shape for leaf in jax.tree.leaves(parameters)]
+    if not shapes or len({shape[:1] for shape in shapes}) != 1 or not all(shapes):
+        raise ValueError(f"parameters: got leaves of shapes {shapes}; expected a common leading axis, one entry per f")
+    filters = Custom(function, parameters)
+    if sources is None:
+        return spectral_diagonal(pairs, filters)
+    return spectral_columns(pairs, filters, source_indices(pairs, sources))
