@@ -115,12 +115,7 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     yield "making room", nodes, k, lambda: (jax.jit(partial(make_room, plan), donate_argnums=0), (state,))
     yield "trial of it", nodes, k, lambda: (try_out, (factor, pencil, shift, state.noise))
     yield "decisions", nodes, k, lambda: (consider, (problem, factor.negative, trial, apart))
-    yield (
-        "window",
-        nodes,
-        k,
-        lambda: (lambda *given: slicing._window(given[0], plan, given[1], plan.window), (problem, state)),
-    )
+    yield "window", nodes, k, lambda: (look, (problem, state))
     yield "first block", nodes, k, lambda: (begin, (pencil, state.start, known))
     yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, (window.low, window.high), apart))
     order = jax.ShapeDtypeStruct((plan.ritz,), int)
