@@ -117,7 +117,7 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     yield "decisions", nodes, k, lambda: (consider, (problem, factor.negative, trial, apart))
     yield "window", nodes, k, lambda: (look, (problem, state))
     yield "first block", nodes, k, lambda: (begin, (pencil, state.start, known))
-    yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, (window.low, window.high), apart))
+    yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, window[1], apart))
     order = jax.ShapeDtypeStruct((plan.ritz,), int)
     store = jax.jit(slicing._stored, donate_argnums=0)
     yield "storing", nodes, k, lambda: (store, (state.vectors, ritz[1], order, state.known))
