@@ -163,9 +163,9 @@ def tangents_of(
     eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
-    gap = eigenvalues[:, None] - values
+    gap = eigenvalues[:, None] - values[None]
     above = values - jnp.nanmin(values)
-    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(above[:k, None], above)
+    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(above[:k, None], above[None])
     apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
     inverse = jnp.where(apart, 1 / jnp.where(apart, gap, 1), 0)
     # Apart from the guards: reverse mode of the frame needs the product with these alone.

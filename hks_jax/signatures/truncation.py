@@ -15,6 +15,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.masks import mask_for
 from hks_jax.fem.resolution import Resolution
+from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import sum_of
 from hks_jax.signatures.tail import beyond_by_weyl, resolving
@@ -77,6 +78,7 @@ class Truncation(eqx.Module):
         return messages
 
 
+@nan_is_meant
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:
     """Estimate what k pairs and the node spacing leave out of the signature at each time.
 
