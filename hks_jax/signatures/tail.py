@@ -39,7 +39,7 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     x = jnp.maximum(x, 1e-3)  # nothing overflows
     count, exponent = (jnp.expand_dims(each, tuple(range(x.ndim - each.ndim))) for each in (count, exponent))
 
-    def add(total: Array, node: tuple[Array, Array]) -> tuple[Array, None]:
+    def add(total: Array, node: tuple[Array, ...]) -> tuple[Array, None]:
         point, weight = node
         return total + weight * jnp.exp((exponent - 1) * jnp.log1p(point / x)), None
 
