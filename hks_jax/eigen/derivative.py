@@ -313,9 +313,9 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     size = jnp.maximum(jnp.abs(values), values - values[:1])
     rounding = jnp.stack([indistinct(each, values.dtype) for each in pencil.parts]).max()
     least = jnp.maximum(jnp.sqrt(jnp.finfo(values.dtype).eps) * size, rounding)
-    near = jnp.abs(values[:, None] - values) <= least[:, None]
+    near = jnp.abs(values[:, None] - values[None]) <= least[:, None]
     if part is not None:
-        near &= part[:, None] == part
+        near &= part[:, None] == part[None]
     fixed = (values == 0) & (pencil.parts[0].n_fixed > 0)  # no perturbation moves or mixes them
     multiple = (jnp.sum(near, axis=1) > 1) & ~fixed | (following - values <= least) | ~kept
 

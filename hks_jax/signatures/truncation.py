@@ -148,9 +148,9 @@ def _resolution_bias(
 ) -> tuple[Float[Array, "n nodes"], Float[Array, "n nodes"]]:
     """Return the estimated relative error by the spacing, and its part that does not fall with t; 0 at other nodes."""
     turning, dispersion = (jnp.where(free, x, 0).ravel() for x in (resolution.turning, resolution.dispersion))
-    lasting = slope[:, None] * turning + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
+    lasting = slope[:, None] * turning[None] + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
     lasting = jnp.where(free.ravel(), lasting, 0)
-    both = jnp.hypot(dispersion / times[:, None], lasting)
+    both = jnp.hypot(dispersion[None] / times[:, None], lasting)
     # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 

@@ -75,7 +75,8 @@ def varadhan_distance(
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
         # At distance zero the root has no derivative, and rounding may leave the kernel just off 1: there it is set.
-        zero = (relative >= 1) | (np.arange(space.domain.size).reshape(space.node_shape) == _broadcast(nodes, space))
+        numbers = np.arange(space.domain.size).reshape(1, *space.node_shape)
+        zero = (relative >= 1) | (numbers == _broadcast(nodes, space))[None]
     else:
         relative, zero = kernel, kernel == 1
         defined &= kernel <= 1
@@ -110,9 +111,9 @@ def _least_kernels(
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
     # The spacing along the way is not known: that at its ends, or the domain's mean if that is larger.
     along = jnp.maximum(
-        jnp.maximum(at_nodes, _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
+        jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )
-    by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along)
+    by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along[None])
     return _broadcast(error[:, None], space), by_grid
 
 
