@@ -6,11 +6,13 @@ from functools import partial
 import jax
 from jaxtyping import Array, Float
 
-from hks_jax.curvature.jet import metric_jet, nan_outside, wraps_per_axis
+from hks_jax.curvature.jet import metric_jet, wraps_per_axis
 from hks_jax.curvature.riemann import scalar
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.nan_outside import nan_is_meant, nan_outside
 
 
+@nan_is_meant
 def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the scalar curvature R of a metric at the nodes; on a surface it is 2K, K the Gaussian curvature.
 

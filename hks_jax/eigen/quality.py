@@ -39,9 +39,9 @@ def measure_pairs(
         if values is not None and vectors.dtype == jnp.float32:
             first = jnp.maximum(start + size - width, 0)
             products = products_with_columns(jax.lax.dynamic_slice_in_dim(vectors, first, width), image)
-            before = first + jnp.arange(width)[:, None] < start + jnp.arange(size)
+            before = first + jnp.arange(width)[:, None] < start + jnp.arange(size)[None]
             twice = jnp.any(before & (jnp.abs(products) > _ALIKE), axis=0)
-        residuals = jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
+        residuals = jnp.linalg.norm(force - quotients[None] * image, axis=0) / jnp.linalg.norm(image, axis=0)
         return quotients, residuals, twice
 
     return jax.tree.map(lambda of_blocks: of_blocks[place], jax.lax.map(measure, jnp.asarray(starts)))

@@ -134,7 +134,7 @@ def _swept(
     """Sweep the block whose rows begin with number ``at``, given its inverse."""
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
     inside = (index >= at) & (index < at + rows.shape[1])
-    rows = jnp.where(inside, -(index == own[:, None]).astype(a.dtype), rows)
+    rows = jnp.where(inside, -(index[None] == own[:, None]).astype(a.dtype), rows)
     change = batched(transposed(rows), batched(inverses, rows))
     return jnp.where(inside, 0, jnp.where(inside[:, None], 0, a)) - change
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral import source_indices, spectral_squared_distances
 from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
@@ -31,6 +32,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     return _distance(pairs, Heat(2 * times), sources)
 
 
+@nan_is_meant
 def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sources *shape"]:
     """Compute the biharmonic distance d(x_s, x)² = Σᵢ (φᵢ(x_s) − φᵢ(x))² / λᵢ² over λᵢ > 0 (Lipman et al. 2010).
 
@@ -58,7 +60,7 @@ def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, 
     squared = spectral_squared_distances(pairs, filters, source_indices(pairs, sources))
     # The root has no derivative at distance zero; there the distance is set, with derivative zero.
     root = jnp.sqrt(jnp.where(squared == 0, 1, squared))
-    return jnp.where(pairs.space.domain, jnp.where(squared == 0, 0, root), jnp.nan)
+    return nan_outside(jnp.where(squared == 0, 0, root), pairs.space.domain)
 
 
 def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
@@ -71,7 +73,7 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
         dimension = dimension_of(pairs, "ShapeDNA that is normalised")
         values = values * volume_of(pairs, "ShapeDNA that is normalised") ** (2 / dimension)
     # NaN comes last: as 0·NaN it would reach the volume's derivative.
-    return jnp.where(pairs.kept, values, jnp.nan)
+    return nan_outside(values, pairs.kept)
 
 
 def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
@@ -83,5 +85,5 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
     n = pairs.n_null  # raises where that is not known
     if not pairs.null_space_known:  # negative ones come first
         n = int((jax.lax.stop_gradient(pairs.eigenvalues) <= 0).sum())
-    values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)[n:]
-    return pairs.space.extend(pairs.vectors[n:] / jnp.sqrt(values[:, None]))
+    scaled = pairs.vectors[n:] / jnp.sqrt(jnp.where(pairs.kept, pairs.eigenvalues, 1)[n:, None])
+    return pairs.space.extend(nan_outside(scaled, pairs.kept[n:, None]))

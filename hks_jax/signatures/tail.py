@@ -14,6 +14,7 @@ from scipy.special import gammainccinv
 
 from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import spectral_diagonal
 from hks_jax.signatures.times import require_pairs
@@ -36,9 +37,15 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     To 1e-3 from x = 0.1 on, to 1e-7 from x = 1 on, for exponents from ½ to 8; x below 1e-3 counts as that.
     """
     x = jnp.maximum(x, 1e-3)  # nothing overflows
-    points, weights = (jnp.asarray(each, x.dtype) for each in (_POINTS, _WEIGHTS))
-    powers = jnp.exp((exponent - 1)[..., None] * jnp.log1p(points / x[..., None]))
-    return count * exponent / x * jnp.exp(-x) * jnp.sum(weights * powers, axis=-1)
+    count, exponent = (jnp.expand_dims(each, tuple(range(x.ndim - each.ndim))) for each in (count, exponent))
+
+    def add(total: Array, node: tuple[Array, ...]) -> tuple[Array, None]:
+        point, weight = node
+        return total + weight * jnp.exp((exponent - 1) * jnp.log1p(point / x)), None
+
+    nodes = tuple(jnp.asarray(each, x.dtype) for each in (_POINTS, _WEIGHTS))
+    integral, _ = jax.lax.scan(add, jnp.zeros(jnp.broadcast_shapes(x.shape, exponent.shape), x.dtype), nodes)
+    return count * exponent / x * jnp.exp(-x) * integral
 
 
 # For a = 1 the integral is 1, for a = 3/2, by parts, 1 + (√π/2) erfc(√x) e^x/√x.
@@ -54,6 +61,7 @@ def resolving(share: float, dimension: int) -> float:
     return float(gammainccinv(dimension / 2, share))
 
 
+@nan_is_meant
 def truncation_map(
     pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n_times"]
 ) -> Float[Array, "n_times *shape"]:

@@ -15,6 +15,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.masks import mask_for
 from hks_jax.fem.resolution import Resolution
+from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import sum_of
 from hks_jax.signatures.tail import beyond_by_weyl, resolving
@@ -77,6 +78,7 @@ class Truncation(eqx.Module):
         return messages
 
 
+@nan_is_meant
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:
     """Estimate what k pairs and the node spacing leave out of the signature at each time.
 
@@ -146,9 +148,9 @@ def _resolution_bias(
 ) -> tuple[Float[Array, "n nodes"], Float[Array, "n nodes"]]:
     """Return the estimated relative error by the spacing, and its part that does not fall with t; 0 at other nodes."""
     turning, dispersion = (jnp.where(free, x, 0).ravel() for x in (resolution.turning, resolution.dispersion))
-    lasting = slope[:, None] * turning + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
+    lasting = slope[:, None] * turning[None] + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
     lasting = jnp.where(free.ravel(), lasting, 0)
-    both = jnp.hypot(dispersion / times[:, None], lasting)
+    both = jnp.hypot(dispersion[None] / times[:, None], lasting)
     # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 

@@ -11,6 +11,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.nan_outside import nan_outside
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal
 from hks_jax.signatures.times import require_pairs
@@ -74,13 +75,14 @@ def varadhan_distance(
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
         # At distance zero the root has no derivative, and rounding may leave the kernel just off 1: there it is set.
-        zero = (relative >= 1) | (np.arange(space.domain.size).reshape(space.node_shape) == _broadcast(nodes, space))
+        numbers = np.arange(space.domain.size).reshape(1, *space.node_shape)
+        zero = (relative >= 1) | (numbers == _broadcast(nodes, space))[None]
     else:
         relative, zero = kernel, kernel == 1
         defined &= kernel <= 1
     ratio = jnp.where(defined & ~zero, relative, jnp.exp(-1.0))
     distance = jnp.sqrt(-4 * _broadcast(times[:, None], space) * jnp.log(ratio))
-    return jnp.where(defined, jnp.where(zero, 0, distance), jnp.nan)
+    return nan_outside(jnp.where(zero, 0, distance), defined)
 
 
 def _broadcast(values: Any, space: FunctionSpace) -> Any:
@@ -103,15 +105,15 @@ def _least_kernels(
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
         raise ValueError("pairs: the distance needs the spacing of nodes, which matrices from elsewhere do not have")
-    weights = jnp.where(pairs.kept, jnp.exp(-times[:, None] * pairs.eigenvalues), 0)
-    residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0), axis=1) / jnp.sum(weights, axis=1)
+    weights = jnp.where(pairs.kept[None], jnp.exp(-times[:, None] * pairs.eigenvalues[None]), 0)
+    residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
     # The spacing along the way is not known: that at its ends, or the domain's mean if that is larger.
     along = jnp.maximum(
-        jnp.maximum(at_nodes, _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
+        jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )
-    by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along)
+    by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along[None])
     return _broadcast(error[:, None], space), by_grid
 
 
