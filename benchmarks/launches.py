@@ -115,14 +115,9 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     yield "making room", nodes, k, lambda: (jax.jit(partial(make_room, plan), donate_argnums=0), (state,))
     yield "trial of it", nodes, k, lambda: (try_out, (factor, pencil, shift, state.noise))
     yield "decisions", nodes, k, lambda: (consider, (problem, factor.negative, trial, apart))
-    yield (
-        "window",
-        nodes,
-        k,
-        lambda: (lambda *given: slicing._window(given[0], plan, given[1], plan.window), (problem, state)),
-    )
+    yield "window", nodes, k, lambda: (look, (problem, state))
     yield "first block", nodes, k, lambda: (begin, (pencil, state.start, known))
-    yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, (window.low, window.high), apart))
+    yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, window[1], apart))
     order = jax.ShapeDtypeStruct((plan.ritz,), int)
     store = jax.jit(slicing._stored, donate_argnums=0)
     yield "storing", nodes, k, lambda: (store, (state.vectors, ritz[1], order, state.known))

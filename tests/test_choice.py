@@ -7,7 +7,7 @@ import pytest
 from fields import flat
 
 import hks_jax as hj
-from hks_jax.eigen import choice
+from hks_jax.eigen import automatic
 from hks_jax.eigen.automatic import choose_for_fit, choose_solver
 
 
@@ -55,7 +55,7 @@ QUICK = ("dense", "block-lanczos")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in CASES])
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_the_jitted_gradient_of_the_default_has_no_callback(monkeypatch, name, dtype):
-    monkeypatch.setattr(choice, "_SMALL", SMALL)
+    monkeypatch.setattr(automatic, "_SMALL", SMALL)
     function, shape, k = CASES[name]
     if shape is None:
         values = hj.examples.bumpy_torus_mesh(16).vertices

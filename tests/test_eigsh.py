@@ -14,6 +14,7 @@ from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import hks_jax as hj
+from hks_jax.eigen.quality import quality
 
 SOLVER = hj.BlockLanczos(block=4)
 
@@ -221,6 +222,77 @@ def test_more_copies_than_a_block_has_columns():
     for solve in (hj.eigsh, eqx.filter_jit(hj.eigsh)):
         pairs = solve(held, k=36, solver=hj.BlockLanczos())
         check(pairs, K, None, exact)
+
+
+def laplacian(edges) -> sp.csr_matrix:
+    edges = sp.csr_matrix(edges)
+    return (sp.diags(np.asarray(edges.sum(axis=1)).ravel()) - edges).tocsr()
+
+
+def star(n: int) -> sp.csr_matrix:
+    ends = np.zeros(n - 1, int), np.arange(1, n)
+    return laplacian(sp.coo_matrix((np.ones(2 * n - 2), np.c_[ends, ends[::-1]]), (n, n)))
+
+
+def isolated(n: int, m: int) -> sp.csr_matrix:
+    """The Laplacian of n vertices without an edge, and of a random graph of m."""
+    edges = sp.random(m, m, 4 / m, random_state=0) > 0
+    return laplacian(sp.block_diag([sp.csr_matrix((n, n)), (edges + edges.T).astype(float)]))
+
+
+def paths(count: int, length: int) -> sp.csr_matrix:
+    ones = np.ones(length - 1)
+    return sp.kron(sp.eye(count), laplacian(sp.diags([ones, ones], [1, -1]))).tocsr()
+
+
+SIMPLE_SPECTRA = {
+    "one far below a bulk": (lambda: sp.diags(np.append(0.5, np.linspace(1, 2, 1999))).tocsr(), 6),
+    "three hardly below a bulk": (lambda: sp.diags(np.append([1 - 7e-5] * 3, np.linspace(1, 2, 997))).tocsr(), 6),
+    "nothing but zero": (lambda: sp.csr_matrix((300, 300)), 6),
+    "a star": (lambda: star(401), 6),
+    "isolated vertices": (lambda: isolated(80, 500), 6),
+    "a complete graph": (lambda: laplacian(np.ones((200, 200))), 6),
+    "as many as there are components": (lambda: paths(40, 20), 40),
+    "six rigid modes alone": (lambda: elastic_body(), 6),
+}
+
+
+@pytest.mark.filterwarnings("ignore:k = 6 cuts a multiple eigenvalue")
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in ("a star", "nothing but zero") else pytest.mark.slow) for n in SIMPLE_SPECTRA],
+)
+def test_spectra_that_are_hard_for_lanczos_alone(name):
+    """Wide gaps, few different eigenvalues, many copies, and nothing but zeros, of which no size is known."""
+    given, k = SIMPLE_SPECTRA[name]
+    K, M = given() if name.startswith("six") else (given(), None)
+    exact = scipy.linalg.eigh(K.toarray(), None if M is None else M.toarray(), eigvals_only=True)
+    pairs = hj.eigsh(K, M, k, solver=hj.BlockLanczos())
+    np.testing.assert_allclose(pairs.eigenvalues, exact[:k], atol=1e-11 * max(exact[-1], 1))
+    weighted = np.asarray(pairs.vectors) if M is None else (M @ np.asarray(pairs.vectors).T).T
+    np.testing.assert_allclose(pairs.vectors @ weighted.T, np.eye(k), atol=1e-9)
+    assert pairs.result == hj.RESULTS.successful
+
+
+def test_a_vector_found_twice_has_not_converged(rng):
+    pencil, k = hj.sparse_pencil(lattice(12).astype(np.float32)), 13
+    pairs = hj.eigsh(pencil, k=k)
+    vectors = pairs.vectors.at[9].set(pairs.vectors[8])
+    _, converged, _ = quality(pencil, pairs.eigenvalues, vectors, pairs.eigenvalues[1], 1.0)
+    np.testing.assert_array_equal(converged, np.arange(k) != 9)
+
+
+@pytest.mark.slow
+def test_in_float32_none_is_missing_though_as_many_are_found():
+    """Once two rows were equal, an eigenvalue missing, and the pairs certified."""
+    n = 4 * 287
+    line = sp.diags([-1.0, 2, -1], [-1, 0, 1], shape=(287, 287))
+    factor = sp.random(n, n, 1 / n, random_state=3)
+    K, M = (m.tocsr().astype(np.float32) for m in (sp.kron(sp.eye(4), line), factor @ factor.T + sp.eye(n)))
+    exact = scipy.linalg.eigh(K.toarray().astype(float), M.toarray(), eigvals_only=True)[:41]
+    pairs = hj.eigsh(K, M, 41, solver=hj.BlockLanczos())
+    np.testing.assert_allclose(pairs.eigenvalues, exact, atol=1e-5)
+    np.testing.assert_allclose(pairs.vectors @ (M @ np.asarray(pairs.vectors).T), np.eye(41), atol=1e-4)
 
 
 @pytest.mark.slow

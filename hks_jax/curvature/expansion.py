@@ -18,7 +18,6 @@ from hks_jax.curvature.jet import (
     inner,
     metric_function,
     metric_jet,
-    nan_outside,
     nodal_jet,
     wraps_per_axis,
 )
@@ -26,6 +25,7 @@ from hks_jax.curvature.laplace_beltrami import laplacian
 from hks_jax.curvature.volume_coefficients import volume_coefficients
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.nan_outside import nan_is_meant, nan_outside
 
 Invariants: TypeAlias = tuple[Array, ...]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
@@ -35,6 +35,7 @@ HIGHEST_ORDER = {2: 3, 3: 2}
 """The last coefficient that is known here, by dimension."""
 
 
+@nan_is_meant
 def hks_expansion(
     field: TensorField, times: Any, order: int | None = None, periodic: bool | Sequence[bool] = False
 ) -> Float[Array, "n_times *shape"]:
@@ -98,7 +99,7 @@ def _hks_expansion(
     t = jnp.expand_dims(times, tuple(range(1, d + 1))).astype(coefficients[0].dtype)
     series = jnp.zeros_like(t)
     for u in reversed(coefficients):
-        series = series * t + u
+        series = series * t + u[None]
     return nan_outside(series / (4 * jnp.pi * t) ** (d / 2), known)
 
 

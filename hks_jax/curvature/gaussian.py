@@ -6,12 +6,14 @@ from functools import partial
 import jax
 from jaxtyping import Array, Float
 
-from hks_jax.curvature.jet import Jet, metric_jet, nan_outside, wraps_per_axis
+from hks_jax.curvature.jet import Jet, metric_jet, wraps_per_axis
 from hks_jax.curvature.volume_coefficients import riemann, scalar
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.nan_outside import nan_is_meant, nan_outside
 
 
+@nan_is_meant
 def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the scalar curvature R of a metric at the nodes; on a surface it is 2K, K the Gaussian curvature.
 
@@ -37,6 +39,7 @@ def _scalar_curvature(field: TensorField, wraps: tuple[bool, ...]) -> Float[Arra
     return nan_outside(scalar(metric), known)
 
 
+@nan_is_meant
 def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
 

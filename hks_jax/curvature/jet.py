@@ -202,13 +202,6 @@ def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[: grid.size].reshape(*grid.shape, *a.shape[2:]), values)
 
 
-def nan_outside(
-    values: Float[Array, "*leading_and_shape"], known: Bool[np.ndarray, "*shape"]
-) -> Float[Array, "*leading_and_shape"]:
-    """Put NaN where a value is not known."""
-    return values if known.all() else jnp.where(known, values, jnp.nan)
-
-
 def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[bool, ...]:
     """Return which axes are periodic.
 

@@ -17,14 +17,15 @@ from hks_jax.curvature.jet import (
     domain_nodes,
     function_jet,
     metric_jet,
-    nan_outside,
     nodal_jet,
     wraps_per_axis,
 )
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.nan_outside import nan_is_meant, nan_outside
 
 
+@nan_is_meant
 def laplace_beltrami(
     field: TensorField,
     f: Float[Array, "*shape"] | Callable[[Array], Array],

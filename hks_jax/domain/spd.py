@@ -103,7 +103,7 @@ _SQUARINGS, _TERMS = 8, 20
 
 def _exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     d, tensors = tensors.shape[-1], symmetrise(tensors)
-    eye = jnp.eye(d, dtype=tensors.dtype)
+    eye = jnp.broadcast_to(jnp.eye(d, dtype=tensors.dtype), tensors.shape)
     mean = jnp.trace(tensors, axis1=-2, axis2=-1) / d
     deviator = tensors - mean[..., None, None] * eye
     powers, coefficients = (_exp_in_2d if d == 2 else _exp_in_3d)(deviator)
@@ -153,7 +153,7 @@ def log(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 # T = mI + S, tr S = 0, S² = qI, has the eigenvalues m ± √q, so that log T = ½ log|T| I + atanh(√q/m)/√q S, and
 # atanh(x)/x is a smooth function of x² = q/m².
 def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
-    eye = jnp.eye(2, dtype=tensors.dtype)
+    eye = jnp.broadcast_to(jnp.eye(2, dtype=tensors.dtype), tensors.shape)
     mean = jnp.trace(tensors, axis1=-2, axis2=-1) / 2
     scaled = tensors / mean[..., None, None]
     deviator = scaled - eye

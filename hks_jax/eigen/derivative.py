@@ -163,9 +163,9 @@ def tangents_of(
     eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
-    gap = eigenvalues[:, None] - values
+    gap = eigenvalues[:, None] - values[None]
     above = values - jnp.nanmin(values)
-    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(above[:k, None], above)
+    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(above[:k, None], above[None])
     apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
     inverse = jnp.where(apart, 1 / jnp.where(apart, gap, 1), 0)
     # Apart from the guards: reverse mode of the frame needs the product with these alone.
@@ -313,9 +313,9 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     size = jnp.maximum(jnp.abs(values), values - values[:1])
     rounding = jnp.stack([indistinct(each, values.dtype) for each in pencil.parts]).max()
     least = jnp.maximum(jnp.sqrt(jnp.finfo(values.dtype).eps) * size, rounding)
-    near = jnp.abs(values[:, None] - values) <= least[:, None]
+    near = jnp.abs(values[:, None] - values[None]) <= least[:, None]
     if part is not None:
-        near &= part[:, None] == part
+        near &= part[:, None] == part[None]
     fixed = (values == 0) & (pencil.parts[0].n_fixed > 0)  # no perturbation moves or mixes them
     multiple = (jnp.sum(near, axis=1) > 1) & ~fixed | (following - values <= least) | ~kept
 

@@ -147,7 +147,7 @@ class Eigenpairs(eqx.Module):
     def last_eigenvalue(self) -> Float[Array, ""]:
         """The largest eigenvalue that is kept; NaN where there is none."""
         if not self.k:
-            return jnp.full((), jnp.nan, self.eigenvalues.dtype)
+            return jnp.asarray(np.nan, self.eigenvalues.dtype)
         return _last(self.eigenvalues, self.kept)
 
     @property

@@ -21,7 +21,8 @@ def measure_pairs(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
     """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether a vector is in large part among the few before it: one found twice.
 
-    If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared.
+    If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared; nor are
+    they in double precision, in which all solvers keep them apart.
     """
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     m, size, width = len(vectors), min(_ROWS, len(vectors)), min(2 * _ROWS, len(vectors))
@@ -32,14 +33,15 @@ def measure_pairs(
         force, image = stiffness(columns), mass(columns)
         if values is None:
             quotients = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
-            twice = jnp.zeros(size, bool)
         else:
             quotients = jax.lax.dynamic_slice_in_dim(values, start, size)
+        twice = jnp.zeros(size, bool)
+        if values is not None and vectors.dtype == jnp.float32:
             first = jnp.maximum(start + size - width, 0)
             products = products_with_columns(jax.lax.dynamic_slice_in_dim(vectors, first, width), image)
-            before = first + jnp.arange(width)[:, None] < start + jnp.arange(size)
+            before = first + jnp.arange(width)[:, None] < start + jnp.arange(size)[None]
             twice = jnp.any(before & (jnp.abs(products) > _ALIKE), axis=0)
-        residuals = jnp.linalg.norm(force - quotients * image, axis=0) / jnp.linalg.norm(image, axis=0)
+        residuals = jnp.linalg.norm(force - quotients[None] * image, axis=0) / jnp.linalg.norm(image, axis=0)
         return quotients, residuals, twice
 
     return jax.tree.map(lambda of_blocks: of_blocks[place], jax.lax.map(measure, jnp.asarray(starts)))

@@ -119,7 +119,7 @@ def eigsh(
     ``eigsh(K, M, k)`` is ``eigenpairs(sparse_pencil(K, M), k)``, in the spelling of `scipy.sparse.linalg.eigsh`. It
     computes what SciPy's does with ``sigma`` below the spectrum and ``which="LM"``, and needs no shift. K may be
     singular, with any null space, or indefinite. Eigenvectors are the *rows* of ``.vectors``. Multiple eigenvalues are
-    found with all their copies. A lowest eigenvalue with more than some forty copies may lack some, which is told.
+    found with all their copies; where values are traced, one with more than some forty may lack some, which is told.
     There is no ``which``: for the largest eigenvalues negate K, for those in the middle give the interval. There is no
     ``LinearOperator`` either: K and M are factorised, by nested dissection.
 

@@ -95,7 +95,8 @@ class FunctionSpace:
         if self._all_free:
             return values.reshape(shape)
         fill = np.where(self.domain.ravel(), 0.0, outside).astype(values.dtype)
-        return _spread(values, self._free_indices, fill).reshape(shape)
+        with jax.debug_nans(False):  # outside the domain it is meant
+            return _spread(values, self._free_indices, fill).reshape(shape)
 
     def transfer(self, values: Float[Array, "... n_dof"], to: "FunctionSpace") -> Float[Array, "... n"]:
         """Return functions of this space as those of another on the same nodes, zero where that has Dirichlet nodes."""

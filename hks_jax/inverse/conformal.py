@@ -53,7 +53,7 @@ class ConformalInformation(Preconditioner):
 
     def _laplacian(self, y: Values) -> Values:
         slopes, back = jax.vjp(self.unknowns.slopes, y / self.root)
-        return back([weight * slope for weight, slope in zip(self.weights, slopes, strict=True)])[0] / self.root
+        return back([weight[None] * slope for weight, slope in zip(self.weights, slopes, strict=True)])[0] / self.root
 
 
 @jit_quickly(eqx.filter_jit)

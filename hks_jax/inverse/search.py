@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from hks_jax.inverse.checkpoint import Checkpoint
@@ -62,7 +63,8 @@ class Search:
         """Solve one problem, beginning at some unknowns, to so many tolerances."""
         tolerance = tolerances * self.tolerance
         method = choose_optimiser(self.optimiser, problem, tolerance, self.noise, self.inner_product, step_size)
-        return Reached(*optimise(problem, values, method, self.noise, self.max_steps, self.log))
+        with jax.debug_nans(False):  # what nobody computed is told as NaN
+            return Reached(*optimise(problem, values, method, self.noise, self.max_steps, self.log))
 
     def through_stages(self, problems: Sequence[Problem], values: Values, first: int, step_size: float) -> Reached:
         """Solve the problems from the first on, one after another; the outcome is that of the last of them."""

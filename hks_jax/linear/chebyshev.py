@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ive
 
 from hks_jax.linear import accelerators
+from hks_jax.linear.products import aligned
 
 
 def chebyshev_recurrence(
@@ -94,7 +95,7 @@ def chebyshev_iteration(
         return state
 
     ratio = (1 - missing).astype(s.dtype) / s
-    first = jnp.zeros_like(w), (ratio / half).astype(w.dtype) * w, ratio
+    first = jnp.zeros_like(w), aligned((ratio / half).astype(w.dtype), w) * w, ratio
     return jax.lax.fori_loop(0, (degree - 1 + missing) // together, turn, first)[1]
 
 

@@ -124,7 +124,7 @@ def conjugate_gradients(
         z = precondition(state.r)
         energy, begin = inner(state.r, z), state.steps == (-1 if orthogonal else 0)
         change = xp.where(state.going & ~state.fresh, energy / state.energy, 0)
-        p = xp.where(state.going, z + change * state.p, 0)
+        p = xp.where(state.going, z + change[(None,) * (z.ndim - change.ndim)] * state.p, 0)
         z = z if orthogonal else state.z
         return state._replace(z=z, p=p, first=xp.where(begin, energy, state.first), energy=energy, change=change)
 

@@ -102,10 +102,10 @@ def _inverse_gaps_jvp(tolerance: float | None, primals: tuple[Array], tangents: 
     gap, apart = _gaps(tolerance, values)
     slope = jnp.where(apart, -1 / jnp.square(jnp.where(apart, gap, 1)), jnp.nan)
     slope = jnp.where(jnp.eye(len(values), dtype=bool), 0, slope)
-    return _inverse_gaps(tolerance, values), slope * (change - change[:, None])
+    return _inverse_gaps(tolerance, values), slope * (change[None] - change[:, None])
 
 
 def _gaps(tolerance: float | None, values: Float[Array, " n"]) -> tuple[Float[Array, "n n"], Bool[Array, "n n"]]:
     """Return λⱼ − λᵢ in row i and column j, and where it is not zero but for the tolerance."""
-    gap = values - values[:, None]
+    gap = values[None] - values[:, None]
     return gap, jnp.abs(gap) > (tolerance or 0) * jnp.max(jnp.abs(values))

@@ -125,7 +125,7 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
     products = gram(x, image)
     norms = jnp.sqrt(jnp.diagonal(products))
     # Of a matrix this small the inverse is as good, and a long triangular solve is slow.
-    inverse = lapack.inverse_cholesky(products / norms / norms[:, None]) / norms
+    inverse = lapack.inverse_cholesky(products / norms[None] / norms[:, None]) / norms[None]
     residuals, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
     return jnp.max(residuals / images)
 

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix, csc_matrix
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear.pattern import Ellpack, Pattern, SparsePattern
-from hks_jax.linear.products import of_each_row
+from hks_jax.linear.products import aligned, of_each_row
 
 Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
@@ -188,7 +188,7 @@ class DiagonalOperator(Operator):
 
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""
-        return self.entries * x
+        return aligned(self.entries, x) * x
 
     def of_columns(self) -> OfColumns:
         """Return the product with a block of columns."""

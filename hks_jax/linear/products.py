@@ -7,6 +7,7 @@ from operator import add
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Inexact, Int
 
 from hks_jax.linear import accelerators
@@ -114,3 +115,8 @@ def row_blocks(
     starts = np.minimum(np.arange(0, count, size), count - size)
     block = np.arange(count) // size
     return starts, (block, np.arange(count) - starts[block])
+
+
+def aligned(x: Array, like: ArrayLike) -> Array:
+    """Return x with axes before its own, as many as ``like`` has: `jax_numpy_rank_promotion` may forbid to add them."""
+    return jnp.expand_dims(x, tuple(range(jnp.ndim(like) - x.ndim)))

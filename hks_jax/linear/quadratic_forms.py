@@ -32,7 +32,7 @@ def quadratic_forms(
     first, (starts, _) = np.arange(0, k, size), row_blocks(n, width)
     past_last = jnp.max(jnp.where(matters, np.arange(1, k + 1), 0), axis=1)
     # Matrices in the order of how many of their blocks count, and how many have the first block, the second …
-    order, counts = jnp.argsort(-past_last), jnp.sum(past_last > first[:, None], axis=1)
+    order, counts = jnp.argsort(-past_last), jnp.sum(past_last[None] > first[:, None], axis=1)
 
     def at_points(number: Array) -> tuple[Array, Float[Array, "k width"]]:
         start = jnp.asarray(starts)[number]
@@ -63,7 +63,7 @@ def quadratic_forms(
 
                 def add(turn: Array, block: Array, right: Array = some[i:]) -> Array:
                     one = order[turn]
-                    weighted = right[: block.shape[2]] * own[one]
+                    weighted = right[: block.shape[2]] * own[one][None]
                     return block.at[one].add(jnp.matmul(right, weighted.T, precision="highest"))
 
                 results.append(jax.lax.fori_loop(0, count, add, block))

@@ -134,30 +134,14 @@ def _swept(
     """Sweep the block whose rows begin with number ``at``, given its inverse."""
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
     inside = (index >= at) & (index < at + rows.shape[1])
-    rows = jnp.where(inside, -(index == own[:, None]).astype(a.dtype), rows)
+    rows = jnp.where(inside, -(index[None] == own[:, None]).astype(a.dtype), rows)
     change = batched(transposed(rows), batched(inverses, rows))
     return jnp.where(inside, 0, jnp.where(inside[:, None], 0, a)) - change
 
 
 def sweep_rows(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
     """Sweep one row at a time, always the one with the largest diagonal entry left; return with them the pivots."""
-    m, n, _ = matrices.shape
-    index = jnp.arange(n)
-
-    def sweep(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        a, swept, pivots = state
-        diagonal = jnp.diagonal(a, axis1=1, axis2=2)
-        chosen = index == jnp.argmax(jnp.where(swept, -1, jnp.abs(diagonal)), axis=1)[:, None]
-        column = jnp.sum(jnp.where(chosen[:, None, :], a, 0), axis=2)
-        pivot = _away_from_zero(jnp.sum(jnp.where(chosen, diagonal, 0), axis=1), least)[:, None]
-        row = jnp.where(chosen, -1, column) / pivot
-        a = a - jnp.where(chosen, 0, column)[:, :, None] * row[:, None, :]
-        a = jnp.where(chosen[:, :, None], row[:, None, :], jnp.where(chosen[:, None, :], row[:, :, None], a))
-        return a, swept | chosen, jnp.where(chosen, pivot, pivots)
-
-    state = matrices, jnp.zeros((m, n), bool), jnp.zeros((m, n), matrices.dtype)
-    a, _, pivots = jax.lax.fori_loop(0, n, sweep, state)
-    return -a, pivots
+    return jax.vmap(_sweep)(matrices, least[:, None])
 
 
 def _away_from_zero(pivots: Float[Array, "*m"], least: Float[Array, "*#m"]) -> Float[Array, "*m"]:
@@ -199,7 +183,7 @@ def invert_in_registers(
         own = pl.ds(first[0], size)
         a = triton.load(matrix.at[own, own], mask=both, other=0)
         identity = (index[:, None] == index[None, :]) & ~both
-        inverted, pivots_so_far = _sweep_in_registers(jnp.where(identity, 1, a), least[...])
+        inverted, pivots_so_far = _sweep(jnp.where(identity, 1, a), least[...])
         triton.store(inverse.at[:, :], inverted, mask=both)
         triton.store(pivots.at[:], pivots_so_far, mask=within)
 
@@ -222,10 +206,8 @@ def invert_in_registers(
     )(at[None], matrices, least[:, None])
 
 
-def _sweep_in_registers(
-    a: Float[Array, "n n"], least: Float[Array, " 1"]
-) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Sweep one row at a time, always the one with the largest diagonal entry left."""
+def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """Return the inverse of one matrix, and the pivots."""
     n = a.shape[0]
     index = jax.lax.broadcasted_iota(jnp.int32, (n,), 0)
 

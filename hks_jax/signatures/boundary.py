@@ -13,6 +13,7 @@ from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, Sides, normalise_boundary
+from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.hks import hks_of_pairs
 from hks_jax.signatures.spectral import spectral_diagonal
@@ -20,6 +21,7 @@ from hks_jax.signatures.times import require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
 
 
+@nan_is_meant
 def boundary_influence(
     domain: TensorField | SimplicialMesh | Eigenpairs,
     times: Any,

@@ -56,7 +56,7 @@ class Columns(_FromSources):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
         """Return Σᵢ cᵢ φᵢ(x_s) φᵢ(x)."""
-        return _matmul(weights[:, None, :] * self.at_sources(vectors).T, vectors)
+        return _matmul(weights[:, None, :] * self.at_sources(vectors).T[None], vectors)
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]

@@ -11,6 +11,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_squared_distances
 from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
@@ -34,6 +35,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     return _distance(pairs, Heat(2 * times), sources)
 
 
+@nan_is_meant
 def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sources *shape"]:
     """Compute the biharmonic distance d(x_s, x)² = Σᵢ (φᵢ(x_s) − φᵢ(x))² / λᵢ² over λᵢ > 0 (Lipman et al. 2010).
 
@@ -61,7 +63,7 @@ def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, 
     squared = spectral_squared_distances(pairs, filters, source_indices(pairs, sources))
     # The root has no derivative at distance zero; there the distance is set, with derivative zero.
     root = jnp.sqrt(jnp.where(squared == 0, 1, squared))
-    return jnp.where(pairs.space.domain, jnp.where(squared == 0, 0, root), jnp.nan)
+    return nan_outside(jnp.where(squared == 0, 0, root), pairs.space.domain)
 
 
 def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
@@ -74,7 +76,7 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
         dimension = dimension_of(pairs, "ShapeDNA that is normalised")
         values = values * volume_of(pairs, "ShapeDNA that is normalised") ** (2 / dimension)
     # NaN comes last: as 0·NaN it would reach the volume's derivative.
-    return jnp.where(pairs.kept, values, jnp.nan)
+    return nan_outside(values, pairs.kept)
 
 
 def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
@@ -86,8 +88,8 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
     n = pairs.n_null  # raises where that is not known
     if not pairs.null_space_known:  # negative ones come first
         n = int((jax.lax.stop_gradient(pairs.eigenvalues) <= 0).sum())
-    values = jnp.where(pairs.kept, pairs.eigenvalues, jnp.nan)[n:]
-    return pairs.space.extend(pairs.vectors[n:] / jnp.sqrt(values[:, None]))
+    scaled = pairs.vectors[n:] / jnp.sqrt(jnp.where(pairs.kept, pairs.eigenvalues, 1)[n:, None])
+    return pairs.space.extend(nan_outside(scaled, pairs.kept[n:, None]))
 
 
 MARGIN = 10.0
@@ -147,13 +149,14 @@ def varadhan_distance(
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
         # At distance zero the root has no derivative, and rounding may leave the kernel just off 1: there it is set.
-        zero = (relative >= 1) | (np.arange(space.domain.size).reshape(space.node_shape) == _broadcast(nodes, space))
+        numbers = np.arange(space.domain.size).reshape(1, *space.node_shape)
+        zero = (relative >= 1) | (numbers == _broadcast(nodes, space))[None]
     else:
         relative, zero = kernel, kernel == 1
         defined &= kernel <= 1
     ratio = jnp.where(defined & ~zero, relative, jnp.exp(-1.0))
     distance = jnp.sqrt(-4 * _broadcast(times[:, None], space) * jnp.log(ratio))
-    return jnp.where(defined, jnp.where(zero, 0, distance), jnp.nan)
+    return nan_outside(jnp.where(zero, 0, distance), defined)
 
 
 def _broadcast(values: Any, space: FunctionSpace) -> Any:
@@ -176,15 +179,15 @@ def _least_kernels(
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
         raise ValueError("pairs: the distance needs the spacing of nodes, which matrices from elsewhere do not have")
-    weights = jnp.where(pairs.kept, jnp.exp(-times[:, None] * pairs.eigenvalues), 0)
-    residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0), axis=1) / jnp.sum(weights, axis=1)
+    weights = jnp.where(pairs.kept[None], jnp.exp(-times[:, None] * pairs.eigenvalues[None]), 0)
+    residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
     # The spacing along the way is not known: that at its ends, or the domain's mean if that is larger.
     along = jnp.maximum(
-        jnp.maximum(at_nodes, _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
+        jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )
-    by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along)
+    by_grid = jnp.exp(-12 * GRID_LIMIT * _broadcast(times[:, None], space) / along[None])
     return _broadcast(error[:, None], space), by_grid
 
 

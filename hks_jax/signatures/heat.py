@@ -126,7 +126,7 @@ def _largest_exponents(
 ) -> Float[Array, " n"]:
     positive = kept & (values > 0)
     logs = jnp.log(jnp.where(positive, values, 1))
-    exponents = jnp.where(positive, -jnp.square((energies[:, None] - logs) / sigma) / 2, -jnp.inf)
+    exponents = jnp.where(positive[None], -jnp.square((energies[:, None] - logs[None]) / sigma) / 2, -jnp.inf)
     return jnp.max(exponents, axis=1)
 
 

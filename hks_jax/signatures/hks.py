@@ -14,6 +14,7 @@ from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.checks import checked_times, require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
+from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral import spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import dimension_of, require_pairs, volume_of
@@ -112,6 +113,7 @@ def hks(
     return _scaled(pairs, times, normalisation, _without(pairs.pencil, times, tolerance))
 
 
+@nan_is_meant
 def hks_auto(
     pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw", tolerance: float = 1e-4
 ) -> AutomaticHKS:
@@ -146,7 +148,7 @@ def hks_auto(
         )
     estimate = truncation(known_pairs, known_times)
     spectral = np.asarray(estimate.tail) <= tolerance
-    nan = jnp.full((), jnp.nan, times.dtype)
+    nan = jnp.asarray(np.nan, times.dtype)
     if spectral.all():
         values = hks_of_pairs(pairs, times, normalisation)
         return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, "none", nan, nan)
@@ -217,9 +219,9 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
     try:
         settings = least_work(pencil, times, tolerance)
     except Unattainable:
-        return jnp.full((), jnp.nan, times.dtype)
+        return jnp.asarray(np.nan, times.dtype)
     if work(settings, pencil, times) > most:
-        return jnp.full((), jnp.nan, times.dtype)
+        return jnp.asarray(np.nan, times.dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)
         spectral = hks_of_pairs(pairs, times)

@@ -218,16 +218,17 @@ def _divided_differences(
     one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
     """Return the matrices [f] and [λf], f being zero where the pairs are not kept."""
-    low, high = jnp.minimum(values[:, None], values), jnp.maximum(values[:, None], values)
+    rows, columns = values[:, None], values[None]
+    low, high = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
     f = _weights(one, values, kept)
-    gap = values[:, None] - values
-    quotient = (f[:, None] - f) / jnp.where(gap == 0, 1, gap)
-    both = kept[:, None] & kept
+    gap = rows - columns
+    quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
+    both = kept[:, None] & kept[None]
     of_f = jnp.where(both, one.divided_difference(low, high), quotient)
     # Between null vectors that every perturbation annihilates G vanishes; and f need not have a derivative at 0.
     of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
     # f at the larger eigenvalue, where it is small, and not the other way round: no cancellation.
-    return of_f, jnp.where(gap >= 0, f[:, None], f) + low * of_f
+    return of_f, jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
 
 
 def _matters(f: Float[Array, " k"], slope: Float[Array, " k"], values: Float[Array, " k"]) -> Bool[Array, " k"]:

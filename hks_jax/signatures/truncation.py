@@ -18,6 +18,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import mask_for
+from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral import spectral_diagonal, sum_of
 from hks_jax.signatures.times import dimension_of, require_pairs
@@ -79,6 +80,7 @@ class Truncation(eqx.Module):
         return messages
 
 
+@nan_is_meant
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:
     """Estimate what k pairs and the node spacing leave out of the signature at each time.
 
@@ -148,9 +150,9 @@ def _resolution_bias(
 ) -> tuple[Float[Array, "n nodes"], Float[Array, "n nodes"]]:
     """Return the estimated relative error by the spacing, and its part that does not fall with t; 0 at other nodes."""
     turning, dispersion = (jnp.where(free, x, 0).ravel() for x in (resolution.turning, resolution.dispersion))
-    lasting = slope[:, None] * turning + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
+    lasting = slope[:, None] * turning[None] + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
     lasting = jnp.where(free.ravel(), lasting, 0)
-    both = jnp.hypot(dispersion / times[:, None], lasting)
+    both = jnp.hypot(dispersion[None] / times[:, None], lasting)
     # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 
@@ -204,9 +206,15 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     To 1e-3 from x = 0.1 on, to 1e-7 from x = 1 on, for exponents from ½ to 8; x below 1e-3 counts as that.
     """
     x = jnp.maximum(x, 1e-3)  # nothing overflows
-    points, weights = (jnp.asarray(each, x.dtype) for each in (_POINTS, _WEIGHTS))
-    powers = jnp.exp((exponent - 1)[..., None] * jnp.log1p(points / x[..., None]))
-    return count * exponent / x * jnp.exp(-x) * jnp.sum(weights * powers, axis=-1)
+    count, exponent = (jnp.expand_dims(each, tuple(range(x.ndim - each.ndim))) for each in (count, exponent))
+
+    def add(total: Array, node: tuple[Array, ...]) -> tuple[Array, None]:
+        point, weight = node
+        return total + weight * jnp.exp((exponent - 1) * jnp.log1p(point / x)), None
+
+    nodes = tuple(jnp.asarray(each, x.dtype) for each in (_POINTS, _WEIGHTS))
+    integral, _ = jax.lax.scan(add, jnp.zeros(jnp.broadcast_shapes(x.shape, exponent.shape), x.dtype), nodes)
+    return count * exponent / x * jnp.exp(-x) * integral
 
 
 # For a = 1 the integral is 1, for a = 3/2, by parts, 1 + (√π/2) erfc(√x) e^x/√x.
@@ -222,6 +230,7 @@ def resolving(share: float, dimension: int) -> float:
     return float(gammainccinv(dimension / 2, share))
 
 
+@nan_is_meant
 def truncation_map(
     pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n_times"]
 ) -> Float[Array, "n_times *shape"]:

@@ -18,6 +18,7 @@ from hks_jax.fem.space import GridSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.chebyshev import heat_coefficients
 from hks_jax.linear.dissection import dissect
+from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.spectrum_free.colours import Colouring
 from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_fewer_vectors, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal
@@ -25,6 +26,7 @@ from hks_jax.spectrum_free.rational import selected_inversion
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
 
 
+@nan_is_meant
 def hks_spectrum_free(
     domain: TensorField | SimplicialMesh | AnyPencil,
     times: Any,
@@ -122,8 +124,8 @@ def _diagonal(
     if checked:
         # A factor, so that the derivatives are NaN too.
         fits = _fits(settings, *jax.lax.stop_gradient((part, times)))
-        values = values * jnp.where(fits, 1, jnp.nan)
-    return jnp.where(space.domain, jnp.where(space.free, values, 0), jnp.nan)
+        values = values * nan_outside(jnp.ones_like(values), fits)
+    return nan_outside(jnp.where(space.free, values, 0), space.domain)
 
 
 @partial(jax.jit, static_argnums=0)

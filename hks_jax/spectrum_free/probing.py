@@ -13,6 +13,7 @@ from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 from hks_jax.linear.linear_map import with_transpose
+from hks_jax.linear.products import aligned
 from hks_jax.spectrum_free.colours import Colouring
 from hks_jax.static_array import StaticArray
 
@@ -157,8 +158,8 @@ def _sum_of_blocks(
     numbers, dtype = jnp.arange(settings.columns, dtype=jnp.int32), jax.tree.leaves(total)[0].dtype
 
     def step(number: Array, total: T) -> T:
-        own = number * settings.columns + numbers
-        return term((jnp.asarray(colours.value, jnp.int32)[..., None] == own).astype(dtype), total)
+        own, of_nodes = number * settings.columns + numbers, jnp.asarray(colours.value, jnp.int32)[..., None]
+        return term((of_nodes == aligned(own, of_nodes)).astype(dtype), total)
 
     return jax.lax.fori_loop(0, -(-(int(colours.value.max()) + 1) // settings.columns), step, total)
 

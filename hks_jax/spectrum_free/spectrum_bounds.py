@@ -79,7 +79,7 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
         top, across = jnp.minimum(top, gershgorin(entries, 1 / nodal.lumped)), jnp.zeros(d, sums.dtype)
     else:
         across = jnp.stack(greatest) - 1
-    sizes = jnp.abs(entries) / nodal.lumped
+    sizes = jnp.abs(entries) / nodal.lumped[None]
     reach = jnp.stack([jnp.max(jnp.sum(sizes[np.flatnonzero(offsets[:, a])], axis=0)) for a in range(d)])
     return Bounds(top, low, reach, across, jnp.min(jnp.where(nodal.free, sums, jnp.inf)), jnp.max(sums))
 

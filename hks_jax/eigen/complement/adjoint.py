@@ -146,7 +146,7 @@ def wanted_errors(
 def norms(rows: Float[Array, "b n"], lumped: Float[Array, " n"]) -> Float[Array, " b"]:
     """Return ‖rᵢ‖ in the norm of M⁻¹, M replaced by its diagonal."""
     xp = rows.__array_namespace__()
-    return xp.sqrt(xp.sum(rows * rows / lumped, axis=1))
+    return xp.sqrt(xp.sum(rows * rows / lumped[None], axis=1))
 
 
 def group_numbers(
@@ -193,7 +193,7 @@ def middles_of_gaps(
     xp = values.__array_namespace__()
     gaps = xp.diff(values)
     typical = (values[-1] - values[0]) / (values.size - 1)
-    distance = xp.abs(values[:-1] + gaps / 2 - targets[:, None])
+    distance = xp.abs((values[:-1] + gaps / 2)[None] - targets[:, None])
     chosen = xp.argmin(xp.where(gaps >= 0.1 * typical, distance, xp.inf), axis=1)
     return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, otherwise)
 

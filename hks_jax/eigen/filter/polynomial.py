@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import chebyshev_iteration
+from hks_jax.linear.products import aligned
 from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
 
 _STEPS = 64
@@ -70,7 +71,7 @@ def correction(
     """
     dtype = residual.dtype
     stiffness, mass = (
-        replace(matrix, coefficients=(matrix.coefficients / pencil.lumped).astype(dtype)).of_columns()
+        replace(matrix, coefficients=(matrix.coefficients / pencil.lumped[None]).astype(dtype)).of_columns()
         for matrix in (pencil.stiffness, pencil.mass)
     )
 
@@ -82,7 +83,7 @@ def correction(
     reference = jnp.minimum(value, band.low)
 
     def run(inverse: Callable[[Array], Array]) -> Float[Array, "*shape b"]:
-        w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - reference.astype(dtype) * whole
+        w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - aligned(reference.astype(dtype), whole) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
     # Apart, so that without further terms all of a step is one computation.

@@ -273,10 +273,10 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Int[Array, ""], Float[Arra
     # 1 − β of the modes: what the lumped mass takes from their eigenvalues.
     missing = 1 - jnp.where(values > 0, state.lumped_values / jnp.where(values > 0, values, 1), 1)
     powers = jnp.arange(1, _MOST_TERMS + 2, dtype=values.dtype)[:, None]
-    lost = missing**powers
+    lost = missing[None] ** powers
     near = (values >= wanted / 2) & (values <= 2 * wanted)
     spread = jnp.max(jnp.where(near, lost, 0), axis=1) - jnp.min(jnp.where(near, lost, jnp.inf), axis=1)
-    beyond = jnp.min(jnp.where(values > 2 * wanted, (1 - lost) * values, jnp.inf), axis=1)
+    beyond = jnp.min(jnp.where((values > 2 * wanted)[None], (1 - lost) * values[None], jnp.inf), axis=1)
     enough = (spread <= _SPLIT) & (beyond >= _APART * wanted)
     # Never fewer than before: what they keep away would come back.
     terms = jnp.maximum(state.terms, jnp.where(jnp.any(enough), jnp.argmax(enough), _MOST_TERMS))

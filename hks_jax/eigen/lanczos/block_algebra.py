@@ -85,6 +85,6 @@ def _factored(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float
     """Return F with FFᵀ = G, the inner products, and F⁻ᵀ."""
     norms = jnp.sqrt(jnp.diagonal(products))
     norms = jnp.where(norms > 0, norms, 1)
-    sizes, mix = lapack.eigh(products / norms / norms[:, None])
+    sizes, mix = lapack.eigh(products / norms[None] / norms[:, None])
     sizes = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(products.dtype).eps * sizes[-1]))
-    return norms[:, None] * mix * sizes, mix / sizes / norms[:, None]
+    return norms[:, None] * mix * sizes[None], mix / sizes[None] / norms[:, None]

@@ -63,12 +63,13 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         state = self.slice(expected(pencil, plan), plan, report)
         assert state.vectors is not None
         values, vectors, bound = _lowest(pencil, state.values, state.vectors, state.complete_below, k)
-        if is_traced(bound) or (state.finished and not jnp.isnan(bound)) or pencil.size > _DENSE:
+        if is_traced(bound) or (state.finished and not math.isnan(bound)) or pencil.size > _DENSE:
             return values, vectors, bound
         report("not all found: computing all pairs")
         first = int(pencil.negative) if isinstance(pencil, LocatedPencil) else 0
         values, vectors, bound = Dense().lowest(pencil, first + k)
-        return values[first:], vectors[first:], bound
+        at = first + jnp.arange(k)  # beyond the end there are no more
+        return values.at[at].get(mode="fill"), vectors.at[at].get(mode="fill"), bound
 
     def max_pairs(self, n_dof: int) -> int:
         """Return how many pairs leave room for a Lanczos basis."""
@@ -130,6 +131,6 @@ def _lowest(
     order = jnp.argsort(values)[:k]
     values, vectors = values[order], vectors[order]
     known = jnp.isfinite(values)
-    if values.dtype == jnp.float32:  # in double precision the projections keep all apart
+    if values.dtype == jnp.float32:
         bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & known), jnp.nan, bound)
     return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound

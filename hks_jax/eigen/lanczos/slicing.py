@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.block_algebra import orthonormal
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Window, crowded, make_room, steps_for
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, crowded, make_room, steps_for
 from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
@@ -118,9 +118,8 @@ def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float
         # Where one slice is enough nothing is known as a rule, and there are no rows of zeros to stay orthogonal to. Of
         # several slices the first would have to be compiled apart.
         nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
-        window = _window(problem, plan, state, 0 if nothing else plan.window)
-        ritz = block_lanczos(problem.pencil, shifted, state.start, window.vectors, plan.steps, window.steps, plan.ritz)
-        interval = window.low, window.high
+        known, interval, steps = _window(problem, plan, state, 0 if nothing else plan.window)
+        ritz = block_lanczos(problem.pencil, shifted, state.start, known, plan.steps, steps, plan.ritz)
         order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
         vectors = ritz[1]
         if not is_traced(following.stuck) and following.stuck and state.below > 0:
@@ -173,8 +172,14 @@ def _inverse_iteration(
 
 
 @jit_quickly(static_argnames=("plan", "rows"))
-def _window(problem: Problem, plan: Plan, state: SlicingState, rows: int) -> Window:
-    """Return how to search around the state's shift, orthogonal to so many eigenvectors."""
+def _window(
+    problem: Problem, plan: Plan, state: SlicingState, rows: int
+) -> tuple[Float[Array, "rows n_dof"], tuple[Float[Array, ""], Float[Array, ""]], Int[Array, ""]]:
+    """Return how to search around the state's shift.
+
+    These are so many of the known eigenvectors nearest to it, to stay orthogonal to, zero where there are fewer; the
+    interval in which nothing else is known; and how many Lanczos blocks to compute.
+    """
     assert state.vectors is not None
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))[:rows]
     vectors = jnp.where((nearest < state.known)[:, None], state.vectors[nearest], 0)
@@ -185,7 +190,7 @@ def _window(problem: Problem, plan: Plan, state: SlicingState, rows: int) -> Win
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
     # The last slice has fewer eigenvalues to find. More than wanted: the certificate needs a gap above the last.
     size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2 + 2 * plan.block, plan.slice_size)
-    return Window(vectors, low, high, jnp.minimum(steps_for(plan, size), plan.steps))
+    return vectors, (low, high), jnp.minimum(steps_for(plan, size), plan.steps)
 
 
 @jit_quickly(donate_argnames="known_vectors")

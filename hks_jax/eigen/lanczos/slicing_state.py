@@ -83,22 +83,6 @@ def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
     return 2 * -(-(21 * size + 120 * plan.block) // (20 * plan.block))
 
 
-class Window(NamedTuple):
-    """How to search around a shift.
-
-    Attributes:
-        vectors: (window, n_dof) the known eigenvectors nearest to the shift, to stay orthogonal to; or zero rows.
-        low: from this number on nothing else is known,
-        high: and up to this.
-        steps: how many Lanczos blocks to compute.
-    """
-
-    vectors: Float[Array, "window n_dof"]
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-    steps: Int[Array, ""]
-
-
 class SlicingState(NamedTuple):
     """What is known between two slices.
 
