@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 import hks_jax as hj
 from hks_jax.eigen.lanczos import block_algebra
 from hks_jax.fem.stencil import Stencil
-from hks_jax.linear import accelerators, column_kernels, elimination_tree
+from hks_jax.linear import accelerators, column_kernels, elimination_tree, symmetric_inverse
 from hks_jax.linear.chebyshev import chebyshev_iteration
 from hks_jax.linear.column_kernels import orthonormal, parts_of_products, remainder
 from hks_jax.linear.dissection import dissect
@@ -174,3 +174,21 @@ def test_dependent_columns_become_orthonormal_in_two_passes(rng):
     assert np.isfinite(x).all()
     np.testing.assert_allclose(products[:5, :5], np.eye(5), atol=1e-8)
     assert np.abs(products).max() < 10
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_kernels_prove_themselves_at_the_first_use(dtype, monkeypatch):
+    monkeypatch.setattr(accelerators, "_PROVED", {})
+    assert not column_kernels.agree(dtype)  # no GPU here, and nothing to prove
+    monkeypatch.setattr(accelerators, "kernels_compile", lambda: True)
+    assert jax.jit(lambda: jnp.asarray(column_kernels.agree(dtype, interpret=True)))()  # while a program is traced
+    assert symmetric_inverse._kernel_agrees(dtype, interpret=True)
+    right = column_kernels.parts_of_products
+    monkeypatch.setattr(column_kernels, "parts_of_products", lambda x, y, interpret: 1.01 * right(x, y, interpret))
+    assert column_kernels.agree(dtype, interpret=True)  # once in a process
+    accelerators._PROVED.clear()
+    with pytest.warns(RuntimeWarning, match=r"on cpu the kernels of block Lanczos in float\d\d differ .* by \d"):
+        assert not column_kernels.agree(dtype, interpret=True)
+    assert not column_kernels.agree(dtype, interpret=True)  # told once
+    with pytest.warns(RuntimeWarning, match=r"kernels of inverses in float\d\d do not compile \("):
+        assert not symmetric_inverse._kernel_agrees(dtype)  # Pallas compiles nothing for a CPU

@@ -5,7 +5,13 @@ waits for everything launched before. Programs there have few kernels, and lengt
 some arithmetic.
 """
 
+import warnings
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
 import jax
+import numpy as np
 from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Float
 
@@ -31,6 +37,46 @@ def kernels_compile() -> bool:
         return False
     capability = str(getattr(jax.local_devices()[0], "compute_capability", ""))
     return capability.replace(".", "").isdigit() and float(capability) >= _CAPABILITY
+
+
+_PROVED: dict[tuple[str, str], bool] = {}
+
+
+def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[Any, Any]]]) -> bool:
+    """Return whether Pallas' kernels compile for the GPU here, and compute what they should, as the first use finds.
+
+    Args:
+        name: of the kernels.
+        dtype: of what they compute with.
+        compare: runs each of them on a small problem, and returns its results beside those that are expected.
+
+    Warns:
+        RuntimeWarning: they do not; XLA's operations take their place for the rest of the process.
+    """
+    if not kernels_compile():
+        return False
+    key = name, np.dtype(dtype).name
+    if key not in _PROVED:
+        failure = ""
+        try:
+            with ThreadPoolExecutor(1) as pool:  # a thread of its own computes, also while this one traces a program
+                results = pool.submit(lambda: [tuple(map(np.asarray, pair)) for pair in compare()]).result()
+            for found, expected in results:
+                error = np.max(np.abs(found - expected))
+                if not error <= float(np.finfo(dtype).eps) ** 0.6 * np.max(np.abs(expected)):
+                    failure = f"differ from what they should compute by {error:.1e}"
+        except Exception as error:  # whatever the compiler of kernels raises
+            failure = f"do not compile ({str(error).strip().splitlines()[0]})" if str(error) else "do not compile"
+        if failure:
+            device = jax.local_devices()[0]
+            warnings.warn(
+                f"on {device.device_kind} the kernels of {name} in {key[1]} {failure}; XLA's operations take their "
+                "place, which are slower",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        _PROVED[key] = not failure
+    return _PROVED[key]
 
 
 def padded_size(n: int, least: int) -> int:

@@ -10,9 +10,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.linear.accelerators import padded_size
+from hks_jax.linear.accelerators import kernels_agree, padded_size
 
 LARGEST = 32
 """Columns of the widest blocks."""
@@ -126,6 +127,25 @@ def orthonormal(
         return [[(number, change)] for number in range(len(columns))], _product(before, norms[:, None] * lower)
 
     return _combined(small, parts, (before,), columns, len(columns), interpret, "orthonormal")
+
+
+def agree(dtype: Any, interpret: bool = False) -> bool:
+    """Return whether these kernels compute on this GPU what they should; see `accelerators.kernels_agree`."""
+
+    def compare() -> list[tuple[Any, Any]]:
+        rng, n, b = np.random.default_rng(0), 3 * _ROWS + 5, 7
+        x, y, z = (rng.standard_normal((n, b)).astype(dtype) for _ in range(3))
+        mix = rng.standard_normal((b, b)).astype(dtype)
+        parts = parts_of_products(jnp.asarray(x), jnp.asarray(y), interpret)
+        products = (x.T @ y + y.T @ x) / 2
+        rest, total = remainder(jnp.asarray(x), jnp.asarray(y), parts, (jnp.asarray(z), jnp.asarray(mix)), interpret)
+        found = [(np.sum(np.asarray(parts), axis=0), x.T @ y), (total, products)]
+        found.append((rest, x - y @ products - z @ mix))
+        squares = parts_of_products(jnp.asarray(x), jnp.asarray(x), interpret)
+        (unit,), factor = orthonormal(squares, (jnp.asarray(x),), jnp.asarray(np.eye(b, dtype=dtype)), interpret)
+        return [*found, (unit.T @ unit, np.eye(b, dtype=dtype)), (unit @ factor.T, x)]
+
+    return kernels_agree("block Lanczos", dtype, compare)
 
 
 _Terms = list[list[tuple[int, Array | None]]]

@@ -1,9 +1,11 @@
 """The inverses of a batch of symmetric indefinite matrices together with their inertia."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.linear import accelerators, lapack
@@ -38,8 +40,20 @@ def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"
         if least is None and len(matrices) >= _MANY:
             return by_cholesky_factors(matrices)
         return by_eigenvalues(matrices, none)
-    ways = {"cpu": by_eigenvalues} | ({"cuda": by_kernels} if accelerators.kernels_compile() else {})
+    ways = {"cpu": by_eigenvalues} | ({"cuda": by_kernels} if _kernel_agrees(matrices.dtype) else {})
     return jax.lax.platform_dependent(matrices, none, **ways, default=by_elimination)
+
+
+def _kernel_agrees(dtype: Any, interpret: bool = False) -> bool:
+    def compare() -> list[tuple[Any, Any]]:
+        frames = np.linalg.qr(np.random.default_rng(0).standard_normal((5, 20, 20)))[0]
+        values = np.linspace(-2, 3, 20)  # none near zero
+        matrices = np.einsum("mij,j,mkj->mik", frames, values, frames).astype(dtype)
+        inverses, pivots = invert_in_registers(jnp.asarray(matrices), jnp.zeros(5, dtype), interpret=interpret)
+        negative = np.sum(np.linalg.eigvalsh(matrices) < 0, axis=1)
+        return [(inverses, np.linalg.inv(matrices)), (np.sum(np.asarray(pivots) < 0, axis=1), negative)]
+
+    return accelerators.kernels_agree("inverses", dtype, compare)
 
 
 def by_cholesky_factors(matrices: Float[Array, "m n n"]) -> Inverses:

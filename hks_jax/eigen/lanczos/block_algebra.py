@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.linear import accelerators, column_kernels, lapack
+from hks_jax.linear import column_kernels, lapack
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import gram, times
 
@@ -76,7 +76,7 @@ def orthonormal(
 
 
 def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Float[Array, "n_dof b"]) -> Any:
-    if accelerators.kernels_compile() and x.shape[1] <= column_kernels.LARGEST:
+    if x.shape[1] <= column_kernels.LARGEST and column_kernels.agree(x.dtype):
         return jax.lax.platform_dependent(cuda=by_kernels, default=plain)
     return plain()
 
