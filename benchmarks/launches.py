@@ -37,11 +37,11 @@ from hks_jax.eigen.lanczos.slicing_state import first_state, make_room  # noqa: 
 from hks_jax.fem.nodal import nodal_pencil  # noqa: E402
 from hks_jax.fem.pencil import Pencil  # noqa: E402
 from hks_jax.inverse import optimise  # noqa: E402
+from hks_jax.inverse.conformal import smoothing  # noqa: E402
 from hks_jax.inverse.gauss_newton import GaussNewton  # noqa: E402
 from hks_jax.inverse.observation import observe  # noqa: E402
 from hks_jax.inverse.parametrisation import choose_parametrisation  # noqa: E402
 from hks_jax.inverse.problem import Problem  # noqa: E402
-from hks_jax.inverse.smoothing import smoothing  # noqa: E402
 from hks_jax.inverse.unknowns import Nodal, nodes_of  # noqa: E402
 from hks_jax.linear import accelerators  # noqa: E402
 from hks_jax.linear.dissection import dissect  # noqa: E402

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import hks_jax as hj
 from hks_jax import plot
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 
 HERE = Path(__file__).parent
 PICTURES = HERE / "images" / "gallery"
@@ -35,7 +35,7 @@ import numpy as np
 
 import hks_jax as hj
 from hks_jax import plot
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 
 jax.config.update("jax_enable_x64", True)
 """

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 
 import hks_jax as hj
 from hks_jax.cli import main
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 
 jax.config.update("jax_enable_x64", True)
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 
 jax.config.update("jax_enable_x64", True)
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 import hks_jax as hj
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 from hks_jax.paper import table1
 from hks_jax.paper.signature import enough_pairs
 

@@ -22,16 +22,14 @@ from hks_jax.cache import cache_folder
 from hks_jax.cli import demo, fit, main, picture
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
-from hks_jax.cli.arguments import Times, parse_boundary, parse_times
-from hks_jax.cli.bar import bar, duration
-from hks_jax.cli.boundary import default_boundary
+from hks_jax.cli.arguments import Times, default_boundary, parse_boundary, parse_times
 from hks_jax.cli.picture import away_from_rim, bounding_box
-from hks_jax.cli.progress import Progress
+from hks_jax.cli.progress import Progress, bar, duration
 from hks_jax.eigen.solver import Status
-from hks_jax.inverse.method import OPTIMISERS
 from hks_jax.inverse.metric_fit import RESULTS
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.inverse.problem import pairs_for
+from hks_jax.inverse.search import OPTIMISERS
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12)

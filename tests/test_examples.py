@@ -6,7 +6,7 @@ from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.domain import examples
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 
 
 def test_bumpy_torus_mesh_and_field_are_one_surface():

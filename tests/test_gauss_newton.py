@@ -11,8 +11,8 @@ from fields import random_spd
 import hks_jax as hj
 from hks_jax.inverse.conformal import conformal_information
 from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.method import choose_inner_product
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
+from hks_jax.inverse.search import choose_inner_product
 from hks_jax.inverse.unknowns import Nodal, nodes_of
 from hks_jax.linear import conjugate_gradients
 

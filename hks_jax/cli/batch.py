@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import Times, parse_times
-from hks_jax.cli.boundary import MEAN, recorded_boundary
+from hks_jax.cli.arguments import MEAN, Times, parse_times, recorded_boundary
 from hks_jax.cli.hks import add_signature_arguments, settings_of
 from hks_jax.cli.inputs import (
     add_eigenpair_arguments,

@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> None:
 
 def phantom_volume() -> TensorVolume:
     """Return the phantom as a slice."""
-    from hks_jax.domain.phantom import phantom
+    from hks_jax.domain.examples import phantom
 
     tensors, mask, spacing = phantom(PHANTOM_SHAPE)
     return TensorVolume(

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.cli.arguments import parse_boundary
-from hks_jax.cli.boundary import NATURAL, recorded_boundary, unreached_sides
+from hks_jax.cli.arguments import NATURAL, parse_boundary, recorded_boundary, unreached_sides
 from hks_jax.cli.explore import About
 from hks_jax.cli.inputs import add_interpolation_argument, add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress

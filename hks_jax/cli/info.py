@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from hks_jax.cli.arguments import DEFAULT_K, LAST, RESOLVED
-from hks_jax.cli.boundary import MEAN, default_boundary, n_problems
+from hks_jax.cli.arguments import DEFAULT_K, LAST, MEAN, RESOLVED, default_boundary, n_problems
 from hks_jax.cli.inputs import add_clean_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read

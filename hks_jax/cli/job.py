@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, LAST, Times
-from hks_jax.cli.boundary import NATURAL, default_boundary, unreached_sides
+from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, LAST, NATURAL, Times, default_boundary, unreached_sides
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -36,7 +35,7 @@ class Settings:
     """What to compute; see ``hks-jax hks --help``.
 
     Only on meshes, which have one of their own, is there no metric. Without a boundary the domain has the one that
-    suits it (`hks_jax.cli.boundary.default_boundary`), and a mesh the natural one.
+    suits it (`hks_jax.cli.arguments.default_boundary`), and a mesh the natural one.
     """
 
     metric: MetricChoice | None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.boundary import recorded_boundary
+from hks_jax.cli.arguments import recorded_boundary
 from hks_jax.cli.job import Settings, field_of
 from hks_jax.cli.outputs import plain
 from hks_jax.cli.progress import Progress

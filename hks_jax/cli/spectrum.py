@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hks_jax.cli.boundary import NATURAL
+from hks_jax.cli.arguments import NATURAL
 from hks_jax.cli.inputs import (
     add_eigenpair_arguments,
     add_json_argument,

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from hks_jax.cli.bar import bar, duration
-from hks_jax.cli.progress import Progress
+from hks_jax.cli.progress import Progress, bar, duration
 
 
 class StudyProgress(Progress):

@@ -13,10 +13,10 @@ import numpy as np
 from hks_jax.atomic import claim
 from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.arguments import Times
-from hks_jax.cli.bar import duration
 from hks_jax.cli.inputs import read_volume
 from hks_jax.cli.job import ComputationError, compute_pairs, signature_of
 from hks_jax.cli.picture import draw, draw_volume
+from hks_jax.cli.progress import duration
 from hks_jax.cli.reading import image_suffix
 from hks_jax.cli.regions import region_table
 from hks_jax.cli.saved_pairs import are_of, read_pairs, write_pairs

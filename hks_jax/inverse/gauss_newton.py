@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.inverse.smoothing import Euclidean, InnerProduct, Preconditioner
+from hks_jax.inverse.conformal import Euclidean, InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Values
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 

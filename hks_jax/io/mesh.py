@@ -15,8 +15,7 @@ from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.io import cortex
 from hks_jax.io.mesh_cleaning import cleaned, require_joined
-from hks_jax.io.mesh_formats import Loaded, meshio, polygonal, through_meshio
-from hks_jax.io.mesh_text import load_obj, load_off
+from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, meshio, polygonal, through_meshio
 from hks_jax.io.vtk_image import holds_dataset
 from hks_jax.reading import existing
 

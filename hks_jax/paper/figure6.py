@@ -8,7 +8,7 @@ from matplotlib import colormaps
 from scipy.ndimage import distance_transform_edt
 
 from hks_jax import plot
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hks_jax.atomic import atomic_path
-from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, figure3_fields, figure4_fields
+from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, figure3_fields, figure4_fields, phantom
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.phantom import phantom
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.paper.figure5 import INDICES

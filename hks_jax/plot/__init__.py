@@ -7,6 +7,7 @@ the HKS, ellipses beside a surface. No function touches pyplot, a backend or rcP
 from hks_jax.plot.convolution import lic_texture as lic_texture
 from hks_jax.plot.convolution import line_integral_convolution as line_integral_convolution
 from hks_jax.plot.curves import hks_curves as hks_curves
+from hks_jax.plot.curves import spectrum as spectrum
 from hks_jax.plot.degenerate import degenerate_points as degenerate_points
 from hks_jax.plot.ellipses import ellipses as ellipses
 from hks_jax.plot.explore import explore as explore
@@ -22,7 +23,6 @@ from hks_jax.plot.orientation import Orientation as Orientation
 from hks_jax.plot.rows import influence_map as influence_map
 from hks_jax.plot.rows import time_rows as time_rows
 from hks_jax.plot.sensitivity import sensitivity as sensitivity
-from hks_jax.plot.spectrum import spectrum as spectrum
 from hks_jax.plot.surfaces import surface as surface
 from hks_jax.plot.tracing import evenly_spaced_lines as evenly_spaced_lines
 from hks_jax.plot.tracing import trace as trace
