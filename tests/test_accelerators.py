@@ -10,7 +10,7 @@ from fields import random_spd
 from scipy.spatial import ConvexHull
 
 import hks_jax as hj
-from hks_jax.eigen.lanczos import block_algebra
+from hks_jax.eigen.lanczos import krylov_basis
 from hks_jax.fem.stencil import Stencil
 from hks_jax.linear import accelerators, column_kernels, elimination_tree, symmetric_inverse
 from hks_jax.linear.chebyshev import chebyshev_iteration
@@ -129,15 +129,15 @@ def test_the_recurrence_by_kernels_is_the_plain_one(rng, monkeypatch):
     pencil = pencil_of(rng, "mask")
     mass = pencil.mass.of_columns()
     x, before = (jnp.asarray(rng.standard_normal((pencil.size, 4))) for _ in range(2))
-    block, image, factor = block_algebra.orthonormal(mass, before)
-    plain = block_algebra.recur(block, image, before, factor, x), block_algebra.without(block, image, x)
+    block, image, factor = krylov_basis.orthonormal(mass, before)
+    plain = krylov_basis.recur(block, image, before, factor, x), krylov_basis.without(block, image, x)
     for name in ("parts_of_products", "remainder", "orthonormal"):
         monkeypatch.setattr(column_kernels, name, partial(getattr(column_kernels, name), interpret=True))
-    monkeypatch.setattr(block_algebra, "_one_of", lambda by_kernels, plain, x: by_kernels())
-    by_kernels = block_algebra.recur(block, image, before, factor, x), block_algebra.without(block, image, x)
+    monkeypatch.setattr(krylov_basis, "_one_of", lambda by_kernels, plain, x: by_kernels())
+    by_kernels = krylov_basis.recur(block, image, before, factor, x), krylov_basis.without(block, image, x)
     for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(by_kernels), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    y, image, factor = block_algebra.orthonormal(mass, before)
+    y, image, factor = krylov_basis.orthonormal(mass, before)
     np.testing.assert_allclose(y.T @ mass(y), np.eye(4), atol=1e-14)
     np.testing.assert_allclose(image, mass(y), atol=1e-14)
     np.testing.assert_allclose(y @ factor.T, before, atol=1e-13)

@@ -10,10 +10,11 @@ from hks_jax.linear.chebyshev import (
     chebyshev_iteration,
     chebyshev_recurrence,
     coefficient_tails,
+    gershgorin,
     heat_coefficients,
+    lanczos_bound,
     least_degree,
 )
-from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
 
 
 def symmetric(values, rng):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hks_jax.linear.quadratic_forms import quadratic_forms
+from hks_jax.linear.products import quadratic_forms
 
 SHAPES = [(3, 5, 40), (2, 70, 2048), (3, 130, 5000), (1, 1, 1)]
 """Matrices, functions and points: one block or several, and points that the last few share with those before."""

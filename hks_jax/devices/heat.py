@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.stencil import Stencil
-from hks_jax.linear.chebyshev import chebyshev_recurrence, heat_coefficients, least_degree
-from hks_jax.linear.spectral_bounds import gershgorin
+from hks_jax.linear.chebyshev import chebyshev_recurrence, gershgorin, heat_coefficients, least_degree
 from hks_jax.traced import is_traced
 
 

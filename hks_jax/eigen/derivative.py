@@ -13,7 +13,6 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
 from hks_jax.eigen.complement.factorised import InteriorAdjoint
-from hks_jax.eigen.first_order import first_order_only
 from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
@@ -21,6 +20,7 @@ from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.batches import one_by_one
 from hks_jax.linear.linear_map import with_transpose
+from hks_jax.linear.not_differentiable import first_order_only
 from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products

@@ -12,9 +12,8 @@ from hks_jax.eigen.count import checked_pencil
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
-from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
+from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, check_choice, truncate
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.multiplets import SPARE, MultipletChoice, check_choice, truncate
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind

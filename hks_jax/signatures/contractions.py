@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.quadratic_forms import quadratic_forms
+from hks_jax.linear.products import quadratic_forms
 from hks_jax.static_array import StaticArray
 
 

@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.first_order import first_order_only
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.linear.not_differentiable import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import Pencil
+from hks_jax.linear.chebyshev import gershgorin, lanczos_bound
 from hks_jax.linear.operators import DiagonalOperator
-from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
 
 _STEPS, _MASS_STEPS = 50, 200
 

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from hks_jax.fem.nodal import NodalPencil
-from hks_jax.linear.chebyshev import chebyshev_iteration
+from hks_jax.linear.chebyshev import chebyshev_iteration, gershgorin, lanczos_bound
 from hks_jax.linear.products import aligned
-from hks_jax.linear.spectral_bounds import gershgorin, lanczos_bound
 
 _STEPS = 64
 """Lanczos steps for the upper end of the spectrum."""

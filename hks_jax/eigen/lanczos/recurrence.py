@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.lanczos.block_algebra import orthonormal, recur, without
-from hks_jax.eigen.lanczos.krylov_basis import Basis, begin, combined, within, write
+from hks_jax.eigen.lanczos.krylov_basis import Basis, begin, combined, orthonormal, recur, within, without, write
 from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.multifrontal import Factorisation
 from hks_jax.linear.pencil import SymmetricPencil

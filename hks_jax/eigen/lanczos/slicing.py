@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.lanczos.block_algebra import orthonormal
+from hks_jax.eigen.lanczos.krylov_basis import orthonormal
 from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
 from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, crowded, make_room, steps_for
 from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
