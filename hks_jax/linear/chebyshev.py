@@ -1,4 +1,4 @@
-"""Chebyshev polynomials of a matrix by its products alone, the expansion of exp(−tλ), and bounds of spectra for them."""
+"""Chebyshev polynomials of a matrix by its products alone, the expansion of exp(−tλ) in them, and bounds of spectra."""
 
 import math
 from collections.abc import Callable
