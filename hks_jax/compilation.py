@@ -40,11 +40,15 @@ def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[
     return decorate
 
 
-def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Return a decorator for functions of few numbers, which take the module of arrays, NumPy's or JAX's, first.
+_FEW = 1 << 18
+"""Numbers that NumPy computes with in less time than it takes to compile a program for them."""
 
-    With concrete values on a CPU they are computed by NumPy, for which nothing is compiled; else by `jax.jit` with the
-    settings. What comes out are JAX's arrays.
+
+def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Return a decorator for functions that take the module of arrays, NumPy's or JAX's, first.
+
+    With concrete values on a CPU, if they are few, NumPy computes, for which nothing is compiled; else `jax.jit` with
+    the settings. What comes out are JAX's arrays.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -52,7 +56,9 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
         @wraps(function)
         def call(*args: Any) -> T:
-            if is_traced((args, jnp.zeros(()))) or jax.default_backend() != "cpu" or jax.process_count() > 1:
+            size = sum(np.size(leaf) for leaf in jax.tree.leaves(args))
+            elsewhere = jax.default_backend() != "cpu" or jax.process_count() > 1
+            if size > _FEW or elsewhere or is_traced((args, jnp.zeros(()))):
                 return compiled(*args)
             known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
             with np.errstate(all="ignore"):

@@ -142,10 +142,11 @@ def incomplete_gamma(a, x):
     return 7 * scipy.special.gamma(a + 1) * x**-a * scipy.special.gammaincc(a, x)
 
 
+@pytest.mark.parametrize("xp", [np, jnp])
 @pytest.mark.parametrize("d", [2, 3])
-def test_the_tail_by_weyl_in_closed_form(d):
+def test_the_tail_by_weyl_in_closed_form(d, xp):
     x = np.geomspace(1e-3, 60, 40)
-    tail = beyond_by_weyl(jnp.asarray(7.0), d, jnp.asarray(x))
+    tail = beyond_by_weyl(xp, xp.asarray(7.0), d, xp.asarray(x))
     np.testing.assert_allclose(tail, incomplete_gamma(d / 2, x), rtol=1e-12)
 
 
@@ -198,17 +199,18 @@ def test_truncation_map_finds_the_worst_node(rng, shape, boundary, spread):
     assert (np.nan_to_num(hj.truncation_map(every, times)) == 0).all()
 
 
+@pytest.mark.parametrize("xp", [np, jnp])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_medians_by_bisection_are_those_of_sorting(rng, dtype):
+def test_medians_by_bisection_are_those_of_sorting(rng, dtype, xp):
     shares = np.concatenate([rng.uniform(0, 1, (3, 41)), np.zeros((1, 41)), np.ones((1, 41))]).astype(dtype)
     free = np.arange(60) % 3 != 1  # 40 of 60; the others count as zero
     padded = np.zeros((5, 60), dtype)
     padded[:, free] = shares[:, :40]
-    found = median_of_shares(jnp.asarray(padded), jnp.asarray(free))
+    found = median_of_shares(xp, xp.asarray(padded), free)
     # Of an even number, the lower of the two in the middle.
     np.testing.assert_allclose(found, np.sort(shares[:, :40], axis=1)[:, 19], rtol=3e-7, atol=1e-12)
     padded[1, 5] = np.nan
-    np.testing.assert_array_equal(np.isnan(median_of_shares(jnp.asarray(padded), jnp.asarray(free))), np.arange(5) == 1)
+    np.testing.assert_array_equal(np.isnan(median_of_shares(xp, xp.asarray(padded), free)), np.arange(5) == 1)
 
 
 def test_resolution_bias_bounds_the_discretisation_error():

@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,31 +33,32 @@ def identity_unless(
     return jnp.where(inside[..., None, None], tensors, jnp.eye(tensors.shape[-1], dtype=tensors.dtype))
 
 
-def adjugate(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the adjugate ``|T| T⁻¹`` of symmetric matrices, d = 2 or 3."""
+def adjugate(tensors: Any) -> Any:
+    """Return the adjugate ``|T| T⁻¹`` of symmetric matrices (..., d, d), d = 2 or 3, of JAX or NumPy."""
     t = tensors
     if t.shape[-1] == 2:
         rows = [[t[..., 1, 1], -t[..., 0, 1]], [-t[..., 1, 0], t[..., 0, 0]]]
     else:
 
-        def cofactor(i: int, j: int) -> Array:
+        def cofactor(i: int, j: int) -> Any:
             (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
             return t[..., a, c] * t[..., b, d] - t[..., a, d] * t[..., b, c]
 
         rows = [[cofactor(j, i) for j in range(3)] for i in range(3)]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    xp = np if isinstance(t, np.ndarray) else jnp
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def determinant(tensors: Float[Array, "... d d"]) -> Float[Array, "..."]:
-    """Return the determinant |T|, d = 2 or 3."""
+def determinant(tensors: Any) -> Any:
+    """Return the determinants |T| of matrices (..., d, d), d = 2 or 3, of JAX or NumPy."""
     t = tensors
     if t.shape[-1] == 2:
         return t[..., 0, 0] * t[..., 1, 1] - t[..., 0, 1] * t[..., 1, 0]
-    return jnp.sum(t[..., 0, :] * adjugate(t)[..., :, 0], axis=-1)
+    return (t[..., 0, :] * adjugate(t)[..., :, 0]).sum(-1)
 
 
-def inverse(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return T⁻¹, d = 2 or 3."""
+def inverse(tensors: Any) -> Any:
+    """Return T⁻¹ of matrices (..., d, d), d = 2 or 3, of JAX or NumPy."""
     return adjugate(tensors) / determinant(tensors)[..., None, None]
 
 

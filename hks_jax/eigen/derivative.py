@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.compilation import jit_quickly
+from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
 from hks_jax.eigen.complement.factorised import InteriorAdjoint
 from hks_jax.eigen.interior import first_from_origin
@@ -245,7 +245,7 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
     return x
 
 
-@jax.jit
+@jit_quickly()
 def _exact_null_modes(
     pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
@@ -258,10 +258,12 @@ def _exact_null_modes(
     n_null = min(pencil.n_null, values.size)
     # The barrier keeps XLA from computing with long constants while it compiles.
     nulls = jax.lax.optimization_barrier(pencil.null_space.vectors[:n_null])
-    lengths = jnp.sqrt(jnp.sum(nulls * mass.apply(nulls), axis=1, keepdims=True))
-    nulls = nulls / lengths
-    nulls = product(lapack.inverse_cholesky(product(nulls, mass.apply(nulls).T)), nulls)
-    share = product(vectors, mass.apply(nulls).T)
+    image = mass.apply(nulls)
+    lengths = jnp.sqrt(jnp.sum(nulls * image, axis=1, keepdims=True))
+    nulls, image = nulls / lengths, image / lengths
+    orthonormal = lapack.inverse_cholesky(product(nulls, image.T))
+    nulls, image = product(orthonormal, nulls), product(orthonormal, image)
+    share = product(vectors, image.T)
     vectors = vectors - product(share, nulls)
     vectors = vectors / jnp.sqrt(1 - jnp.sum(share * share, axis=1, keepdims=True))
     return values.at[:n_null].set(0), vectors.at[:n_null].set(nulls)
@@ -310,17 +312,25 @@ def of_simple(
 @of_simple.defjvp
 def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, values, following, kept, part, pencil = primals
-    size = jnp.maximum(jnp.abs(values), values - values[:1])
-    rounding = jnp.stack([indistinct(each, values.dtype) for each in pencil.parts]).max()
-    least = jnp.maximum(jnp.sqrt(jnp.finfo(values.dtype).eps) * size, rounding)
-    near = jnp.abs(values[:, None] - values[None]) <= least[:, None]
-    if part is not None:
-        near &= part[:, None] == part[None]
-    fixed = (values == 0) & (pencil.parts[0].n_fixed > 0)  # no perturbation moves or mixes them
-    multiple = (jnp.sum(near, axis=1) > 1) & ~fixed | (following - values <= least) | ~kept
+    rounding = [indistinct(each, values.dtype) for each in pencil.parts]
+    multiple = _is_multiple(values, following, kept, part, rounding, pencil.parts[0].n_fixed > 0)
 
     def undefined(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         counts = jnp.any(x != 0, axis=1)
         return jnp.where((multiple & counts)[:, None], jnp.nan, x)
 
     return vectors, with_transpose(undefined, undefined, tangents[0])
+
+
+@numpy_where_known(static_argnums=5)
+def _is_multiple(
+    xp: Any, values: Any, following: Any, kept: Any, part: Any | None, rounding: list[Any], fixed: bool
+) -> Any:
+    """Return which pairs (k) are left out, cut, or copies of an eigenvalue that perturbations mix."""
+    size = xp.maximum(xp.abs(values), values - values[:1])
+    least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))
+    near = xp.abs(values[:, None] - values[None]) <= least[:, None]
+    if part is not None:
+        near &= part[:, None] == part[None]
+    mixed = (xp.sum(near, axis=1) > 1) & ~((values == 0) & fixed)  # no perturbation moves or mixes those that are fixed
+    return mixed | (following - values <= least) | ~kept

@@ -84,6 +84,7 @@ def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
     return 4 * jnp.finfo(dtype).eps * largest(pencil)
 
 
+@jax.jit
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
     """Return about the largest eigenvalue: 4·max|Kᵢᵢ/Mᵢᵢ| is λ_max on a uniform grid in 2D and 3D."""
     return 4 * jnp.max(jnp.abs(pencil.stiffness.diagonal()) / pencil.mass.diagonal())

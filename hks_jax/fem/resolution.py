@@ -1,14 +1,15 @@
 """How well a grid or a mesh resolves a metric: the nodal numbers behind estimates of the discretisation error."""
 
 from itertools import combinations
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from hks_jax.compilation import jit_quickly
+from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, mask_for
@@ -49,7 +50,9 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool) -> 
     """Return what the spacing of a grid, or the edges of a mesh, do to the functions of a space."""
     if isinstance(space, GridSpace):
         # The mask goes in as an array, so that grids that differ only in it share one compilation.
-        return _of_grid(metric, mask_for(metric.tensors, space.domain), space.periodic, lumped)
+        domain = mask_for(metric.tensors, space.domain)
+        settings = space.periodic, metric.interpolation, lumped
+        return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings))
     assert isinstance(space, MeshSpace)
     return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
 
@@ -62,13 +65,11 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool) -> 
 #
 # A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6, which adds d/24 Σₐ hₐ²gₐₐ/t, by E λkₐ² = (d + 2)gₐₐ/4t²;
 # 1/20 in place of 1/24 is what the next terms make of it at t = 6h².
-def dispersion(
-    tensors: Float[Array, "*shape d d"], spacing: Float[np.ndarray | Array, " d"], lumped: bool
-) -> Float[Array, "*shape"]:
-    """Return the error, times t, of the signature that Q1 elements give where tensors do not vary."""
+def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool) -> Any:
+    """Return the error (*shape), times t, of the signature that Q1 elements give where tensors do not vary."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
     of_mass = 1 / 12 + (d / 20 if lumped else 0)
-    total = jnp.zeros(tensors.shape[:-2], tensors.dtype)
+    total = xp.zeros(tensors.shape[:-2], tensors.dtype)
     for a in range(d):
         along = tensors[..., a, a]
         total = total + spacing[a] ** 2 * along * (of_mass - inverse[..., a, a] * along / 16)
@@ -79,69 +80,67 @@ def dispersion(
 # solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p, and its energy, Aₐₐ(∂ₐ²w)² hₐ²/12, is what the
 # element lacks: with p of covariance A⁻¹ it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, in units of what p has along one axis. That is for
 # √t above the length on which A varies. Below it the error is of the same size, but no such sum of neighbours.
-def turning(
-    tensors: Float[Array, "*shape d d"], domain: Bool[np.ndarray | Array, "*shape"], periodic: tuple[bool, ...]
-) -> Float[Array, "*shape"]:
-    """Return the relative error of eigenvalues because the tensors vary between neighbours that are in the domain."""
-    root = jnp.sqrt(spd.determinant(tensors))[..., None, None]
+def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
+    """Return the relative error (*shape) of eigenvalues because the tensors vary between neighbours in the domain."""
+    root = xp.sqrt(spd.determinant(tensors))[..., None, None]
     flux, reciprocal = spd.adjugate(tensors) / root, tensors / root
-    total = jnp.zeros(tensors.shape[:-2], tensors.dtype)
+    total = xp.zeros(tensors.shape[:-2], tensors.dtype)
     for a, wraps in enumerate(periodic):
-        jump = jnp.roll(flux[..., a], -1, a) - flux[..., a]
+        jump = xp.roll(flux[..., a], -1, a) - flux[..., a]
         half = 0.5 * reciprocal / flux[..., a, a, None, None]
-        both = half + jnp.roll(half, -1, a)
-        pairs = _neighbours(domain, a, wraps)
-        energy = jnp.where(pairs, jnp.einsum("...i,...ij,...j->...", jump, both, jump, precision="highest"), 0)
-        count = pairs.astype(energy.dtype) + jnp.roll(pairs, 1, a).astype(energy.dtype)
-        total = total + (energy + jnp.roll(energy, 1, a)) / (12 * jnp.maximum(count, 1))
+        both = half + xp.roll(half, -1, a)
+        pairs = _neighbours(xp, domain, a, wraps)
+        energy = xp.where(pairs, (jump[..., :, None] * both * jump[..., None, :]).sum((-2, -1)), 0)
+        count = pairs.astype(energy.dtype) + xp.roll(pairs, 1, a).astype(energy.dtype)
+        total = total + (energy + xp.roll(energy, 1, a)) / (12 * xp.maximum(count, 1))
     return total
 
 
 # Interpolation along axis a errs by −ξ(h − ξ)/2 times the second derivative, in the mean by −h²/12 times it, and the
 # density √|T| by half the trace of T⁻¹ times that: tr T⁻¹∂ₐ²T for T interpolated, ∂ₐ²log|T| for its logarithm.
-def swelling(
-    tensors: Float[Array, "*shape d d"],
-    domain: Bool[np.ndarray | Array, "*shape"],
-    periodic: tuple[bool, ...],
-    interpolation: Interpolation,
-) -> Float[Array, ""]:
+def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
     """Return the relative error of the domain's volume because of the interpolation between the nodes."""
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)
-    density, total = jnp.sqrt(determinant), jnp.zeros((), tensors.dtype)
+    density, total = xp.sqrt(determinant), xp.zeros((), tensors.dtype)
     for a, wraps in enumerate(periodic):
         if interpolation == "linear":
-            second = jnp.roll(tensors, 1, a) + jnp.roll(tensors, -1, a) - 2 * tensors
-            error = jnp.einsum("...ij,...ji->...", inverse, second, precision="highest")
+            second = xp.roll(tensors, 1, a) + xp.roll(tensors, -1, a) - 2 * tensors
+            error = (inverse * second).sum((-2, -1))  # both are symmetric
         else:
-            logarithm = jnp.log(determinant)
-            error = jnp.roll(logarithm, 1, a) + jnp.roll(logarithm, -1, a) - 2 * logarithm
-        pairs = _neighbours(domain, a, wraps)
-        weight = jnp.where(pairs & jnp.roll(pairs, 1, a), density, 0)
-        total = total + jnp.sum(weight * error) / 24 / jnp.maximum(jnp.sum(weight), jnp.finfo(tensors.dtype).tiny)
-    return jnp.abs(total)
+            logarithm = xp.log(determinant)
+            error = xp.roll(logarithm, 1, a) + xp.roll(logarithm, -1, a) - 2 * logarithm
+        pairs = _neighbours(xp, domain, a, wraps)
+        weight = xp.where(pairs & xp.roll(pairs, 1, a), density, 0)
+        total = total + xp.sum(weight * error) / 24 / xp.maximum(xp.sum(weight), xp.finfo(tensors.dtype).tiny)
+    return xp.abs(total)
 
 
-def _neighbours(domain: Bool[np.ndarray | Array, "*shape"], axis: int, wraps: bool) -> Bool[Array, "*shape"]:
-    """Tell which nodes are in the domain with the next one along the axis."""
-    pairs = jnp.logical_and(domain, jnp.roll(domain, -1, axis))
+def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
+    """Tell which nodes (*shape) are in the domain with the next one along the axis."""
+    pairs = xp.logical_and(domain, xp.roll(domain, -1, axis))
     if wraps:
         return pairs
     n = domain.shape[axis]
-    return pairs & (jnp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
+    return pairs & (xp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@jit_quickly(static_argnames=("periodic", "lumped"))
+@numpy_where_known(static_argnums=(3, 4, 5))
 def _of_grid(
-    metric: SampledMetric, domain: Bool[np.ndarray | Array, "*shape"], periodic: tuple[bool, ...], lumped: bool
-) -> Resolution:
-    assert metric.spacing is not None
-    tensors = spd.positive_or_nan(spd.identity_unless(domain, metric.tensors))
-    along = [metric.spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
-    return Resolution(
-        jnp.sqrt(jnp.max(jnp.stack(along), axis=0)),
-        dispersion(tensors, metric.spacing, lumped),
-        turning(tensors, domain, periodic),
-        swelling(tensors, domain, periodic, metric.interpolation),
+    xp: Any,
+    tensors: Any,
+    domain: Any,
+    spacing: Any,
+    periodic: tuple[bool, ...],
+    interpolation: Interpolation,
+    lumped: bool,
+) -> tuple[Any, ...]:
+    tensors = xp.where(domain[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
+    along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
+    return (
+        xp.sqrt(xp.max(xp.stack(along), axis=0)),
+        _dispersion(xp, tensors, spacing, lumped),
+        _turning(xp, tensors, domain, periodic),
+        _swelling(xp, tensors, domain, periodic, interpolation),
     )
 
 

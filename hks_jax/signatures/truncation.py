@@ -2,25 +2,26 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 from jax.scipy.special import erfc
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Real
-from scipy.special import gammainccinv
+from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import checked_times
-from hks_jax.compilation import jit_quickly
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import mask_for
+from hks_jax.linear.loops import for_each
 from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
-from hks_jax.signatures.spectral import spectral_diagonal, sum_of
+from hks_jax.signatures.spectral import spectral_diagonal
 from hks_jax.signatures.times import dimension_of, require_pairs
 from hks_jax.traced import is_traced
 
@@ -101,78 +102,78 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     dtype = require_pairs(pairs).eigenvalues.dtype
     if not pairs.lowest:
         raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
-    # Weyl's law counts from the bottom of the spectrum, which a potential moves.
-    bottom = pairs.spectral_origin
-    known = pairs.eigenvalues - bottom, pairs.kept, pairs.next_eigenvalue - bottom, checked_times("times", times, dtype)
-    resolution = jax.lax.stop_gradient(pairs.pencil).resolution
-    return _truncation(
-        resolution,
-        mask_for(pairs.eigenvalues, pairs.space.free),
-        *jax.lax.stop_gradient(known),
-        dimension=dimension_of(pairs, "an estimate of the truncation"),
-    )
+    pairs, at = jax.lax.stop_gradient((pairs, checked_times("times", times, dtype)))
+    known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
+    dimension, resolution = dimension_of(pairs, "an estimate of the truncation"), pairs.pencil.resolution
+    errors = resolution and (resolution.dispersion, resolution.turning, resolution.swelling)
+    free = mask_for(known, pairs.space.free)
+    return Truncation(at, *_truncation(errors, free, *known, at, dimension))
 
 
-@jit_quickly(static_argnames="dimension")
+@numpy_where_known(static_argnums=7)
 def _truncation(
-    resolution: Resolution | None,
-    free: Bool[np.ndarray | Array, "*shape"],
-    values: Float[Array, " k"],
-    kept: Bool[Array, " k"],
-    next_eigenvalue: Float[Array, ""],
-    at: Float[Array, " n"],
+    xp: Any,
+    errors: tuple[Any, Any, Any] | None,
+    free: Any,
+    values: Any,
+    kept: Any,
+    next_eigenvalue: Any,
+    bottom: Any,
+    at: Any,
     dimension: int,
-) -> Truncation:
-    complete = jnp.isinf(next_eigenvalue)
-    following = jnp.where(complete, 1, next_eigenvalue)
-    left = beyond_by_weyl(jnp.sum(kept, dtype=at.dtype), dimension, following * at)
-    trace = sum_of(Heat(at), values, kept)
-    tail = jnp.where(complete, 0, left / (left + trace))
-    slope = -sum_of(Derivative(Heat(at), Heat(at)), values, kept) / (dimension / 2 * trace)
-    smallest = jnp.where(complete, 0, resolving(TAIL_LIMIT, dimension) / following)
-    if resolution is None:
-        unknown = jnp.full_like(at, jnp.nan)
-        return Truncation(at, tail, unknown, unknown, unknown, smallest)
-    bias, lasting = _resolution_bias(resolution, free, at, 1 - (1 - slope) * (1 - tail))
-    coarse = jnp.sum(bias > BIAS_LIMIT, axis=1, dtype=at.dtype) / jnp.sum(free, dtype=at.dtype)
-    return Truncation(at, tail, median_of_shares(bias, free), median_of_shares(lasting, free), coarse, smallest)
+) -> tuple[Any, ...]:
+    """Return what `Truncation` has beside the times."""
+    # Weyl's law counts from the bottom of the spectrum, which a potential moves.
+    values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
+    complete = xp.isinf(next_eigenvalue)
+    following = xp.where(complete, 1, next_eigenvalue)
+    left = beyond_by_weyl(xp, xp.sum(kept, dtype=at.dtype), dimension, following * at)
+    exponents = at[:, None] * values[None]
+    terms = xp.where(kept[None], xp.exp(-exponents), 0)
+    trace = xp.sum(terms, axis=1)
+    tail = xp.where(complete, 0, left / (left + trace))
+    slope = xp.sum(xp.where(kept[None], exponents * terms, 0), axis=1) / (dimension / 2 * trace)
+    smallest = xp.where(complete, 0, resolving(TAIL_LIMIT, dimension) / following)
+    if errors is None:
+        unknown = xp.full_like(at, xp.nan)
+        return tail, unknown, unknown, unknown, smallest
+    bias, lasting = _resolution_bias(xp, errors, free, at, 1 - (1 - slope) * (1 - tail))
+    coarse = xp.sum(bias > BIAS_LIMIT, axis=1, dtype=at.dtype) / xp.sum(free, dtype=at.dtype)
+    return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
 
 # Eigenvalues larger by the factor 1 + δ make the heat trace Z(t) that of the time (1 + δ)t: an error proportional to
 # s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where the constant is left. A volume larger by the
 # factor 1 + v is that of the metric times (1 + v)^(2/d), which divides the signature by 1 + v and eigenvalues by
 # (1 + v)^(2/d): an error of v(1 − s). Where k pairs are too few for t, what lies beyond them counts with s = 1.
-def _resolution_bias(
-    resolution: Resolution,
-    free: Bool[np.ndarray | Array, "*shape"],
-    times: Float[Array, " n"],
-    slope: Float[Array, " n"],
-) -> tuple[Float[Array, "n nodes"], Float[Array, "n nodes"]]:
-    """Return the estimated relative error by the spacing, and its part that does not fall with t; 0 at other nodes."""
-    turning, dispersion = (jnp.where(free, x, 0).ravel() for x in (resolution.turning, resolution.dispersion))
-    lasting = slope[:, None] * turning[None] + (jnp.abs(1 - slope) * resolution.swelling)[:, None]
-    lasting = jnp.where(free.ravel(), lasting, 0)
-    both = jnp.hypot(dispersion[None] / times[:, None], lasting)
+def _resolution_bias(xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any) -> tuple[Any, Any]:
+    """Return the estimated relative error (n, nodes) by the spacing, and its part that does not fall with t.
+
+    Both are 0 at nodes that are not free.
+    """
+    dispersion, turning = (xp.where(free, x, 0).ravel() for x in errors[:2])
+    lasting = slope[:, None] * turning[None] + (xp.abs(1 - slope) * errors[2])[:, None]
+    lasting = xp.where(free.ravel()[None], lasting, 0)
+    both = xp.hypot(dispersion[None] / times[:, None], lasting)
     # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 
 
-def median_of_shares(x: Float[Array, "n nodes"], free: Bool[np.ndarray | Array, "*shape"]) -> Float[Array, " n"]:
-    """Return the median over the free nodes of numbers between 0 and 1, 0 at the others, to 1e-12; NaN where one is.
+def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
+    """Return the medians (n) over the free nodes of numbers (n, nodes) between 0 and 1, which are 0 at the others.
 
-    Bisection: sorting takes ten times as long.
+    To 1e-12; NaN where one is. By bisection: sorting takes JAX ten times as long.
     """
-    twice_half = 2 * free.size - jnp.sum(free)
+    twice_half = 2 * free.size - xp.sum(free)
 
-    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Any, ends: tuple[Any, Any]) -> tuple[Any, Any]:
         low, high = ends
         middle = (low + high) / 2
-        enough = 2 * jnp.sum(x <= middle[:, None], axis=1) >= twice_half
-        return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
+        enough = 2 * xp.sum(x <= middle[:, None], axis=1) >= twice_half
+        return xp.where(enough, low, middle), xp.where(enough, middle, high)
 
-    low = jnp.zeros(len(x), x.dtype)
-    _, median = jax.lax.fori_loop(0, 40, halve, (low, low + 1))
-    return jnp.where(jnp.any(jnp.isnan(x), axis=1), jnp.nan, median)
+    _, median = for_each(40, halve, (xp.zeros(len(x), x.dtype), xp.ones(len(x), x.dtype)))
+    return xp.where(xp.any(xp.isnan(x), axis=1), xp.nan, median)
 
 
 def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
@@ -218,16 +219,17 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
 
 
 # For a = 1 the integral is 1, for a = 3/2, by parts, 1 + (√π/2) erfc(√x) e^x/√x.
-def beyond_by_weyl(count: Float[Array, ""], dimension: int, x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return `beyond` for Weyl's exponent d/2, d = 2 or 3."""
+def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
+    """Return `beyond` of x (...) for Weyl's exponent d/2, d = 2 or 3."""
     if dimension == 2:
-        return count * jnp.exp(-x) / x
-    return 1.5 * count * (jnp.exp(-x) + math.sqrt(math.pi) / 2 * erfc(jnp.sqrt(x)) / jnp.sqrt(x)) / x
+        return count * xp.exp(-x) / x
+    complement = erfc if xp is jnp else scipy.special.erfc
+    return 1.5 * count * (xp.exp(-x) + math.sqrt(math.pi) / 2 * complement(xp.sqrt(x)) / xp.sqrt(x)) / x
 
 
 def resolving(share: float, dimension: int) -> float:
     """Return the Λt from which on no more than this share of the heat trace lies beyond Λ, by Weyl's law."""
-    return float(gammainccinv(dimension / 2, share))
+    return float(scipy.special.gammainccinv(dimension / 2, share))
 
 
 @nan_is_meant
