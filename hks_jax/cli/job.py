@@ -24,6 +24,7 @@ from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.hks import HKSMethod, Normalisation, hks, hks_auto
 from hks_jax.signatures.times import default_times, positive_range
 from hks_jax.signatures.truncation import truncation, truncation_map
+from hks_jax.uncertainty import Uncertainty
 
 
 class ComputationError(RuntimeError):
@@ -52,13 +53,14 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The signature on the volume whose mask is the domain, or on a mesh, and what the report says of it."""
+    """The signature on the volume whose mask is the domain, or on a mesh; its report; its error bars, if asked for."""
 
     volume: TensorVolume | SimplicialMesh
     times: np.ndarray
     values: np.ndarray
     eigenvalues: np.ndarray
     report: dict[str, Any]
+    bars: Uncertainty | None = None
 
 
 def use_dtype(dtype: str) -> None:

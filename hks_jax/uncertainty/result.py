@@ -13,7 +13,7 @@ from hks_jax.checks import require_number
 
 BEYOND = 0.02
 """The share of the variance beyond linear, its median over the nodes, from which on intervals are not claimed."""
-INDEFINITE = 1e-3
+INDEFINITE = 0.02
 """The share of tensors made indefinite by noise from which on they are not."""
 
 
@@ -80,7 +80,7 @@ class Uncertainty(eqx.Module):
         """Where intervals are claimed: bool, for each number, or for each entry of the first axis of maps, as a time.
 
         They are where `beyond_linear` is at most 2 % and the bias at most the deviation, in the median over the map,
-        and noise makes at most one tensor in a thousand indefinite.
+        and noise makes at most two tensors in a hundred indefinite.
         """
 
         def of(deviation: Array, bias: Array, beyond: Array) -> Array:
