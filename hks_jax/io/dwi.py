@@ -154,8 +154,8 @@ def fit_dwi(
 
 # With the logarithms y of the signals, weights w (the signals that an unweighted fit predicts), and the rows X of the
 # design, least squares minimise Σ w²(y − Xβ)². A logarithm has the variance σ²/w² to first order, so that β has the
-# covariance σ²(XᵀW²X)⁻¹, and σ² is the sum of squares over as many images as there are more than unknowns (Koay, Chang,
-# Pierpaoli and Basser 2007).
+# covariance σ²(XᵀW²X)⁻¹, and σ² is the signals' sum of squared residuals over as many as there are more images than
+# unknowns (Koay, Chang, Pierpaoli and Basser 2007).
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],
@@ -179,8 +179,9 @@ def _covariance(
                 f"are {design.shape[1]} unknowns; expected at least {design.shape[1] + 1} images, and 15 for an "
                 "estimate to a quarter. State the noise of the images as a number"
             )
-        residuals = y - np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True)
-        variance = np.sum(weights * residuals**2, axis=1) / freedom
+        # Of the signals, not of their logarithms, which near zero are far off.
+        fitted = np.exp(np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True))
+        variance = np.sum((data - fitted) ** 2, axis=1) / freedom
         if (zero := variance <= 1e-20 * weights.mean(axis=1)).any():
             raise ValueError(
                 f'noise: got "residuals", which are zero in {int(zero.sum())} of {len(zero)} voxels; expected images '

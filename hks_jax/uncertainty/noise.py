@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.special import gammaincinv
 
 from hks_jax.checks import real_array, require_number
 from hks_jax.domain.grid import Grid
@@ -80,8 +81,9 @@ class TensorNoise(eqx.Module):
         """Estimate the noise of each of two scans of the same subject: half of the square of their difference.
 
         One covariance, relative to the squared mean diffusivity, and one correlation length are estimated over all
-        nodes inside the mask, the latter from neighbours along the axes. Assumed are scans that lie exactly on each
-        other, and equal and independent noise: whatever moved between them counts as noise.
+        nodes inside the mask: the size of the former by a median, the latter from neighbours along the axes. Assumed
+        are scans that lie exactly on each other, and equal and independent noise: whatever moved between them counts
+        as noise.
 
         Args:
             first: (*shape, d, d), tensors of one scan.
@@ -104,6 +106,9 @@ class TensorNoise(eqx.Module):
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: they are the same; expected two scans, whose noise differs")
+        # The typical node counts, not the few, as in fluid, that have much more noise: q would have χ²'s median.
+        q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
+        relative *= np.median(q) / (2 * gammaincinv(len(relative) / 2, 0.5))
         # Blurred white noise has the correlation exp(−h²/4w²) at the distance h.
         widths = []
         for axis, h in enumerate(grid.spacing):
