@@ -828,6 +828,15 @@ def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
         assert saved["deviation"].shape == saved["bias"].shape == saved["hks"].shape
         known = np.isfinite(saved["hks"])
         assert (saved["deviation"][known] > 0).all()
+        drawn = np.sqrt(np.mean(np.square(saved["noise_maps"]), axis=0))
+        np.testing.assert_allclose(saved["deviation"][known], drawn[known], rtol=1e-4)
+        labels = np.where(np.arange(SHAPE[0]) < 7, 1, 2)[:, None] * np.ones(SHAPE[1], int)
+        np.save(tmp_path / "labels.npy", labels)
+        mean = np.nanmean(saved["noise_maps"][:, 1, :7], axis=(1, 2))
+    main(["stats", str(tmp_path / "out"), "--atlas", str(tmp_path / "labels.npy"), "-q"])
+    lines = (tmp_path / "out" / "regions.tsv").read_text().splitlines()
+    assert lines[0].endswith("\terror")
+    assert float(lines[2].split("\t")[-1]) == pytest.approx(np.sqrt(np.mean(mean**2)), rel=1e-3)
 
 
 def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):

@@ -1,7 +1,7 @@
 """The main job: from a tensor volume or a mesh to its heat kernel signature, and what is known about it."""
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,13 @@ class Settings:
     dtype: Literal["float32", "float64"] = "float64"
 
 
+class Bars(NamedTuple):
+    """Error bars of a signature, and the noise (n_draws, n_times, *shape) of which they are made."""
+
+    uncertainty: Uncertainty
+    maps: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The signature on the volume whose mask is the domain, or on a mesh; its report; its error bars, if asked for."""
@@ -60,7 +67,7 @@ class Result:
     values: np.ndarray
     eigenvalues: np.ndarray
     report: dict[str, Any]
-    bars: Uncertainty | None = None
+    bars: Bars | None = None
 
 
 def use_dtype(dtype: str) -> None:

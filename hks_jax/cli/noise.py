@@ -14,7 +14,7 @@ from jaxtyping import Float
 from hks_jax.accuracy import AccuracyWarning
 from hks_jax.cli.arguments import Times
 from hks_jax.cli.inputs import read_volume
-from hks_jax.cli.job import Result, Settings, automatic_times
+from hks_jax.cli.job import Bars, Result, Settings, automatic_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
@@ -22,7 +22,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solve import eigenpairs
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.hks import hks
-from hks_jax.uncertainty import TensorNoise, Uncertainty, uncertainty
+from hks_jax.uncertainty import TensorNoise, uncertainty
 
 _CANDIDATES = 4
 """How many times as many times are looked at as automatic ones are asked for."""
@@ -55,7 +55,7 @@ def noise_of(args: argparse.Namespace, volume: TensorVolume, grid: Grid, progres
 
 def error_bars(
     volume: TensorVolume, noise: TensorNoise, pairs: Eigenpairs, settings: Settings, draws: int, progress: Progress
-) -> tuple[Uncertainty, Settings]:
+) -> tuple[Bars, Settings]:
     """Compute error bars; return them, and the settings with the times, which begin where there is signal."""
     if settings.method != "spectral":
         raise ValueError(f"--noise: with --method {settings.method} there are no error bars; leave one of them out")
@@ -73,7 +73,15 @@ def error_bars(
     with progress.stage("error bars", f"{draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # of times that are not chosen, too
         tensors = volume.tensors.astype(settings.dtype)
-        bars = uncertainty(signature, tensors, noise, method="resample", draws=draws, progress=progress.update)
+        maps: list[np.ndarray] = []
+
+        def keep(one: Any) -> None:
+            maps.append(np.asarray(one, np.float32))
+
+        bars = uncertainty(
+            signature, tensors, noise, method="resample", draws=draws, progress=progress.update, each=keep
+        )
+    chosen = np.arange(len(times))
     if not settings.times.explicit:
         clear = np.flatnonzero(np.asarray(bars.signal_to_noise) >= _SIGNAL)
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
@@ -82,11 +90,12 @@ def error_bars(
         times = tuple(times[i] for i in chosen)
     for message in bars.messages():
         progress.warn(message)
-    return bars, replace(settings, times=Times(times, wanted))
+    return Bars(bars, np.stack(maps)[:, chosen]), replace(settings, times=Times(times, wanted))
 
 
-def with_error_bars(result: Result, bars: Uncertainty, source: str) -> Result:
+def with_error_bars(result: Result, found: Bars, source: str) -> Result:
     """Return a result with error bars, and with what the report says of them."""
+    bars = found.uncertainty
     ratio = np.asarray(bars.signal_to_noise)
     clear = np.flatnonzero(ratio > _CLEAR)
     report = {
@@ -98,7 +107,7 @@ def with_error_bars(result: Result, bars: Uncertainty, source: str) -> Result:
         "claimed": np.asarray(bars.trusted).tolist(),
         f"exceeds_{_CLEAR:g}_from_t": float(result.times[clear[0]]) if clear.size else None,
     }
-    return replace(result, bars=bars, report={**result.report, "noise": report})
+    return replace(result, bars=found, report={**result.report, "noise": report})
 
 
 def z_of(result: Result) -> Float[np.ndarray, "n_times *shape"] | None:
@@ -112,4 +121,4 @@ def z_of(result: Result) -> Float[np.ndarray, "n_times *shape"] | None:
         reference = ((4 * np.pi * result.times) ** power).reshape(ones)
     else:
         reference = np.nanmedian(values.reshape(len(values), -1), axis=1).reshape(ones)
-    return (values - reference) / np.asarray(result.bars.deviation)
+    return (values - reference) / np.asarray(result.bars.uncertainty.deviation)

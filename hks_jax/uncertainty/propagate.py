@@ -68,6 +68,7 @@ def uncertainty(
     compiled: bool = True,
     progress: Callable[[str], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
+    each: Callable[[Any], None] | None = None,
 ) -> Uncertainty:
     """Compute what noise of measured tensors does to a function of them: its standard deviation, and its bias.
 
@@ -101,6 +102,8 @@ def uncertainty(
             called as it is.
         progress: called with a short text after each pair.
         checkpoint: a file to write after each pair. If it is there already, resampling goes on from it.
+        each: called with the noise that each pair found, of the structure of the value and of its deviation: what
+            covariances, or errors of means over regions, can be made of. Not again for pairs of a checkpoint.
 
     Returns:
         Value, deviation and bias, and how sure they are. Under `jit` it works with a method that is named. The
@@ -137,7 +140,7 @@ def uncertainty(
         method = "exact" if compiled and size <= draws else "resample"
     half = -(-draws // 2)
     pairs = half if method == "resample" else min(_PAIRS, half)
-    moments = _in_pairs(run, value, measured, noise, seed, pairs, progress, checkpoint)
+    moments = _in_pairs(run, value, measured, noise, seed, pairs, progress, checkpoint, each)
     variance = jax.tree.map(lambda odd: odd / pairs, moments.odd)
     spread = jax.tree.map(lambda s: s / max(pairs - 1, 1), moments.spread)
     freedom: float = pairs
@@ -240,6 +243,7 @@ def _in_pairs(
     pairs: int,
     progress: Callable[[str], None] | None,
     checkpoint: str | os.PathLike[str] | None,
+    each: Callable[[Any], None] | None,
 ) -> _Moments:
     """Return the moments of antithetic pairs."""
     nothing = jax.tree.map(jnp.zeros_like, value)
@@ -247,8 +251,11 @@ def _in_pairs(
     moments = _Moments(none, nothing, nothing, nothing, none)
 
     def step(index: Any, moments: _Moments) -> _Moments:
-        plus, minus, raised = _pair(measured, noise, seed, index)
-        return moments.add(run(plus), run(minus), value, raised)
+        more, less, raised = _pair(measured, noise, seed, index)
+        plus, minus = run(more), run(less)
+        if each is not None:
+            each(jax.tree.map(lambda p, m: (p - m) / (2 * _SCALE), plus, minus))
+        return moments.add(plus, minus, value, raised)
 
     if is_traced(value):
         return jax.lax.fori_loop(0, pairs, step, moments)
