@@ -18,13 +18,14 @@ import numpy as np
 from brain_study import tissues
 
 import hks_jax as hj
+from hks_jax.cli.picture import cropped, placed
 
 jax.config.update("jax_enable_x64", True)
 
-LENGTHS = 2.0 ** np.arange(0.5, 4.0, 0.5)
+LENGTHS = 2.0 ** np.arange(1.0, 4.0, 0.5)
 """√(Dt) in voxels, D the median mean diffusivity of the slice."""
 REGIONS = {"all": (1, 2, 3, 4), "grey matter": (1, 2), "white matter": (3,)}
-SETTINGS = {"k": 250, "boundary": "mean"}
+SETTINGS = {"k": 400, "boundary": "mean"}
 DRAWS = 16
 
 
@@ -124,19 +125,20 @@ def study(volumes: list[hj.io.TensorVolume], z: int) -> tuple[dict, dict]:
 def draw(path: Path, grid: hj.Grid, bars: list[hj.Uncertainty], times: np.ndarray, plane: hj.io.TensorVolume) -> None:
     """Draw both halves without fading, and below the whole with it."""
     first, second = bars[1:]
-    shown, chosen = bars[0], [0, 2, 4, 6]
-    figure = hj.plot.new_figure(13, 9.6)
+    shown, chosen = bars[0], [0, 1, 3, 5]
+    figure = hj.plot.new_figure(12, 10.2)
     panels = figure.subplots(3, len(chosen), squeeze=False)
-    orientation = hj.plot.Orientation.of(plane.affine, 2)
+    small, box = cropped(plane, grid.inside)
+    orientation = placed(plane, box, "neurological")
     names = ("first half", "second half", "whole, noise faded")
     for line, name, each in zip(panels, names, (first, second, shown), strict=True):
         for ax, i in zip(line, chosen, strict=True):
-            value = np.where(grid.inside, np.asarray(shown.value[i]), np.nan)
+            value = np.asarray(shown.value[i])
             reach = float(np.nanquantile(np.abs(value - 1), 0.97))
-            z = shown.z(1.0)[i] if each is shown else None
+            z = np.asarray(shown.z(1.0)[i])[box] if each is shown else None
             colours = {"vmin": 1 - reach, "vmax": 1 + reach, "cmap": "RdBu_r"}
-            hj.plot.scalar_image(ax, each.value[i], grid, orientation=orientation, z=z, **colours)
-            ax.set_title(f"{name}, {LENGTHS[i]:.2g} voxels" if each is first else name, fontsize="medium")
+            hj.plot.scalar_image(ax, np.asarray(each.value[i])[box], small, orientation=orientation, z=z, **colours)
+            ax.set_title(rf"{name}, $\sqrt{{Dt}}$ = {LENGTHS[i]:.2g} voxels", fontsize="small")
             ax.set_axis_off()
     hj.plot.save_figure(figure, path)
 

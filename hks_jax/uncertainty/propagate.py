@@ -122,10 +122,9 @@ def uncertainty(
     def smoothed(D: Array) -> Array:
         return smooth_tensors(noise.grid, D, smoothing) if noise.grid is not None and smoothing else D
 
-    def of_smoothed(D: Array) -> Any:
-        return function(smoothed(D))
-
-    run = jax.jit(of_smoothed) if compiled else of_smoothed
+    # The function itself where it can be: what is compiled of it then serves other calls, too.
+    whole = (lambda D: function(smoothed(D))) if smoothing else function
+    run = jax.jit(whole) if compiled else whole
     try:
         value = run(measured)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
@@ -147,7 +146,7 @@ def uncertainty(
     if method != "resample":
         freedom = math.inf if method == "exact" else draws
         rule = _exact if method == "exact" else partial(_linear, draws=draws)
-        variance = rule(of_smoothed, measured, noise, seed)
+        variance = rule(whole, measured, noise, seed)
     smear = None
     if smoothing:
         smear = jax.tree.map(jnp.subtract, run(smoothed(measured)), value)
