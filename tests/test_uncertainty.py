@@ -50,13 +50,13 @@ def test_neighbours_share_noise_as_blurred_white_noise_does():
     np.testing.assert_allclose(C[12, 12:18], np.exp(-(r**2) / (4 * 0.9**2)), atol=2e-4)
 
 
-def test_numbers_are_exact_and_say_which_measurement_matters(rng):
-    grid = hj.Grid((5, 4))
+def test_numbers_are_exact(rng):
+    grid = hj.Grid((4, 3))
     D, m = random_spd(rng, grid.shape, 0.2), 3
     noise = hj.TensorNoise(1e-3 * random_covariance(rng, grid.shape, m), grid, correlation=0.6)
 
     def mean(D):
-        pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, D, "inverse"), 20, solver="dense")
+        pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, D, "inverse"), 12, solver="dense")
         return jnp.mean(hj.hks(pairs, [3.0])[:, :2])
 
     bars = hj.uncertainty(mean, D, noise)
@@ -65,28 +65,36 @@ def test_numbers_are_exact_and_say_which_measurement_matters(rng):
     J = jax.jacobian(noise.tensors)(jnp.zeros((*grid.shape, m))).reshape(g.size, -1)
     np.testing.assert_allclose(bars.deviation, np.linalg.norm(np.ravel(g) @ J), rtol=1e-10)
 
-    def variance(covariance):
-        return hj.uncertainty(mean, D, hj.TensorNoise(covariance), method="exact", draws=4).deviation ** 2
 
-    slope = jax.jit(jax.grad(variance))(noise.covariance)
+def test_the_derivative_by_the_noise_says_which_measurement_matters(rng):
+    D = random_spd(rng, (5, 4), 0.2)
+
+    def volume(D):
+        return jnp.sum(jnp.sqrt(spd.determinant(D)))
+
+    def variance(covariance):
+        return hj.uncertainty(volume, D, hj.TensorNoise(covariance), method="exact", draws=4).deviation ** 2
+
+    slope = jax.jit(jax.grad(variance))(jnp.asarray(1e-3 * random_covariance(rng, (5, 4), 3)))
+    g = jax.grad(volume)(jnp.asarray(D))
     parts = components(g + np.swapaxes(g, -1, -2)) * np.where(np.equal(*np.tril_indices(2)), 0.5, 1.0)
     symmetric = (slope + np.swapaxes(slope, -1, -2)) / 2
     np.testing.assert_allclose(symmetric, parts[..., :, None] * parts[..., None, :], rtol=1e-8, atol=1e-14)
 
 
 def test_maps_agree_with_the_dense_jacobian(rng):
-    grid = hj.Grid((6, 5))
+    grid = hj.Grid((5, 4))
     D = random_spd(rng, grid.shape, 0.2)
     noise = hj.TensorNoise(1e-4 * random_covariance(rng, grid.shape, 3), grid)
 
     def signature(D):
-        pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, D, "inverse"), 30, solver="dense")
+        pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, D, "inverse"), 20, solver="dense")
         return hj.hks(pairs, [2.0, 8.0], "flat")
 
     J = jax.jacobian(lambda white: signature(D + noise.tensors(white)))(jnp.zeros((*grid.shape, 3)))
     expected = np.sqrt(np.sum(np.square(J), axis=(-3, -2, -1)))
     for method in ("resample", "linear"):
-        bars = hj.uncertainty(signature, D, noise, method=method, draws=400)
+        bars = hj.uncertainty(signature, D, noise, method=method, draws=200)
         ratio = np.asarray(bars.deviation) / expected
         assert abs(np.sqrt(np.mean(ratio**2)) - 1) < 2 * bars.sampling_error
         assert np.std(ratio) < 1.5 * bars.sampling_error
