@@ -15,7 +15,7 @@ import nibabel as nib
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.domain.phantom import phantom
+from hks_jax.domain.examples import phantom
 
 jax.config.update("jax_enable_x64", True)
 
