@@ -57,6 +57,13 @@ HEADINGS = {
     "span_s": "first to last launch, s",
     "waits_before": "before",
     "peak_GB_before": "before",
+    "maps_claimed": "claimed",
+    "in_68_claimed": "claimed in 68 %",
+    "in_95_claimed": "claimed in 95 %",
+    "in_68_all": "all in 68 %",
+    "in_95_all": "all in 95 %",
+    "worst_68": "farthest from 68 %",
+    "uncorrected": "value ± σ",
     "least_ms": "least time, ms",
     "least_ms_before": "before",
 }

@@ -75,6 +75,10 @@ from hks_jax.signatures.truncation import truncation_map as truncation_map
 from hks_jax.spectrum_free.colours import Colouring as Colouring
 from hks_jax.spectrum_free.heat_diagonal import colouring as colouring
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free as hks_spectrum_free
+from hks_jax.uncertainty import TensorNoise as TensorNoise
+from hks_jax.uncertainty import Uncertainty as Uncertainty
+from hks_jax.uncertainty import smooth_tensors as smooth_tensors
+from hks_jax.uncertainty import uncertainty as uncertainty
 
 __version__ = "0.2.0"
 

@@ -808,3 +808,42 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     before = sorted(tmp_path.iterdir())
     assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
+    noise = "0.05"
+    if second:
+        noise = str(tmp_path / "second.npz")
+        other = metric() * (1 + 0.04 * rng.standard_normal((*SHAPE, 1, 1)))
+        np.savez(noise, tensors=other, spacing=[0.5, 0.25], origin=[1.0, 2.0], mask=disc())
+    words = ["-k", "30", "--times", "auto:3", "--noise", noise, "--draws", "8", "--normalisation", "flat", "-q"]
+    main(["hks", str(npz), "-o", str(tmp_path / "out"), "--metric", "inverse", *words])
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    ratio = report["noise"]["signal_to_noise"]
+    assert len(ratio) == len(report["times"]) == 3
+    assert ratio[0] >= 1
+    assert report["noise"]["sampling_error"] == pytest.approx(8**-0.5)
+    with np.load(tmp_path / "out" / "hks.npz") as saved:
+        assert saved["deviation"].shape == saved["bias"].shape == saved["hks"].shape
+        known = np.isfinite(saved["hks"])
+        assert (saved["deviation"][known] > 0).all()
+        drawn = np.sqrt(np.mean(np.square(saved["noise_maps"]), axis=0))
+        np.testing.assert_allclose(saved["deviation"][known], drawn[known], rtol=1e-4)
+        labels = np.where(np.arange(SHAPE[0]) < 7, 1, 2)[:, None] * np.ones(SHAPE[1], int)
+        np.save(tmp_path / "labels.npy", labels)
+        mean = np.nanmean(saved["noise_maps"][:, 1, :7], axis=(1, 2))
+    main(["stats", str(tmp_path / "out"), "--atlas", str(tmp_path / "labels.npy"), "-q"])
+    lines = (tmp_path / "out" / "regions.tsv").read_text().splitlines()
+    assert lines[0].endswith("\terror")
+    assert float(lines[2].split("\t")[-1]) == pytest.approx(np.sqrt(np.mean(mean**2)), rel=1e-3)
+
+
+def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):
+    for words, text in (
+        (["--noise", "residuals"], "--noise: residuals are those of a fit"),
+        (["--noise", "0.1", "--method", "auto"], "--noise: with --method auto there are no error bars"),
+        (["--noise", str(tmp_path / "absent.npz")], "absent.npz"),
+    ):
+        assert main(["hks", str(npz), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) != 0
+        assert text in capsys.readouterr().err

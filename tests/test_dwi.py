@@ -1,9 +1,11 @@
 """Scans as they come: signals and directions that are not numbers, b-values in other units."""
 
+import jax.numpy as jnp
 import nibabel as nib
 import numpy as np
 import pytest
 
+import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.io import fit_dwi
 
@@ -113,3 +115,89 @@ def test_b_values_in_another_unit_are_refused_until_it_is_told(scan, capsys, uni
     assert f"pass --unit {unit}, that of the tensors" in capsys.readouterr().err
     assert main([*arguments, "--unit", unit]) == 0
     assert "(b ≤ 1000 s/mm²)" in capsys.readouterr().out
+
+
+def noisy_scan(scan, images, rng, sigma=10.0):
+    """Let every voxel of the head be another measurement of the same tensor."""
+    directions = rng.normal(size=(images, 3))
+    scan.directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    scan.b = np.where(np.arange(images) < 2, 0.0, 1000.0)
+    exponent = scan.b * np.einsum("na,ab,nb->n", scan.directions, D, scan.directions)
+    scan.directions[:2] = 0
+    scan.signal = 1000 * np.exp(-exponent) + sigma * rng.standard_normal((*SHAPE, images))
+    return sigma
+
+
+def lower(tensors):
+    rows, columns = np.tril_indices(3)
+    return tensors[..., rows, columns]
+
+
+@pytest.mark.parametrize("frame", ["fsl", "world"])
+def test_covariances_are_those_of_repeated_scans(scan, rng, frame):
+    sigma = noisy_scan(scan, 20, rng)
+    affine = np.eye(4)
+    affine[:3, :3] = 2 * np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    paths, whole = scan.write(), np.ones(SHAPE, bool)
+    nib.save(nib.Nifti1Image(scan.signal, affine), paths[0])
+    stated, found = (fit_dwi(*paths, whole, bvec_frame=frame, noise=noise) for noise in (sigma, "residuals"))
+    expected = np.cov(lower(stated.tensors[whole]).T)
+    for fit in (stated, found):
+        mean = fit.covariance[whole].mean(axis=0)
+        np.testing.assert_allclose(mean, expected, atol=0.08 * np.abs(expected).max())
+    assert "covariances of the tensors from the fit's residuals, of 13 degrees of freedom" in " ".join(found.notes)
+    plane = found.slice("y", 10)
+    np.testing.assert_array_equal(plane.covariance, found.covariance[:, 10][..., [0, 3, 5], :][..., [0, 3, 5]])
+
+
+def test_covariances_agree_with_the_wild_bootstrap(scan, rng):
+    # Residuals of random sign, scaled by what the fit takes of them (Whitcher, Tuch, Wisco, Sorensen and Wang 2008).
+    noisy_scan(scan, 40, rng)
+    found = scan.fit(head(), noise="residuals")
+    from dipy.core.gradients import gradient_table
+    from dipy.reconst import dti
+
+    table = gradient_table(scan.b, bvecs=scan.directions)
+    X, voxels = dti.design_matrix(table), np.argwhere(head())[:30]
+    ratios = []
+    for voxel in map(tuple, voxels):
+        y = np.log(scan.signal[voxel])
+        w = np.exp(X @ np.linalg.pinv(X) @ y)
+        fitted = X @ np.linalg.lstsq(X * w[:, None], w * y, rcond=None)[0]
+        hat = (X * w[:, None]) @ np.linalg.pinv(X * w[:, None])
+        scaled = (y - fitted) / np.sqrt(1 - np.diag(hat))
+        again = np.exp(fitted + scaled * rng.choice([-1, 1], (150, 40)))
+        spread = np.var(lower(dti.TensorModel(table).fit(again).quadratic_form), axis=0)
+        ratios.append(spread / np.diag(found.covariance[voxel]))
+    assert abs(np.mean(ratios) - 1) < 0.1
+
+
+def test_the_error_of_anisotropy_is_that_of_koay(scan, rng):
+    noisy_scan(scan, 30, rng)
+    fit = scan.fit(head(), noise="residuals")
+
+    def anisotropy(tensors):
+        deviator = tensors - jnp.trace(tensors) / 3 * np.eye(3)
+        return jnp.sqrt(1.5 * jnp.sum(deviator**2) / jnp.sum(tensors**2))
+
+    T, covariance = fit.tensors[12, 11, 3], fit.covariance[12, 11, 3]
+    bars = hj.uncertainty(lambda tensors: anisotropy(tensors[0]), T[None], hj.TensorNoise(covariance[None]))
+    # Koay, Chang, Pierpaoli and Basser 2007: FA² = 3/2 (1 − (tr D)²/3|D|²); off the diagonal a component counts twice.
+    trace, square = np.trace(T), np.sum(T**2)
+    slope = (T * trace**2 / square - trace * np.eye(3)) / (2 * square * float(anisotropy(T)))
+    g = lower(slope) * np.where(np.equal(*np.tril_indices(3)), 1, 2)
+    assert bars.method == "exact"
+    np.testing.assert_allclose(bars.deviation, np.sqrt(g @ covariance @ g), rtol=1e-8)
+    spread = np.std([anisotropy(each) for each in fit.tensors[head()][:300]])
+    assert abs(spread / bars.deviation - 1) < 0.35
+
+
+def test_noise_needs_residuals(scan):
+    with pytest.raises(
+        ValueError, match=rf'noise: got "residuals", which are zero in {head().sum()} of {head().sum()}'
+    ):
+        scan.fit(head(), noise="residuals")
+    scan.b[1] = 3000.0
+    scan.b[8:] = 3000.0
+    with pytest.raises(ValueError, match=r'"residuals" with 7 images, and .* 7 unknowns; expected at least 8 images'):
+        scan.fit(head(), b_max=1000, noise="residuals")

@@ -377,6 +377,42 @@ def test_deviation_bounds_that_of_the_exact_posterior():
     assert (few.deviation < 0.5).all()
 
 
+def test_error_bars_of_a_fit_are_those_of_its_posterior():
+    """The covariance is (JᵀΣ⁻¹J + R)⁻¹, with the penalties' and the white prior's R."""
+    grid = hj.Grid((7, 6), 0.2)
+    tensors = np.exp(0.3 * np.sin(3 * grid.nodes[..., 0]))[..., None, None] * np.eye(2)
+    target = hj.hks(hj.eigenpairs(hj.TensorField(grid, tensors), 42), [0.15, 0.4])
+    init = hj.TensorField(grid, np.broadcast_to(np.eye(2), (7, 6, 2, 2)))
+    deviation = 0.02 * target * (1 + np.arange(6) / 3)
+    fit = hj.fit_metric(
+        target, [0.15, 0.4], init, "conformal", k=42, deviation=deviation, regularisers=[H1(1e-5)], max_steps=3
+    )
+    relative = np.asarray(deviation / target)
+    assert fit.noise == pytest.approx(np.sqrt(target.size / np.sum(relative**-2.0)))
+
+    def residuals(values):
+        _, penalties = fit.problem.residuals(values)
+        signature = fit.problem.observation.predict(fit.problem.pairs(values))
+        own = jnp.log(signature / target) / relative
+        return jnp.concatenate([own.ravel(), penalties * np.sqrt(target.size) / fit.noise])
+
+    A = jax.jit(jax.jacfwd(residuals))(fit.values)[..., 0]
+    exact = np.sqrt(np.diag(np.linalg.inv(A.T @ A + np.eye(42) / 0.5**2)))
+    found = fit.uncertainty(prior=0.5, draws=400)
+    assert found.unsolved < 1e-5
+    ratio = np.asarray(found.values)[:, 0] / exact
+    assert abs(ratio.mean() - 1) < 0.02
+    assert ratio.std() < 2 * found.sampling_error
+    # T = e^u I.
+    np.testing.assert_allclose(
+        found.tensors[..., 0, 0].ravel(), np.exp(fit.values[:, 0]) * found.values[:, 0], rtol=1e-10
+    )
+    with pytest.raises(ValueError, match=r"deviation: 14 of 84 are not positive numbers \(the first at \(0, 0, 1\)"):
+        hj.fit_metric(target, [0.15, 0.4], init, deviation=np.where(np.arange(6) % 7 == 1, 0, 0.1)[: target.shape[-1]])
+    with pytest.raises(ValueError, match="deviation: it cannot be taken through a loss that is a function"):
+        hj.fit_metric(target, [0.15, 0.4], init, deviation=deviation, loss=lambda a, b: a - b)
+
+
 @pytest.mark.slow
 def test_identifiability_is_the_spectrum_of_the_information(rng):
     # On the smaller grid the weakest direction takes more iterations than these.

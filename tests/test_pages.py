@@ -9,8 +9,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
-# A file of the reader's, and addresses of other machines, are not here.
-NOT_HERE = ("heart.vtu", "jax.distributed.initialize")
+# Files of the reader's, and addresses of other machines, are not here.
+NOT_HERE = ("heart.vtu", "dwi.nii.gz", "jax.distributed.initialize")
 
 
 def blocks(page):

@@ -440,3 +440,12 @@ def test_colours_reach_as_far_above_their_centre_as_below():
     assert image.get_cmap().name == "viridis"
     figure = hks_panels(np.stack([values, 1 + 2 * (values - 1)]), [1.0, 2.0], grid, centre=1.0, shared_range=True)
     assert figure.axes[0].images[0].get_clim() == pytest.approx((0.2, 1.8))
+
+
+def test_what_noise_could_make_fades_into_grey():
+    grid = Grid((3, 2))
+    values, z = np.arange(6.0).reshape(3, 2), np.array([[0.0, -1.0], [2.0, 5.0], [np.nan, -3.0]])
+    figure = hks_panels(values[None], [1.0], grid, z=z[None])
+    grey = np.asarray(figure.axes[0].images[1].get_array())
+    assert grey.shape == (2, 3, 4)
+    np.testing.assert_allclose(grey[..., 3].T, [[1, 0.5], [0, 0], [0, 0]])

@@ -71,6 +71,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     add_clean_argument(parser)
     add_signature_arguments(parser)
+    add_noise_arguments(parser)
     add_view_argument(parser)
     add(
         "--save-pairs",
@@ -106,6 +107,20 @@ def add_signature_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_noise_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that ask for error bars."""
+    add = parser.add_argument_group("error bars").add_argument
+    add(
+        "--noise",
+        metavar="N",
+        help="of the tensors, for error bars: a number, relative to the mean diffusivity, such as 0.1; residuals, what "
+        "the fit to diffusion-weighted images leaves; a second FILE of tensors, from another scan of the subject; or "
+        "roughness, what neighbours differ by. Adds deviation and bias to hks.npz, signal to noise at each t to the "
+        "report, and fades in the picture what noise could make; automatic times begin where signal is",
+    )
+    add("--draws", type=int, default=16, metavar="N", help="noisy maps that error bars are made of (default 16)")
+
+
 def settings_of(args: argparse.Namespace, times: Times, metric: MetricChoice | None) -> "Settings":
     """Return what the arguments ask for."""
     from hks_jax.cli.job import Settings
@@ -132,11 +147,14 @@ def run(args: argparse.Namespace) -> None:
     on_mesh, saved = is_mesh(args.file), is_saved_pairs(args.file)
     if args.clean and not on_mesh:
         raise ValueError("--clean: it is for meshes; leave it out for tensors on a grid, and see --repair")
+    if args.noise is not None and (on_mesh or saved):
+        raise ValueError("--noise: it is for tensors on a grid; leave it out for meshes and for eigenpairs")
     if not (on_mesh or saved):
         require_metric(args)
     from hks_jax.cli import mesh as meshes
     from hks_jax.cli import saved_pairs
     from hks_jax.cli.job import compute_on_mesh, compute_pairs, signature_of
+    from hks_jax.cli.noise import error_bars, noise_of, with_error_bars
     from hks_jax.cli.outputs import PAIRS, check_folder, of_earlier, show_files, write_outputs
     from hks_jax.cli.picture import draw, draw_volume
 
@@ -170,7 +188,12 @@ def run(args: argparse.Namespace) -> None:
                         file.unlink(missing_ok=True)
                     domain = volume.with_mask(field.grid.mask)
                     saved_pairs.write_pairs(args.output / PAIRS, domain, pairs, settings, image, progress.warnings)
+            if args.noise is not None:
+                noise = noise_of(args, volume, field.grid, progress)
+                bars, settings = error_bars(volume, noise, pairs, settings, args.draws, progress)
             result = signature_of(volume, field, pairs, settings, progress)
+            if args.noise is not None:
+                result = with_error_bars(result, bars, args.noise)
             flat = volume.dimension == 2
             draw_to = partial(draw if flat else partial(draw_volume, through=args.through), result, view=args.view)
         files = write_outputs(args.output, result, progress, draw=draw_to, image=image, command=sys.argv)

@@ -1,7 +1,7 @@
 """The main job: from a tensor volume or a mesh to its heat kernel signature, and what is known about it."""
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.hks import HKSMethod, Normalisation, hks, hks_auto
 from hks_jax.signatures.times import default_times, positive_range
 from hks_jax.signatures.truncation import truncation, truncation_map
+from hks_jax.uncertainty import Uncertainty
 
 
 class ComputationError(RuntimeError):
@@ -50,15 +51,23 @@ class Settings:
     dtype: Literal["float32", "float64"] = "float64"
 
 
+class Bars(NamedTuple):
+    """Error bars of a signature, and the noise (n_draws, n_times, *shape) of which they are made."""
+
+    uncertainty: Uncertainty
+    maps: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The signature on the volume whose mask is the domain, or on a mesh, and what the report says of it."""
+    """The signature on the volume whose mask is the domain, or on a mesh; its report; its error bars, if asked for."""
 
     volume: TensorVolume | SimplicialMesh
     times: np.ndarray
     values: np.ndarray
     eigenvalues: np.ndarray
     report: dict[str, Any]
+    bars: Bars | None = None
 
 
 def use_dtype(dtype: str) -> None:

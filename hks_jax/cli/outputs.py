@@ -89,11 +89,14 @@ def save_result(
 ) -> None:
     """Write a signature as `stem` with ``.npz`` after it and, unless it is empty, with the suffix of an image.
 
-    The former also has the times, the eigenvalues, the tensors that the signature is of, to be shown beside it, and
-    `more`.
+    The former also has the times, the eigenvalues, the tensors that the signature is of, to be shown beside it, the
+    deviation, the bias and draws of its noise if they are known, and `more`.
     """
     values = as_precise_as_the_data(result)
     extra = {"times": result.times, "eigenvalues": result.eigenvalues, **(more or {})}
+    if result.bars is not None:
+        bars, maps = result.bars
+        extra |= {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": maps}
     for suffix in filter(None, (".npz", image)):
         given: dict[str, Any] = {"times": result.times} if suffix == ".nii.gz" else extra
         if suffix == ".npz" and isinstance(result.volume, TensorVolume):

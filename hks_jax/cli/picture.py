@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hks_jax.cli.job import Result
+from hks_jax.cli.noise import z_of
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io.volume import TensorVolume
@@ -43,7 +44,8 @@ def draw(
     """Draw the signature of a slice, one image per time with its own colours.
 
     The colours span the values away from the boundary; arrows at a colour bar's ends say that some lie beyond. Under
-    "flat" normalisation they diverge from 1, which the signature is where the metric is flat.
+    "flat" normalisation they diverge from 1, which the signature is where the metric is flat. With error bars, what
+    noise could make of flat space fades.
 
     Args:
         result: what to draw.
@@ -64,6 +66,8 @@ def draw(
     grid, box = cropped(volume, inside)
     values, inside, orientation = values[:, *box], inside[box], placed(volume, box, view)
 
+    z = z_of(result)
+    z = None if z is None else z[:, *box]
     rows = math.ceil(len(values) / 4)
     columns = math.ceil(len(values) / rows)
     figure = new_figure(columns * 3.3, rows * (2.4 * proportion(grid, orientation) + 0.4) + 0.4 * bool(title))
@@ -77,7 +81,8 @@ def draw(
             colours = colours_of(image[deep], span, LEAST_RANGE, _centre(result))
         low, high, cmap = colours
         image = np.where(inside, image, np.nan)
-        scalar_image(ax, image, grid, cmap=cmap, vmin=low, vmax=high, orientation=orientation)
+        faded = None if z is None or grey else z[i - (first is not None)]
+        scalar_image(ax, image, grid, cmap=cmap, vmin=low, vmax=high, orientation=orientation, z=faded)
         ax.set_title(text, fontsize="medium")
         ax.set_axis_off()
     for ax in panels[len(values) :]:

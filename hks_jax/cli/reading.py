@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -253,4 +253,5 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
             instead = "pass --bvec-frame" if option == "frame" else "leave it out with --bval and --bvec"
             raise ValueError(f"--{option}: it is for files of tensors; {instead}")
     axes = {} if args.bvec_frame is None else {"bvec_frame": args.bvec_frame}
-    return fit_dwi(args.file, args.bval, args.bvec, args.mask, args.b_max, unit=args.unit, **axes), None
+    noise: Literal["residuals"] | None = "residuals" if getattr(args, "noise", None) == "residuals" else None
+    return fit_dwi(args.file, args.bval, args.bvec, args.mask, args.b_max, unit=args.unit, noise=noise, **axes), None

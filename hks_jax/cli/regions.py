@@ -17,7 +17,7 @@ from hks_jax.signatures.regions import region_statistics
 
 COLUMNS = ("index", "region", "voxels", "coverage", "volume", "t", "mean", "std", "median")
 
-_SOME = ("lambda1_t",)
+_SOME = ("lambda1_t", "error")
 """Columns that only some tables have."""
 _SCALES = {
     "raw": "the heat kernel signature, per (metric length)^d",
@@ -59,6 +59,11 @@ def region_table(
     if "scaled_times" in arrays:  # of a study whose times are λ₁t
         columns = (*COLUMNS[:5], "lambda1_t", *COLUMNS[5:])
         times = [(float(scaled), *t) for scaled, t in zip(arrays["scaled_times"], times, strict=True)]
+    errors: list[np.ndarray] = []
+    if "noise_maps" in arrays:  # the means of draws of noise have the variance of the mean's
+        columns = (*columns, "error")
+        draws = [region_statistics(one, labels).mean for one in arrays["noise_maps"]]
+        errors = [np.sqrt(np.mean(np.square(draws), axis=0))]
     rows = [
         (int(label), called.get(int(label), f"label {label}"), int(n), float(part), float(volume), *t, *statistics)
         for r, (label, n, part, volume) in enumerate(
@@ -69,6 +74,7 @@ def region_table(
             regions.mean[:, r].tolist(),
             regions.deviation[:, r].tolist(),
             regions.median[:, r].tolist(),
+            *(error[:, r].tolist() for error in errors),
             strict=True,
         )
     ]
@@ -100,6 +106,7 @@ def _about(about: About, atlas: Path, names: Path | None, flat: bool) -> dict[st
         "mean": {"Description": f"mean over these voxels of {values}"},
         "std": {"Description": "standard deviation over these voxels, divided by their number"},
         "median": {"Description": "median over these voxels"},
+        "error": {"Description": "standard deviation of the mean that the noise of the tensors gives it"},
         "GeneratedBy": {"Name": "hks-jax", "Version": __version__},
         "LabelMap": {"File": atlas.name, "SHA256": digest(atlas)},
         "Names": None if names is None else {"File": names.name, "SHA256": digest(names)},

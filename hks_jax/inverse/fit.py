@@ -22,7 +22,7 @@ from hks_jax.inverse import checkpoint as files
 from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.conformal import InnerProduct
 from hks_jax.inverse.metric_fit import MetricFit, Step
-from hks_jax.inverse.observation import Loss, Observation, Signature, observe
+from hks_jax.inverse.observation import Loss, Observation, Signature, observe, weigh
 from hks_jax.inverse.optimise import Optimiser
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
 from hks_jax.inverse.problem import Problem
@@ -44,6 +44,7 @@ def fit_metric(
     loss: str | Loss = "log",
     sigma: Any = None,
     weights: Any = None,
+    deviation: Any = None,
     regularisers: Sequence[Regulariser] = (),
     noise: float | None = None,
     k: int | None = None,
@@ -83,6 +84,9 @@ def fit_metric(
             target values, flat, to residuals.
         sigma: the width of a wave kernel signature.
         weights: ≥ 0, broadcast to the target's shape; 0 for what is not observed (it may be NaN there).
+        deviation: the standard deviation of the target's noise, of its unit, broadcast to its shape; as
+            `hks_jax.uncertainty` gives it. Residuals are weighed by its inverse square, besides by `weights`, and
+            ``noise`` is what follows from it unless it is given. Noise that entries share is not heeded.
         regularisers: of `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
         noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``): stop where the misfit reaches it.
         k: eigenpairs; by default so many that a share of 1e-6 of the heat trace at the smallest time lies beyond them,
@@ -129,6 +133,9 @@ def fit_metric(
         require_number("noise", noise)
     if smoothness is not None:
         require_number("smoothness", smoothness, inclusive=True)
+    if deviation is not None:
+        weights, stated = weigh(target, weights, deviation, loss)
+        noise = stated if noise is None else noise
     pencil = assemble(init, boundary)
     space, dtype, shape = pencil.space, init.domain_tensors.dtype, np.shape(target)
     unknowns = _unknowns(parametrisation, parameters, init, space.domain)
@@ -190,7 +197,7 @@ def fit_metric(
         )
     history, losses = tuple(log.history), tuple(log.losses)
     field, reached_loss = unknowns.field(values), float(outcome.loss)
-    return MetricFit(field, reached_loss, misfit, left, history, result, values, problem, losses)
+    return MetricFit(field, reached_loss, misfit, left, history, result, values, problem, losses, noise)
 
 
 def _unknowns(parametrisation: Any, parameters: Any, init: TensorField, domain: np.ndarray) -> Unknowns:

@@ -5,6 +5,7 @@ import dataclasses
 from jaxtyping import Array
 
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.inverse.posterior import Posterior, posterior
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
 
@@ -66,6 +67,7 @@ class MetricFit:
         values: the unknowns, as the parametrisation has them.
         problem: the least squares problem, for `identifiability` and for a fit of your own.
         losses: the loss of each start.
+        noise: the standard deviation of the residuals that was stated, or that of the target made; else None.
     """
 
     field: TensorField
@@ -77,6 +79,7 @@ class MetricFit:
     values: Values
     problem: Problem
     losses: tuple[float, ...]
+    noise: float | None = None
 
     @property
     def converged(self) -> bool:
@@ -93,6 +96,27 @@ class MetricFit:
     def hks(self) -> Array:
         """The signature of the fitted metric, of the kind and shape of the target; computed anew each time."""
         return self.problem.observation.predict(self.problem.pairs(self.values))
+
+    def uncertainty(self, prior: float = 1.0, noise: float | None = None, draws: int = 32, seed: int = 0) -> Posterior:
+        """Compute the error bars of the fitted metric, to first order about it: Laplace's approximation.
+
+        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹: J is the Jacobian of the data, Σ their noise,
+        weighed as in the fit, and R what the penalties and a white prior know. Draws from it come of one linear
+        system each, by conjugate gradients.
+
+        Args:
+            prior: the standard deviation that every unknown has without data, in the parametrisation's units.
+            noise: of the residuals; None: that of the fit.
+            draws: how many; a deviation is sure to 1/√(2·draws) of itself.
+            seed: of the draws.
+
+        Raises:
+            ValueError: a fit without noise, when none is given.
+        """
+        noise = self.noise if noise is None else noise
+        if noise is None:
+            raise ValueError("noise: the fit has none; give the standard deviation of its residuals, or fit with one")
+        return posterior(self.problem, self.values, noise, prior, draws, seed)
 
     def __repr__(self) -> str:
         return f"MetricFit({self.result}: loss {self.loss:.3e} after {self.steps} steps)"

@@ -136,6 +136,35 @@ def observe(
     )
 
 
+def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[np.ndarray, float]:
+    """Return the weights that a stated deviation of the target makes, and the deviation of a residual in their mean.
+
+    Raises:
+        ValueError: deviations of another shape, or not positive where the target is known; a loss that is a function.
+    """
+    if callable(loss):
+        raise ValueError("deviation: it cannot be taken through a loss that is a function; give weights and noise")
+    require_real("deviation", deviation)
+    values = np.asarray(target, np.float64)
+    given = _checked_weights(weights, values.shape)
+    try:
+        size = np.broadcast_to(np.asarray(deviation, np.float64), values.shape)
+    except ValueError:
+        raise ValueError(
+            f"deviation: got shape {np.shape(deviation)}; expected one that broadcasts to the target's {values.shape}"
+        ) from None
+    used = (given > 0) & np.isfinite(values)
+    if (bad := used & ~(np.isfinite(size) & (size > 0))).any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"deviation: {int(bad.sum())} of {int(used.sum())} are not positive numbers (the first at {first}: "
+            f"{size[first]:.4g}); expected one for every observed value. Give others the weight 0"
+        )
+    of_residuals = np.where(used, size if loss == "absolute" else size / np.abs(values), 1.0)
+    weighed = np.where(used, given / of_residuals**2, 0.0)
+    return weighed, float(np.sqrt(np.sum(given, where=used) / np.sum(weighed)))
+
+
 def _checked_weights(weights: Any, shape: tuple[int, ...]) -> np.ndarray:
     array = np.ones(shape) if weights is None else np.asarray(weights, np.float64)
     try:

@@ -10,10 +10,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hks_jax.checks import require_number
 from hks_jax.io import nifti
 from hks_jax.io.masks import as_mask, read_mask
 from hks_jax.io.provenance import digest
-from hks_jax.io.tensor_order import to_voxel_axes
+from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
@@ -58,6 +59,7 @@ def fit_dwi(
     *,
     bvec_frame: Literal["fsl", "voxel", "world"] = "fsl",
     unit: Unit | None = None,
+    noise: float | Literal["residuals"] | None = None,
 ) -> TensorVolume:
     """Fit diffusion tensors to diffusion-weighted images: weighted least squares on log signals (DIPY's TensorModel).
 
@@ -73,16 +75,21 @@ def fit_dwi(
             MRtrix has them.
         unit: of diffusivity, whose reciprocal is the b-values' unit: ``"m2/s"`` for b-values in s/m², ``"um2/ms"`` for
             ms/µm². None: mm²/s.
+        noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
+            ``"residuals"``, in each voxel what the fit leaves, of as many degrees of freedom as there are images more
+            than 7. None: no covariance.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s. DIPY replaces eigenvalues that are not positive by about 1e-9 mm²/s; a
-        note says how many voxels have one (mostly at the rim: erode the mask).
+        Tensors along the voxel axes, in mm²/s, and with `noise` their covariance, to first order in it. DIPY replaces
+        eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at the rim:
+        erode the mask).
 
     Raises:
         ImportError: DIPY or nibabel is missing.
         FileNotFoundError: no such file.
         ValueError: numbers of images, b-values and directions that disagree; b-values in another unit; directions that
-            have no length, or another than 1; a mask of another shape; too few images; no signal.
+            have no length, or another than 1; a mask of another shape; too few images, also to estimate noise from
+            residuals; residuals that are zero; no signal.
     """
     dti, gradients, segmentation = _dipy()
     image = nifti.load(path)
@@ -112,6 +119,9 @@ def fit_dwi(
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
     tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), bvec_frame, affine)
+    covariance = None
+    if noise is not None:
+        covariance = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
     notes = [
         f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
@@ -121,6 +131,8 @@ def fit_dwi(
     ]
     if bvec_frame != "fsl":
         notes.append(f"gradient directions along the {bvec_frame} axes, as asked; tensors taken to the voxel axes")
+    if noise is not None:
+        notes.append(f"covariances of the tensors from {_noise_text(noise, int(used.sum()))}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
     return TensorVolume(
@@ -136,7 +148,58 @@ def fit_dwi(
         digest=digest(path),
         length_unit="mm",
         unit=MM2_PER_S,
+        covariance=covariance,
     )
+
+
+# With the logarithms y of the signals, weights w (the signals that an unweighted fit predicts), and the rows X of the
+# design, least squares minimise Σ w²(y − Xβ)². A logarithm has the variance σ²/w² to first order, so that β has the
+# covariance σ²(XᵀW²X)⁻¹, and σ² is the signals' sum of squared residuals over as many as there are more images than
+# unknowns (Koay, Chang, Pierpaoli and Basser 2007).
+def _covariance(
+    signal: Float[np.ndarray, "nx ny nz n"],
+    inside: Bool[np.ndarray, "nx ny nz"],
+    design: Float[np.ndarray, "n 7"],
+    noise: float | Literal["residuals"],
+    frame: str,
+    affine: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "nx ny nz 6 6"]:
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask."""
+    data = np.asarray(signal[inside], np.float64)
+    positive = data[data > 0]
+    y = np.log(np.maximum(data, positive.min() if positive.size else 1.0))
+    weights = np.exp(2 * y @ (design @ np.linalg.pinv(design)))
+    information = np.einsum("vn,na,nb->vab", weights, design, design, optimize=True)
+    inverse = np.linalg.inv(information)
+    if noise == "residuals":
+        freedom = design.shape[0] - design.shape[1]
+        if freedom < 1:
+            raise ValueError(
+                f'noise: got "residuals" with {design.shape[0]} images, and a tensor and a signal without weighting '
+                f"are {design.shape[1]} unknowns; expected at least {design.shape[1] + 1} images, and 15 for an "
+                "estimate to a quarter. State the noise of the images as a number"
+            )
+        # Of the signals, not of their logarithms, which near zero are far off.
+        fitted = np.exp(np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True))
+        variance = np.sum((data - fitted) ** 2, axis=1) / freedom
+        if (zero := variance <= 1e-20 * weights.mean(axis=1)).any():
+            raise ValueError(
+                f'noise: got "residuals", which are zero in {int(zero.sum())} of {len(zero)} voxels; expected images '
+                "with noise. Leave these voxels out of the mask, or state the noise of the images as a number"
+            )
+    else:
+        require_number("noise", noise)
+        variance = np.full(len(data), float(noise) ** 2)
+    turned = pack(to_voxel_axes(unpack(np.eye(6), "nifti"), frame, affine), "nifti").T
+    covariance = np.zeros((*inside.shape, 6, 6))
+    covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
+    return covariance
+
+
+def _noise_text(noise: float | Literal["residuals"], images: int) -> str:
+    if noise == "residuals":
+        return f"the fit's residuals, of {images - 7} degrees of freedom in each voxel"
+    return f"the images' noise, stated as {noise:g}"
 
 
 def _of_length_one(

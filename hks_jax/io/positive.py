@@ -46,4 +46,4 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
     note = f"{formula} of all tensors S, {before} of {int(inside.sum())} of which are not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
-    return replace(volume, tensors=tensors, repair=report, notes=(*volume.notes, note))
+    return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))

@@ -132,7 +132,12 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         nearest = ndimage.distance_transform_edt(
             bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
         )
-        tensors[bad] = volume.tensors[tuple(index[bad] for index in nearest)]
+        source = tuple(index[bad] for index in nearest)
+        tensors[bad] = volume.tensors[source]
+        if volume.covariance is not None:
+            covariance = volume.covariance.copy()
+            covariance[bad] = volume.covariance[source]
+            changed = replace(changed, covariance=covariance)
     return replace(changed, tensors=tensors)
 
 

@@ -36,6 +36,8 @@ class TensorVolume:
             many are under the one in which they were read; else None.
         length_unit: ``"mm"``, which the lengths of a file that has a unit are converted to; empty where it has none.
         unit: ``"mm²/s"`` where the tensors' unit is known, because it was told, or they were fitted; else empty.
+        covariance: (*shape, m, m) of the components xx xy yy (xz yz zz) along the voxel axes, in the squared unit of
+            the tensors, where it is known (`fit_dwi`); else None.
 
     Raises:
         ValueError: shapes that do not agree; spacings that are not positive, numbers that are not finite.
@@ -56,6 +58,7 @@ class TensorVolume:
     invalid_by_order: InvalidByOrder | None = None
     length_unit: str = ""
     unit: str = ""
+    covariance: Float[np.ndarray, "*shape m m"] | None = None
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
@@ -76,6 +79,10 @@ class TensorVolume:
             )
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
             raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected (4, 4), finite")
+        if self.covariance is not None and self.covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):
+            raise ValueError(
+                f"{where}covariance: got shape {self.covariance.shape}; expected (*shape, m, m), m = d(d+1)/2"
+            )
 
     def __repr__(self) -> str:
         """Return one line without the arrays."""
@@ -135,7 +142,11 @@ class TensorVolume:
                 where = f"{AXES[a]} = {filled[0]} … {filled[-1]}" if filled.size else "no slice at all"
                 raise ValueError(f"mask: empty in slice {AXES[a]} = {index}; it has voxels inside at {where}")
         keep = [b for b in range(3) if b != a]
-        affine = None
+        affine = covariance = None
+        if self.covariance is not None:
+            rows, columns = np.tril_indices(3)
+            within = np.flatnonzero((rows != a) & (columns != a))
+            covariance = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
         if self.affine is not None:
             affine = self.affine.copy()
             affine[:3, 3] += index * affine[:3, a]
@@ -147,6 +158,7 @@ class TensorVolume:
             mask=mask,
             affine=affine,
             slice_axis=a,
+            covariance=covariance,
             notes=(*self.notes, f"slice {AXES[a]} = {index}: the in-plane block of each tensor"),
         )
 

@@ -17,6 +17,9 @@ from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import cell_extent, colour_bar, frame, new_figure, number_text, require_plane, save_figure
 from hks_jax.plot.orientation import Orientation
 
+FADED = 2.0
+"""The number of standard deviations from which on values are no longer faded as noise."""
+
 
 def scalar_image(
     ax: Axes,
@@ -32,6 +35,7 @@ def scalar_image(
     colorbar: bool = True,
     label: str = "",
     orientation: Orientation | None = None,
+    z: Real[ArrayLike, "nx ny"] | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw node values as an image: array axis 0 horizontal, one cell per node, transparent outside the mask.
@@ -54,6 +58,8 @@ def scalar_image(
         label: the colour bar's label.
         orientation: how the grid lies in space. The picture is then turned, has coordinates of space, and letters at
             its edges.
+        z: (*shape,), how many standard deviations of noise the values are from what would be nothing
+            (`hks_jax.Uncertainty.z`): below `FADED` of them they fade into grey, which they are at 0.
         **kwargs: passed to `Axes.imshow`.
 
     Raises:
@@ -61,8 +67,11 @@ def scalar_image(
     """
     require_plane("grid", grid)
     array = masked("values", values, grid)
+    opacity = None if z is None else (1 - np.abs(masked("z", z, grid)) / FADED).clip(0, 1).filled(0)
     if orientation is not None:
-        array, grid = orientation.array(array), orientation.grid(grid)
+        array = orientation.array(array)
+        opacity = None if opacity is None else orientation.array(opacity)
+        grid = orientation.grid(grid)
     colours = colours_of(array.compressed(), quantiles, least_range, centre)
     low, high = colours.low if vmin is None else vmin, colours.high if vmax is None else vmax
     image = ax.imshow(
@@ -74,6 +83,9 @@ def scalar_image(
         vmax=high,
         **{"interpolation": "nearest", **kwargs},
     )
+    if opacity is not None:
+        grey = np.dstack([np.full((*opacity.T.shape, 3), 0.8), opacity.T])
+        ax.imshow(grey, origin="lower", extent=cell_extent(grid), interpolation="nearest")
     frame(ax, grid)
     if orientation is not None:
         orientation.letter(ax)
@@ -100,6 +112,7 @@ def hks_panels(
     label: str = "",
     suptitle: str = "",
     orientation: Orientation | None = None,
+    z: Real[ArrayLike, "n_times nx ny"] | None = None,
 ) -> Figure:
     """Return a figure with one image of the HKS per time, each with its own colour map unless `shared_range`.
 
@@ -120,6 +133,7 @@ def hks_panels(
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: as for `scalar_image`.
+        z: (n_times, *shape), as for `scalar_image`: what noise could make fades.
 
     Raises:
         ValueError: shapes that do not agree; no time at all.
@@ -141,7 +155,8 @@ def hks_panels(
             continue
         colours: dict[str, Any] = {"cmap": cmap, "vmin": vmin, "vmax": vmax, "centre": centre}
         colours |= {"quantiles": quantiles, "least_range": least_range}
-        scalar_image(ax, images[index], grid, label=label, orientation=orientation, **colours)
+        faded = None if z is None else np.asarray(z)[index]
+        scalar_image(ax, images[index], grid, label=label, orientation=orientation, z=faded, **colours)
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
     if suptitle:

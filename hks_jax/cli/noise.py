@@ -1,0 +1,124 @@
+"""Error bars on the command line: where the noise comes from, and what of the signature exceeds it."""
+
+import argparse
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from hks_jax.accuracy import AccuracyWarning
+from hks_jax.cli.arguments import Times
+from hks_jax.cli.inputs import read_volume
+from hks_jax.cli.job import Bars, Result, Settings, automatic_times
+from hks_jax.cli.progress import Progress
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.solve import eigenpairs
+from hks_jax.io.volume import TensorVolume
+from hks_jax.signatures.hks import hks
+from hks_jax.uncertainty import TensorNoise, uncertainty
+
+_CANDIDATES = 4
+"""How many times as many times are looked at as automatic ones are asked for."""
+_SIGNAL = 1.0
+"""The signal to noise from which on automatic times begin."""
+_CLEAR = 2.0
+"""The signal to noise that the report names the first time of."""
+
+
+def noise_of(args: argparse.Namespace, volume: TensorVolume, grid: Grid, progress: Progress) -> TensorNoise:
+    """Return the noise that the arguments name.
+
+    Raises:
+        FileNotFoundError: neither a number, nor a word that is known, nor a file.
+        ValueError: residuals of what was not fitted; a second scan that does not fit the first.
+    """
+    if args.noise == "residuals":
+        if volume.covariance is None:
+            raise ValueError("--noise: residuals are those of a fit to diffusion-weighted images (--bval, --bvec)")
+        return TensorNoise(volume.covariance, grid)
+    if args.noise == "roughness":
+        return TensorNoise.from_roughness(volume.tensors, grid)
+    try:
+        level = float(args.noise)
+    except ValueError:
+        again = argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
+        return TensorNoise.from_scans(volume.tensors, read_volume(again, progress).tensors, grid)
+    return TensorNoise.relative(volume.tensors, level, grid)
+
+
+def error_bars(
+    volume: TensorVolume, noise: TensorNoise, pairs: Eigenpairs, settings: Settings, draws: int, progress: Progress
+) -> tuple[Bars, Settings]:
+    """Compute error bars; return them, and the settings with the times, which begin where there is signal."""
+    if settings.method != "spectral":
+        raise ValueError(f"--noise: with --method {settings.method} there are no error bars; leave one of them out")
+    wanted = settings.times.automatic
+    times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
+    grid = noise.grid
+    assert grid is not None
+    assert settings.metric is not None
+    boundary = settings.boundary or "neumann"
+
+    def signature(D: Any) -> Any:
+        field = TensorField.from_diffusion(grid, D, settings.metric, interpolation=settings.interpolation)
+        return hks(eigenpairs(field, pairs.k, boundary, settings.solver), times, settings.normalisation)
+
+    with progress.stage("error bars", f"{draws} noisy maps"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", AccuracyWarning)  # of times that are not chosen, too
+        tensors = volume.tensors.astype(settings.dtype)
+        maps: list[np.ndarray] = []
+
+        def keep(one: Any) -> None:
+            maps.append(np.asarray(one, np.float32))
+
+        bars = uncertainty(
+            signature, tensors, noise, method="resample", draws=draws, progress=progress.update, each=keep
+        )
+    chosen = np.arange(len(times))
+    if not settings.times.explicit:
+        clear = np.flatnonzero(np.asarray(bars.signal_to_noise) >= _SIGNAL)
+        first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
+        chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)
+        bars = jax.tree.map(lambda leaf: leaf[chosen] if jnp.ndim(leaf) else leaf, bars)
+        times = tuple(times[i] for i in chosen)
+    for message in bars.messages():
+        progress.warn(message)
+    return Bars(bars, np.stack(maps)[:, chosen]), replace(settings, times=Times(times, wanted))
+
+
+def with_error_bars(result: Result, found: Bars, source: str) -> Result:
+    """Return a result with error bars, and with what the report says of them."""
+    bars = found.uncertainty
+    ratio = np.asarray(bars.signal_to_noise)
+    clear = np.flatnonzero(ratio > _CLEAR)
+    report = {
+        "source": source,
+        "draws": bars.draws,
+        "sampling_error": bars.sampling_error,
+        "indefinite": float(bars.indefinite),
+        "signal_to_noise": ratio.tolist(),
+        "claimed": np.asarray(bars.trusted).tolist(),
+        f"exceeds_{_CLEAR:g}_from_t": float(result.times[clear[0]]) if clear.size else None,
+    }
+    return replace(result, bars=found, report={**result.report, "noise": report})
+
+
+def z_of(result: Result) -> Float[np.ndarray, "n_times *shape"] | None:
+    """Return how many standard deviations the signature is from that of flat space, or from its median."""
+    if result.bars is None:
+        return None
+    values, normalisation = result.values, result.report["settings"]["normalisation"]
+    ones = (-1, *[1] * (values.ndim - 1))
+    if normalisation in ("raw", "flat"):
+        power = 0 if normalisation == "flat" else -(values.ndim - 1) / 2
+        reference = ((4 * np.pi * result.times) ** power).reshape(ones)
+    else:
+        reference = np.nanmedian(values.reshape(len(values), -1), axis=1).reshape(ones)
+    return (values - reference) / np.asarray(result.bars.uncertainty.deviation)

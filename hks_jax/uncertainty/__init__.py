@@ -1,0 +1,6 @@
+"""Error bars: what the noise of measured tensors does to what is computed of them."""
+
+from hks_jax.uncertainty.noise import TensorNoise as TensorNoise
+from hks_jax.uncertainty.propagate import uncertainty as uncertainty
+from hks_jax.uncertainty.result import Uncertainty as Uncertainty
+from hks_jax.uncertainty.smoothing import smooth_tensors as smooth_tensors

@@ -1,0 +1,245 @@
+"""Error bars against dense Jacobians, exact moments, and repeated measurements."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fields import random_spd
+
+import hks_jax as hj
+from hks_jax.domain import spd
+
+
+def random_covariance(rng, shape, m, rank=None):
+    root = 0.1 * rng.standard_normal((*shape, m, rank or m))
+    return root @ np.swapaxes(root, -1, -2)
+
+
+def components(tensors):
+    rows, columns = np.tril_indices(tensors.shape[-1])
+    return tensors[..., rows, columns]
+
+
+def quietly(*args, **settings):
+    with pytest.warns(hj.AccuracyWarning):
+        return hj.uncertainty(*args, **settings)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("rank", [1, None])
+def test_noise_has_the_covariance_asked_for(rng, d, rank):
+    m = d * (d + 1) // 2
+    covariance = random_covariance(rng, (4,), m, rank)
+    noise = hj.TensorNoise(covariance)
+    J = jax.jacobian(lambda white: components(noise.tensors(white)))(jnp.zeros((4, m))).reshape(4 * m, 4 * m)
+    found = (J @ J.T).reshape(4, m, 4, m)
+    for i in range(4):
+        np.testing.assert_allclose(found[i, :, i], covariance[i], atol=1e-12)
+    assert not found[0, :, 1].any()
+    T = noise.tensors(jnp.ones((4, m)))
+    np.testing.assert_array_equal(T, np.swapaxes(T, -1, -2))
+
+
+def test_neighbours_share_noise_as_blurred_white_noise_does():
+    grid = hj.Grid((3, 24), (0.7, 0.5))
+    noise = hj.TensorNoise(np.tile(np.eye(3), (3, 24, 1, 1)), grid, correlation=0.9)
+    J = jax.jacobian(lambda white: components(noise.tensors(white))[1, :, 0])(jnp.zeros((3, 24, 3)))
+    C = np.einsum("aijk,bijk->ab", J, J)
+    np.testing.assert_allclose(np.diag(C), 1, atol=1e-12)
+    r = 0.5 * np.arange(6)
+    np.testing.assert_allclose(C[12, 12:18], np.exp(-(r**2) / (4 * 0.9**2)), atol=2e-4)
+
+
+def test_numbers_are_exact(rng):
+    grid = hj.Grid((4, 3))
+    D, m = random_spd(rng, grid.shape, 0.2), 3
+    noise = hj.TensorNoise(1e-3 * random_covariance(rng, grid.shape, m), grid, correlation=0.6)
+
+    def mean(D):
+        pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, D, "inverse"), 12, solver="dense")
+        return jnp.mean(hj.hks(pairs, [3.0])[:, :2])
+
+    bars = hj.uncertainty(mean, D, noise)
+    assert (bars.method, bars.sampling_error) == ("exact", 0)
+    g = jax.grad(mean)(jnp.asarray(D))
+    J = jax.jacobian(noise.tensors)(jnp.zeros((*grid.shape, m))).reshape(g.size, -1)
+    np.testing.assert_allclose(bars.deviation, np.linalg.norm(np.ravel(g) @ J), rtol=1e-10)
+
+
+def test_the_derivative_by_the_noise_says_which_measurement_matters(rng):
+    D = random_spd(rng, (5, 4), 0.2)
+
+    def volume(D):
+        return jnp.sum(jnp.sqrt(spd.determinant(D)))
+
+    def variance(covariance):
+        return hj.uncertainty(volume, D, hj.TensorNoise(covariance), method="exact", draws=4).deviation ** 2
+
+    slope = jax.jit(jax.grad(variance))(jnp.asarray(1e-3 * random_covariance(rng, (5, 4), 3)))
+    g = jax.grad(volume)(jnp.asarray(D))
+    parts = components(g + np.swapaxes(g, -1, -2)) * np.where(np.equal(*np.tril_indices(2)), 0.5, 1.0)
+    symmetric = (slope + np.swapaxes(slope, -1, -2)) / 2
+    np.testing.assert_allclose(symmetric, parts[..., :, None] * parts[..., None, :], rtol=1e-8, atol=1e-14)
+
+
+def test_maps_agree_with_the_dense_jacobian(rng):
+    grid = hj.Grid((5, 4))
+    D = random_spd(rng, grid.shape, 0.2)
+    noise = hj.TensorNoise(1e-4 * random_covariance(rng, grid.shape, 3), grid)
+
+    def signature(D):
+        pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, D, "inverse"), 20, solver="dense")
+        return hj.hks(pairs, [2.0, 8.0], "flat")
+
+    J = jax.jacobian(lambda white: signature(D + noise.tensors(white)))(jnp.zeros((*grid.shape, 3)))
+    expected = np.sqrt(np.sum(np.square(J), axis=(-3, -2, -1)))
+    for method in ("resample", "linear"):
+        bars = hj.uncertainty(signature, D, noise, method=method, draws=200)
+        ratio = np.asarray(bars.deviation) / expected
+        assert abs(np.sqrt(np.mean(ratio**2)) - 1) < 2 * bars.sampling_error
+        assert np.std(ratio) < 1.5 * bars.sampling_error
+        assert np.all(bars.trusted)
+        assert np.all(np.abs(bars.bias) < 0.1 * bars.deviation)
+
+
+def test_bias_and_departure_from_linearity_of_a_quadratic_are_exact(rng):
+    # E det(D + δ) − det D = cov(xx, yy) − var(xy), and var = gᵀΣg besides what is quadratic.
+    D, covariance = random_spd(rng, (40, 50), 0.1), random_covariance(rng, (40, 50), 3) / 10
+    bars = hj.uncertainty(spd.determinant, D, hj.TensorNoise(covariance), draws=64, method="resample")
+    expected = covariance[..., 0, 2] - covariance[..., 1, 1]
+    error, stated = np.asarray(bars.bias) - expected, np.sqrt(np.mean(np.square(bars.bias_error)))
+    assert abs(error.mean()) < 0.1 * stated
+    assert 0.9 < np.sqrt(np.mean(error**2)) / stated < 1.1
+    g = np.stack([D[..., 1, 1], -2 * D[..., 0, 1], D[..., 0, 0]], axis=-1)
+    linear = np.einsum("...a,...ab,...b->...", g, covariance, g)
+    assert abs(np.mean(np.square(bars.deviation) / linear) - 1) < 0.02
+    np.testing.assert_allclose(bars.corrected, bars.value - bars.bias)
+
+
+def test_intervals_contain_the_truth_as_often_as_they_say(rng):
+    grid = hj.Grid((7, 7), mask=np.add.outer((np.arange(7) - 3) ** 2, (np.arange(7) - 3) ** 2) < 12)
+    D = random_spd(rng, grid.shape, 0.3)
+
+    @jax.jit
+    def signature(D):
+        pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, D, "inverse"), 16, "mean", solver="dense")
+        return hj.hks(pairs, [3.0, 12.0], "flat")
+
+    truth, inside = np.asarray(signature(jnp.asarray(D))), {0.68: [], 0.95: []}
+    for seed in range(100):
+        change = hj.TensorNoise.relative(D, 0.04).tensors(jnp.asarray(rng.standard_normal((7, 7, 3))))
+        measured = D + change
+        noise = hj.TensorNoise.relative(measured, 0.04)
+        bars = hj.uncertainty(signature, measured, noise, draws=16, method="resample", seed=seed, compiled=False)
+        for level, found in inside.items():
+            low, high = bars.interval(level)
+            found.append(((low < truth) & (truth < high))[:, np.isfinite(truth[0])])
+    for level, found in inside.items():
+        np.testing.assert_allclose(np.mean(found, axis=(0, 2)), level, atol=0.06)
+
+
+def test_what_is_beyond_linear_or_indefinite_is_said(rng):
+    D = random_spd(rng, (30, 30), 0.1)
+    bars = quietly(spd.inverse, D, hj.TensorNoise.relative(D, 0.15), draws=8)
+    assert not np.any(bars.trusted)
+    assert "beyond linear" in bars.messages()[0]
+    bars = quietly(spd.inverse, D, hj.TensorNoise.relative(D, 0.5), draws=8)
+    assert "indefinite" in bars.messages()[0]
+    assert np.isfinite(bars.deviation).all()
+
+
+def test_two_scans_tell_level_and_correlation(rng):
+    grid = hj.Grid((60, 50), (2.0, 3.0), mask=np.indices((60, 50)).sum(axis=0) > 20)
+    D = np.where(grid.inside[..., None, None], random_spd(rng, grid.shape, 0.3), 0)
+    noise = hj.TensorNoise.relative(D, 0.07, grid, correlation=2.0)
+    first, second = (D + noise.tensors(jnp.asarray(rng.standard_normal((60, 50, 3)))) for _ in range(2))
+    found = hj.TensorNoise.from_scans(first, second, grid)
+    ratio = np.trace(found.covariance[grid.inside].sum(0)) / np.trace(noise.covariance[grid.inside].sum(0))
+    assert abs(ratio - 1) < 0.1
+    assert abs(found.correlation - 2.0) < 0.2
+
+
+def test_roughness_tells_the_level_on_smooth_fields(rng):
+    grid = hj.Grid((40, 40))
+    x, y = np.meshgrid(*(np.arange(40) / 40,) * 2, indexing="ij")
+    D = (1 + 0.4 * np.sin(6 * x) * np.cos(5 * y))[..., None, None] * np.diag([1.5, 0.5])
+    noisy = D + hj.TensorNoise.relative(D, 0.05).tensors(jnp.asarray(rng.standard_normal((40, 40, 3))))
+    found = hj.TensorNoise.from_roughness(noisy, grid)
+    ratio = np.sqrt(found.covariance / np.asarray(hj.TensorNoise.relative(D, 0.05).covariance))[..., 0, 0]
+    assert abs(np.median(ratio) - 1) < 0.1
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_smoothing_is_log_euclidean_and_keeps_to_the_mask(rng, d):
+    shape = (7, 6, 5)[:d]
+    mask = rng.random(shape) < 0.8
+    grid = hj.Grid(shape, 0.5, mask=mask, components="all")
+    D = random_spd(rng, shape)
+    inside = grid.inside
+    smooth = np.asarray(hj.smooth_tensors(grid, np.where(mask[..., None, None], D, np.eye(d)), 0.6))
+    x = np.argwhere(inside) * 0.5
+    weights = np.exp(-np.sum((x[:, None] - x) ** 2, axis=-1) / (2 * 0.6**2))
+    expected = np.einsum("ij,j...->i...", weights / weights.sum(1, keepdims=True), np.asarray(spd.log(D[inside])))
+    np.testing.assert_allclose(spd.log(smooth[inside]), expected, atol=1e-10)
+    assert hj.smooth_tensors(grid, D, 0) is not smooth
+
+
+def test_smoothing_lowers_noise_and_tells_what_it_smears(rng):
+    grid = hj.Grid((16, 16))
+    D = (1 + 0.3 * np.cos(np.arange(16) / 2))[:, None, None, None] * np.tile(np.eye(2), (16, 16, 1, 1))
+    noise = hj.TensorNoise.relative(D, 0.05, grid)
+    plain, smooth = (
+        hj.uncertainty(spd.determinant, D, noise, method="resample", draws=32, smoothing=w) for w in (0.0, 1.0)
+    )
+    assert plain.smear is None
+    assert np.mean(smooth.deviation) < 0.4 * np.mean(plain.deviation)
+    shift = np.asarray(smooth.value - plain.value)[4:-4]
+    assert np.corrcoef(shift.ravel(), np.asarray(smooth.smear)[4:-4].ravel())[0, 1] > 0.95
+
+
+def test_an_interrupted_computation_goes_on(rng, tmp_path):
+    D, told = random_spd(rng, (3, 3), 0.1), []
+    settings = {"noise": hj.TensorNoise.relative(D, 0.05), "draws": 12, "method": "resample"}
+    whole = hj.uncertainty(spd.determinant, D, **settings)
+
+    def stop(text):
+        told.append(text)
+        if len(told) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        hj.uncertainty(spd.determinant, D, **settings, progress=stop, checkpoint=tmp_path / "c.npz")
+    told += ["", ""]
+    resumed = hj.uncertainty(spd.determinant, D, **settings, progress=stop, checkpoint=tmp_path / "c.npz")
+    assert told[2:] == ["6 of 12 noisy maps", "", "", "6 of 12 noisy maps"][:1] + told[3:]
+    assert told[-1] == "12 of 12 noisy maps"
+    np.testing.assert_allclose(resumed.deviation, whole.deviation, rtol=1e-14)
+    with pytest.raises(ValueError, match="another computation"):
+        hj.uncertainty(spd.determinant, 2 * D, **settings, checkpoint=tmp_path / "c.npz")
+
+
+def test_bad_input_is_named(rng):
+    D = random_spd(rng, (4, 3), 0.1)
+    grid, good = hj.Grid((4, 3)), np.tile(1e-3 * np.eye(3), (4, 3, 1, 1))
+    bad = good.copy()
+    bad[2, 1] = np.diag([1, -2, 1])
+    for covariance, text in (
+        (bad, r"semidefinite at 1 of 12 nodes, the worst at \(2, 1\), of eigenvalues from -2 "),
+        (np.where(np.arange(3) == 1, np.nan, good), r"NaN or infinite at 12 of 12"),
+        (good[..., :2], r"expected \(\*shape, m, m\)"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            hj.TensorNoise(covariance)
+    with pytest.raises(ValueError, match="correlation: got a length but no grid"):
+        hj.TensorNoise(good, correlation=1.0)
+    with pytest.raises(ValueError, match=r"noise: its deviation is .* squared unit"):
+        hj.uncertainty(spd.determinant, 1e-6 * D, hj.TensorNoise(good))
+    with pytest.raises(ValueError, match="noise: got a covariance of shape"):
+        hj.uncertainty(spd.determinant, D[:2], hj.TensorNoise(good))
+    with pytest.raises(ValueError, match="noise has no grid"):
+        hj.uncertainty(spd.determinant, D, hj.TensorNoise(good), smoothing=1.0)
+    with pytest.raises(ValueError, match=r"pass compiled=False"):
+        hj.uncertainty(lambda D: np.linalg.det(D), D, hj.TensorNoise(good))
+    assert hj.uncertainty(lambda D: np.linalg.det(D), D, hj.TensorNoise(good), compiled=False).draws == 16
+    with pytest.raises(ValueError, match="they are the same"):
+        hj.TensorNoise.from_scans(D, D, grid)
