@@ -1,6 +1,7 @@
 """Compiling for CPUs in half the time, or not at all."""
 
 import os
+from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial, wraps
 from typing import Any, ParamSpec, TypeVar
@@ -40,7 +41,7 @@ def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[
     return decorate
 
 
-_FEW = 1 << 18
+_FEW, _FEW_AT_FIRST = 1 << 18, 1 << 20
 """Numbers that NumPy computes with in less time than it takes to compile a program for them."""
 
 
@@ -56,17 +57,39 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
         @wraps(function)
         def call(*args: Any) -> T:
-            size = sum(np.size(leaf) for leaf in jax.tree.leaves(args))
-            elsewhere = jax.default_backend() != "cpu" or jax.process_count() > 1
-            if size > _FEW or elsewhere or is_traced((args, jnp.zeros(()))):
-                return compiled(*args)
-            known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
-            with np.errstate(all="ignore"):
-                return jax.tree.map(jnp.asarray, function(np, *known))
+            return by_numpy(partial(function, np), *args) if known_and_few(_FEW, args) else compiled(*args)
 
         return call
 
     return decorate
+
+
+def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
+    """Return what a function makes of NumPy's arrays in place of JAX's, as JAX's arrays."""
+    known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
+    with np.errstate(all="ignore"):
+        return jax.tree.map(jnp.asarray, function(*known))
+
+
+def known_and_few(most: int, args: Any) -> bool:
+    """Return whether values are concrete, no more than that, and on a CPU of this process alone."""
+    size = sum(np.size(leaf) for leaf in jax.tree.leaves(args))
+    here = jax.default_backend() == "cpu" and jax.process_count() == 1
+    return size <= most and here and not is_traced((args, jnp.zeros(())))
+
+
+_TRIES = 8
+"""Calls in which NumPy loses less time than it takes to compile a program of XLA's."""
+_calls: Counter[Any] = Counter()
+
+
+def at_first(name: str, args: Any) -> bool:
+    """Return whether NumPy should compute: few concrete values on a CPU, in the first calls with such shapes."""
+    if not known_and_few(_FEW_AT_FIRST, args):
+        return False
+    key = name, tuple((np.shape(leaf), str(jnp.result_type(leaf))) for leaf in jax.tree.leaves(args))
+    _calls[key] += 1
+    return _calls[key] <= _TRIES
 
 
 @cache

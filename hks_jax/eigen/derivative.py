@@ -1,5 +1,6 @@
 """Eigenpairs of a pencil, the lowest or those from an origin, and their derivatives by stiffness and mass."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.compilation import at_first, by_numpy, jit_quickly, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
 from hks_jax.eigen.complement.factorised import InteriorAdjoint
 from hks_jax.eigen.interior import first_from_origin
@@ -122,12 +123,20 @@ def _computed(
     return values, vectors, bound
 
 
-@partial(jax.jit, static_argnames="k")
 def _cut(
     values: Float[Array, " p"], vectors: Float[Array, "p n_dof"], k: int
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]:
     """Return the first k pairs, and the eigenvalue after them."""
-    return values[:k], vectors[:k], values[k] if len(values) > k else jnp.asarray(jnp.inf, values.dtype)
+    if at_first("cut", (values, vectors)):
+        return by_numpy(partial(_first, k=k), values, vectors)
+    return _first_by_jax(values, vectors, k)
+
+
+def _first(values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
+    return values[:k], vectors[:k], values[k] if len(values) > k else np.asarray(np.inf, values.dtype)
+
+
+_first_by_jax = jax.jit(_first, static_argnames="k")
 
 
 # Apart from the tangents, so that many products with one Jacobian share it.
@@ -245,7 +254,6 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
     return x
 
 
-@jit_quickly()
 def _exact_null_modes(
     pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
@@ -253,20 +261,43 @@ def _exact_null_modes(
 
     Their eigenvalue is 0 and not the ±1e-13 of a solver; what rounding left of them in the other vectors is taken out.
     """
-    mass, product = pencil.mass, partial(jnp.matmul, precision="highest")
+    if not at_first("null modes", (pencil.mass, values, vectors)):
+        return _exact_by_jax(pencil, values, vectors)
     assert pencil.null_space is not None
-    n_null = min(pencil.n_null, values.size)
+    mass = pencil.mass.to_scipy()
+
+    def inverse_cholesky(matrix: np.ndarray) -> np.ndarray:
+        return np.linalg.inv(np.linalg.cholesky(matrix))
+
+    by_scipy = partial(_with_null_modes, np, lambda rows: (mass @ rows.T).T, inverse_cholesky)
+    return by_numpy(by_scipy, pencil.null_space.vectors, values, vectors)
+
+
+@jit_quickly()
+def _exact_by_jax(
+    pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
+) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
+    assert pencil.null_space is not None
     # The barrier keeps XLA from computing with long constants while it compiles.
-    nulls = jax.lax.optimization_barrier(pencil.null_space.vectors[:n_null])
-    image = mass.apply(nulls)
-    lengths = jnp.sqrt(jnp.sum(nulls * image, axis=1, keepdims=True))
+    nulls = jax.lax.optimization_barrier(pencil.null_space.vectors)
+    return _with_null_modes(jnp, pencil.mass.apply, lapack.inverse_cholesky, nulls, values, vectors)
+
+
+def _with_null_modes(
+    xp: Any, mass: Callable[[Any], Any], inverse_cholesky: Callable[[Any], Any], nulls: Any, values: Any, vectors: Any
+) -> tuple[Any, Any]:
+    product = np.matmul if xp is np else partial(jnp.matmul, precision="highest")
+    nulls = nulls[: values.size]
+    image = mass(nulls)
+    lengths = xp.sqrt(xp.sum(nulls * image, axis=1, keepdims=True))
     nulls, image = nulls / lengths, image / lengths
-    orthonormal = lapack.inverse_cholesky(product(nulls, image.T))
+    orthonormal = inverse_cholesky(product(nulls, image.T))
     nulls, image = product(orthonormal, nulls), product(orthonormal, image)
     share = product(vectors, image.T)
     vectors = vectors - product(share, nulls)
-    vectors = vectors / jnp.sqrt(1 - jnp.sum(share * share, axis=1, keepdims=True))
-    return values.at[:n_null].set(0), vectors.at[:n_null].set(nulls)
+    vectors = vectors / xp.sqrt(1 - xp.sum(share * share, axis=1, keepdims=True))
+    n_null = len(nulls)
+    return xp.concatenate([xp.zeros_like(values[:n_null]), values[n_null:]]), xp.concatenate([nulls, vectors[n_null:]])
 
 
 @jax.custom_jvp

@@ -178,7 +178,7 @@ class Eigenpairs(eqx.Module):
             return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
         values, bad = np.asarray(self.eigenvalues), ~np.asarray(self.converged)
-        kept, cut = int(self.kept.sum()), int(self.cut_multiplet)
+        kept, cut = int(np.asarray(self.kept).sum()), int(self.cut_multiplet)
         sentences, last = [], values[kept - 1]
         if bad.any():
             missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
@@ -208,7 +208,7 @@ class Eigenpairs(eqx.Module):
         if not self.k:
             return "no eigenpairs: there are none in the interval"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
-        kept, following = int(self.kept.sum()), float(self.next_eigenvalue)
+        kept, following = int(np.asarray(self.kept).sum()), float(self.next_eigenvalue)
         last = float(self.last_eigenvalue)
         lines = [
             f"{self.k} eigenpairs of {sum(p.space.n_dof for p in self.pencil.parts)} by {self.solver_name}",

@@ -5,17 +5,18 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.checks import require_count
-from hks_jax.compilation import jit_quickly
+from hks_jax.compilation import at_first, by_numpy, jit_quickly
 from hks_jax.eigen.count import certain_count, count_below
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.origin import LocatedPencil, locate, translated
-from hks_jax.eigen.quality import indistinct, largest, quality
+from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
@@ -187,7 +188,6 @@ def _pairs(
     )
 
 
-@jit_quickly(static_argnames=("tolerance", "known"))
 def _quality(
     pencil: SymmetricPencil,
     values: Float[Array, " k"],
@@ -196,19 +196,47 @@ def _quality(
     tolerance: float,
     known: bool,
 ) -> tuple[Array, ...]:
-    """Return residuals, which of them are small, which eigenvalues are zero within rounding, the multiplet tolerance.
-
-    Residuals are relative to eigenvalues as they count from the origin; small ones are measured by the first positive
-    one where the null space is known, and else by the mean distance of eigenvalues.
-    """
+    """Return residuals, what converged, which eigenvalues are zero within rounding, and the multiplet tolerance."""
     k = values.size
     if k == 0:
         return jnp.zeros(0, values.dtype), *[jnp.zeros(0, bool)] * 2, jnp.asarray(1e-6, values.dtype)
-    zero = jnp.abs(values + origin) <= indistinct(pencil, values.dtype)
-    if known:
-        unit = values[min(pencil.n_null, k - 1)]
-    else:  # where all are zero within rounding, only the size of K is left
-        unit = jnp.where(jnp.all(zero), largest(pencil), (values[-1] - values[0]) / k)
-    residuals, small, rounding = quality(pencil, values, vectors, unit, tolerance)
-    converged = small & (values >= 0) if known else small
-    return residuals, converged, zero, jnp.clip(rounding[-1], 1e-6, 1e-3)
+    if not at_first("quality", (pencil, values, vectors)):
+        return _judged_by_jax(pencil, values, vectors, origin, tolerance, known)
+
+    def by_scipy(values: np.ndarray, vectors: np.ndarray, origin: np.ndarray) -> tuple[Any, ...]:
+        measured = measured_on_host(pencil, vectors, values)
+        return _judged(np, measured, values, origin, pencil.n_null, tolerance, known)
+
+    return by_numpy(by_scipy, values, vectors, origin)
+
+
+@jit_quickly(static_argnames=("tolerance", "known"))
+def _judged_by_jax(
+    pencil: SymmetricPencil,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    origin: Float[Array, ""],
+    tolerance: float,
+    known: bool,
+) -> tuple[Array, ...]:
+    measured = *measure_pairs(pencil, vectors, values)[1:], largest(pencil)
+    return _judged(jnp, measured, values, origin, pencil.n_null, tolerance, known)
+
+
+def _judged(
+    xp: Any, measured: tuple[Any, Any, Any], values: Any, origin: Any, n_null: int, tolerance: float, known: bool
+) -> tuple[Any, ...]:
+    """Return what `_quality` does, of pairs as they were measured.
+
+    Residuals are relative to eigenvalues as they count from the origin. Small eigenvalues are measured by the first
+    positive one where the null space is known, and else by their mean distance; where all are zero, by the size of K.
+    """
+    (residuals, twice, size), k = measured, values.size
+    rounding = 4 * xp.finfo(values.dtype).eps * size
+    zero = xp.abs(values + origin) <= rounding
+    unit = values[min(n_null, k - 1)] if known else xp.where(xp.all(zero), size, (values[-1] - values[0]) / k)
+    scale = xp.maximum(xp.abs(values), xp.abs(unit))
+    scale = xp.where(scale > 0, scale, xp.where(size > 0, size, 1)).astype(values.dtype)
+    converged = (residuals <= allowed_residuals(scale, rounding, tolerance, xp)) & ~twice
+    converged = converged & (values >= 0) if known else converged
+    return residuals / scale, converged, zero, xp.clip(rounding / scale[-1], 1e-6, 1e-3).astype(values.dtype)

@@ -1,5 +1,7 @@
 """How well eigenpairs are known: their residuals, and what rounding alone makes of eigenvalues."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,36 +49,30 @@ def measure_pairs(
     return jax.tree.map(lambda of_blocks: of_blocks[place], jax.lax.map(measure, jnp.asarray(starts)))
 
 
-def quality(
-    pencil: SymmetricPencil,
-    values: Float[Array, " k"],
-    vectors: Float[Array, "k n_dof"],
-    unit: Float[Array, ""],
-    tolerance: float,
-) -> tuple[Float[Array, " k"], Bool[Array, " k"], Float[Array, " k"]]:
-    """Return residuals relative to the eigenvalues, whether pairs converged, and what rounding alone makes.
-
-    They converged if residuals are small enough, and vectors orthogonal to those before. Eigenvalues smaller than
-    ``unit`` are measured by it; where both are zero, by the size of K.
-    """
-    _, residuals, twice = measure_pairs(pencil, vectors, values)
-    scale = jnp.maximum(jnp.abs(values), jnp.abs(unit))
-    size, rounding = largest(pencil), indistinct(pencil, values.dtype)
-    scale = jnp.where(scale > 0, scale, jnp.where(size > 0, size, 1))
-    small = (residuals <= allowed_residuals(scale, rounding, tolerance)) & ~twice
-    return residuals / scale, small, rounding / scale
+def measured_on_host(
+    pencil: SymmetricPencil, vectors: Float[np.ndarray, "m n_dof"], values: Float[np.ndarray, " m"]
+) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖, whether a vector is in large part among those before it, and `largest`, by SciPy."""
+    stiffness, mass = pencil.stiffness.to_scipy(), pencil.mass.to_scipy()
+    image = mass @ vectors.T
+    residuals = np.linalg.norm(stiffness @ vectors.T - image * values, axis=0) / np.linalg.norm(image, axis=0)
+    twice = np.zeros(len(values), bool)
+    if vectors.dtype == np.float32:
+        twice = np.any(np.abs(np.tril(vectors @ image, -1)) > _ALIKE, axis=1)
+    return residuals, twice, 4 * np.max(np.abs(stiffness.diagonal()) / mass.diagonal())
 
 
-def allowed_residuals(scale: Float[Array, "*m"], rounding: Float[Array, ""], tolerance: float) -> Float[Array, "*m"]:
+def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp) -> Any:
     """Return the residuals ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
 
     Args:
-        scale: what their residuals are relative to: the size of λ, or of a typical eigenvalue if that is larger.
+        scale: (*m) what their residuals are relative to: the size of λ, or of a typical eigenvalue if that is larger.
         rounding: the residuals that rounding alone may make; it excuses a relative one of a per cent at most, beyond
             which the pair is not known, whatever the reason.
         tolerance: the relative residual asked for.
+        xp: the module of arrays.
     """
-    return jnp.maximum(tolerance * scale, jnp.minimum(rounding, _EXCUSED * scale))
+    return xp.maximum(tolerance * scale, xp.minimum(rounding, _EXCUSED * scale))
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
