@@ -647,8 +647,8 @@ def test_pairs_of_another_pencil_are_refused(tmp_path):
     fewer = {**np.load(path), "vectors": np.ones((6, 41))}
     with pytest.raises(ValueError, match=r"got .* \(6, 41\); expected \(6, 42\), those of this pencil"):
         pairs_of("p.npz", fewer, pencil(plane))
-    with pytest.raises(ValueError, match="lacks part"):
-        pairs_of("p.npz", {name: a for name, a in fewer.items() if name != "part"}, pencil(plane))
+    with pytest.raises(ValueError, match="lacks kept"):
+        pairs_of("p.npz", {name: a for name, a in fewer.items() if name != "kept"}, pencil(plane))
     with pytest.raises(ValueError, match=r"ends in \.npz"):
         hj.io.save_pairs(tmp_path / "p.npy", pairs)
 

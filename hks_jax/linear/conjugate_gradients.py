@@ -122,7 +122,7 @@ def conjugate_gradients(
 
     def direct(state: _Iteration) -> _Iteration:
         z = precondition(state.r)
-        energy, begin = inner(state.r, z), state.steps == (-1 if orthogonal else 0)
+        energy, begin = inner(state.r, z), state.steps == 0
         change = xp.where(state.going & ~state.fresh, energy / state.energy, 0)
         p = xp.where(state.going, z + change[(None,) * (z.ndim - change.ndim)] * state.p, 0)
         z = z if orthogonal else state.z
