@@ -1,8 +1,9 @@
 """Tensors in space: whatever the format, the hand, the unit, the frame and the storage, it is the same field.
 
 A check makes tensors of voxels of any orientation in the scanner's coordinates, writes them as another program would
-(NIfTI in three units of length and three frames, NRRD with a measurement frame in two spaces), and reads them. Then it has the library write and read them once more, in any of its formats, and sample them at the
-voxels' centres. Components along the axes of space, positions in mm, and the picture's sides must be what they were.
+(NIfTI in three units of length and three frames, NRRD with a measurement frame in two spaces), and reads them. Then it
+has the library write and read them once more, in any of its formats, and sample them at the voxels' centres. Components
+along the axes of space, positions in mm, and the picture's sides must be what they were.
 """
 
 import importlib.util
