@@ -38,11 +38,15 @@ def main() -> None:
     mean = np.asarray(hj.hks(pairs, times, "flat"))
     natural = mean * (1 + np.asarray(hj.boundary_influence(pairs, times)))
     figure = hj.plot.new_figure(8.4, 7.4)
-    nodes = np.argwhere(np.isfinite(mean[0])) * grid.spacing
+    orientation = hj.plot.Orientation.of(plane.volume_affine, plane.thin_axis)
+    shown = orientation.grid(grid)
+    nodes = np.argwhere(np.isfinite(orientation.array(mean)[0])) * shown.spacing + shown.origin
     (left, bottom), (right, top) = nodes.min(axis=0) - 4, nodes.max(axis=0) + 4
     for row, name, values in zip(figure.subplots(2, 3), ("neumann", "mean"), (natural, mean), strict=True):
         for ax, length, image in zip(row, LENGTHS, values, strict=True):
-            hj.plot.scalar_image(ax, image, grid, vmin=0.7, vmax=1.3, centre=1.0, label=r"$4\pi t\,$HKS")
+            ax.set(xlim=(left, right), ylim=(bottom, top))
+            colours = {"vmin": 0.7, "vmax": 1.3, "cmap": "RdBu_r", "label": r"$4\pi t\,$HKS"}
+            hj.plot.scalar_image(ax, image, grid, orientation=orientation, **colours)
             ax.set_title(rf"{name}, $\sqrt{{Dt}}$ = {length:g} mm", fontsize="medium")
             ax.set(xlim=(left, right), ylim=(bottom, top))
             ax.set_axis_off()

@@ -37,11 +37,14 @@ def require_number(
 
 
 def require_real(name: str, values: Any) -> None:
-    """Raise ValueError for complex numbers: as real ones they would lose their imaginary part."""
-    if any(np.iscomplexobj(leaf) for leaf in jax.tree.leaves(values)):
+    """Raise ValueError for complex numbers, which would lose their imaginary part, and for those that JAX has not."""
+    leaves = jax.tree.leaves(values)
+    if any(np.iscomplexobj(leaf) for leaf in leaves):
         raise ValueError(
             f"{name}: got complex numbers; expected real ones. Pass the real part, if the imaginary part is rounding"
         )
+    if any(isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f" and leaf.dtype.itemsize > 8 for leaf in leaves):
+        raise ValueError(f"{name}: got {np.dtype(np.longdouble)}, which JAX has not; pass it as .astype(np.float64)")
 
 
 def real_array(name: str, values: Any) -> Array:

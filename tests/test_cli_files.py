@@ -320,6 +320,16 @@ def test_numpy_files_and_unsymmetric_matrices(tmp_path, capsys):
     assert "1 tensors are unsymmetric, and this format keeps one half of them only" in error
 
 
+def test_volumes_without_an_element_and_of_eight_values(tmp_path, capsys):
+    np.save(tmp_path / "t.npy", np.broadcast_to(D, (1, 1, 1, 3, 3)))
+    assert main(["info", str(tmp_path / "t.npy"), "--spacing", "1", "1", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "components      0: nothing to compute on" in text
+    assert "t ≥" not in text
+    nib.save(nib.Nifti1Image(np.ones((3, 4, 5, 8)), np.eye(4)), tmp_path / "camino.nii.gz")
+    assert "Camino has an exit code and log S₀ before" in error_of(capsys, ["info", str(tmp_path / "camino.nii.gz")])
+
+
 @pytest.mark.parametrize(("library", "suffix"), [("nrrd", ".nrrd"), ("vtkmodules", ".vti"), ("nibabel", ".nii.gz")])
 def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library, suffix):
     pytest.importorskip(library)

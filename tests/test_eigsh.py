@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse as sp
+from annotations import unchecked
 from jax.experimental.sparse import BCOO, BCSR
 from pencils import directions, graph_laplacian, indefinite, lattice
+from scipy.sparse.linalg import aslinearoperator
 from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
 from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
@@ -180,6 +182,17 @@ def test_what_is_refused():
     skewed[3, 5] = 0.3
     with pytest.raises(ValueError, match=r"K: not symmetric: entry \((3, 5|5, 3)\)"):
         hj.eigsh(skewed, M, 3)
+    almost = K.tolil()
+    almost[3, 4] += 1e-9
+    with pytest.raises(ValueError, match=r"entry .* differs from it by 1e-09, which is more than rounding"):
+        hj.eigsh(almost, k=3)
+    with pytest.raises(ValueError, match=r"M: got the number 6; .* If it is k, pass k=6"):
+        hj.eigsh(K, 6)
+    with pytest.raises(ValueError, match=r"K: got float128, .* \.astype\(np.float64\)"):
+        hj.eigsh(K.astype(np.longdouble), k=3)
+    for given in ((aslinearoperator(K),), (K, aslinearoperator(M))):
+        with unchecked(), pytest.raises(TypeError, match=r"[KM]: got a LinearOperator; expected a matrix with entries"):
+            hj.eigsh(*given, k=3)
     with pytest.raises(ValueError, match=r"M: got shape \(59, 59\); expected that of K, \(60, 60\)"):
         hj.eigsh(K, sp.eye(59).tocsr() + sp.eye(59, k=1) + sp.eye(59, k=-1), 3)
     with pytest.raises(ValueError, match=r"M: it has \d+ negative eigenvalue"):

@@ -1,3 +1,4 @@
+import re
 import warnings
 
 import jax
@@ -295,6 +296,10 @@ def test_too_small_times_are_reported():
     whole = hj.eigenpairs(flat((8, 9), (1.0, 1.0)), 72)
     with pytest.warns(hj.AccuracyWarning, match="too small for the grid: .* Use times from about .* or a finer grid"):
         hj.hks(whole, [0.004])
+    # The advice is the same whatever the time, and enough.
+    said = [hj.truncation(whole, [t]).messages()[0] for t in (1e-6, 1e-3, 4e-3)]
+    (least,) = {float(re.search(r"from about (\S+),", text)[1]) for text in said}
+    assert 0.095 < hj.truncation(whole, [least]).resolution_bias[0] < 0.105
     smallest = hj.truncation(pairs, [0.5]).smallest_time
     assert hj.truncation(pairs, smallest[None]).tail[0] < 0.011
 

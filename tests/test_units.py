@@ -64,6 +64,8 @@ def test_masks_and_labels_that_lost_the_unit_lie_where_the_tensors_do(tmp_path):
         nib.save(image, tmp_path / "m.nii")
         np.testing.assert_array_equal(read_mask(tmp_path / "m.nii", read.affine), values == 1)
         np.testing.assert_array_equal(read_labels(tmp_path / "m.nii", SHAPE, read.affine), values)
+        with pytest.raises(ValueError, match=r"affine is the image's, .* cropped or resampled without its affine"):
+            read_labels(tmp_path / "m.nii", (8, 7, 6), read.affine)
     image.header.set_xyzt_units("meter")
     nib.save(image, tmp_path / "m.nii")
     with pytest.raises(ValueError, match="the mask's affine places it"):

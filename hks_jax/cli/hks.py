@@ -34,7 +34,7 @@ Compute the heat kernel signature of a field of diffusion tensors. FILE holds on
   tensors                    of a volume, which is computed whole unless --slice cuts it; pass --metric
   diffusion-weighted images  with --bval and --bvec: tensors are fitted to them
   a mesh                     of triangles or tetrahedra, with the metric of space, or with that of the tensors at its
-                             vertices that --array names
+                             vertices that --array names, or of the volume --tensors in which it lies
   eigenpairs                 which --save-pairs has kept: for other times, or another normalisation or method
 
 The folder OUT gets hks.npz, an image or a mesh in FILE's format (times along the fourth axis), hks.png and report.json.
@@ -46,6 +46,7 @@ examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 100 --times auto:8
   hks-jax hks out/pairs.npz -o later --times auto:24 --normalisation flat
   hks-jax hks heart.vtu -o out --array D --metric inverse -k 50
+  hks-jax hks lh.white --tensors dti.nii.gz -o out --metric inverse
   hks-jax hks dwi.nii.gz --bval dwi.bval --bvec dwi.bvec -o out --slice z=10 --metric inverse --components largest
 """
 
@@ -70,6 +71,14 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
     )
     add_clean_argument(parser)
+    add(
+        "--tensors",
+        type=Path,
+        metavar="FILE",
+        help="of a mesh that lies in a volume, such as a cortex: the tensors, sampled at its vertices in the "
+        "coordinates of the scanner (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation); "
+        "options on voxels and numbers are about this file",
+    )
     add_signature_arguments(parser)
     add_noise_arguments(parser)
     add_view_argument(parser)
@@ -149,6 +158,8 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--clean: it is for meshes; leave it out for tensors on a grid, and see --repair")
     if args.noise is not None and (on_mesh or saved):
         raise ValueError("--noise: it is for tensors on a grid; leave it out for meshes and for eigenpairs")
+    if args.tensors and not on_mesh:
+        raise ValueError("--tensors: it is for a mesh that lies in a volume; leave it out for the volume itself")
     if not (on_mesh or saved):
         require_metric(args)
     from hks_jax.cli import mesh as meshes
@@ -169,7 +180,7 @@ def run(args: argparse.Namespace) -> None:
         draw_to: Callable[[Path], None]
         if on_mesh:
             with progress.stage("reading", str(args.file)):
-                mesh = meshes.read_domain(args)
+                mesh = meshes.read_domain(args, progress)
             result = compute_on_mesh(mesh, meshes.describe_mesh(args.file, mesh), settings, progress)
             image, draw_to = meshes.mesh_suffix(args.file, mesh), partial(meshes.draw, result)
         else:

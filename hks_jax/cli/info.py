@@ -114,10 +114,10 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         description["eigenvalues"]["largest"] = float(values.max())
         description["median_mean_diffusivity"] = float(np.median(values.mean(axis=-1)))
     # Of a few valid ones among indefinite tensors nothing can be told that suits.
-    if good.any() and bad.sum() <= MANY * inside.sum():
+    if count and good.any() and bad.sum() <= MANY * inside.sum():
         metrics = {"inverse": np.linalg.inv(tensors), "tensor": tensors}
         problems, share = n_problems(boundary, volume.dimension), inside.sum() / good.sum()
-        steps = _steps(labels if count else inside)
+        steps = _steps(labels)
         description["suits"] = {
             name: _suits(g, np.array(volume.spacing), steps, share, problems) for name, g in metrics.items()
         }
@@ -216,7 +216,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"order, frame    {description['order']}, {description['frame']} axes",
             *(f"                {as_options(note, READING)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",
-            f"components      {description['components']} ({sizes} nodes)",
+            f"components      {description['components']}{f' ({sizes} nodes)' if sizes else ': nothing to compute on'}",
             f"boundary        {description['boundary']} unless chosen"
             f"{', whose two problems share the k pairs' * (description['boundary'] == MEAN)}",
         ]

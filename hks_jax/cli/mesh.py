@@ -9,19 +9,30 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.job import Result, use_dtype
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import read
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.io import read_mesh, read_mesh_arrays
+from hks_jax.io import read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN
 from hks_jax.io.provenance import digest
+from hks_jax.io.repair import require_valid
 from hks_jax.io.tensor_order import unpack
 from hks_jax.plot import new_figure, number_text, save_figure, surface
 
 _OF_GRIDS = {
     "slice": None,
+    "through": None,
+    "view": "neurological",
+    "save_pairs": False,
+    "components": "raise",
+    "method": "spectral",
+}
+"""Options that mean nothing on a mesh, and what they are unless given."""
+_OF_VOLUMES = {
     "mask": None,
     "background": None,
     "erode": 0,
@@ -33,36 +44,33 @@ _OF_GRIDS = {
     "bvec": None,
     "bvec_frame": None,
     "b_max": None,
-    "through": None,
-    "view": "neurological",
-    "save_pairs": False,
-    "components": "raise",
-    "method": "spectral",
 }
-"""Options that mean nothing on a mesh, and what they are unless given."""
+"""Those that are about the volume in which a mesh lies."""
 _OF_TENSORS = {"metric": None, "order": None, "interpolation": "linear"}
 """Options that are about the tensors at a mesh's vertices."""
 
 
 def check_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that are for grids alone, and for tensors of which the metric is open."""
-    for name, default in _OF_GRIDS.items():
+    if args.tensors and args.array:
+        raise ValueError("--tensors, --array: got both; tensors come from a volume, or from the mesh's own vertices")
+    for name, default in (_OF_GRIDS if args.tensors else _OF_GRIDS | _OF_VOLUMES).items():
         if getattr(args, name) != default:
             raise ValueError(f"--{name.replace('_', '-')}: it is for tensors on a grid; leave it out for a mesh")
     if args.boundary not in (None, *MESH_BOUNDARIES):
         raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes one of {', '.join(MESH_BOUNDARIES)}")
-    if args.array is None:
+    if not (args.array or args.tensors):
         for name, default in _OF_TENSORS.items():
             if getattr(args, name) != default:
                 raise ValueError(
-                    f"--{name}: a mesh has the metric of space unless --array names tensors at its vertices; pass "
-                    "both, or neither"
+                    f"--{name}: a mesh has the metric of space unless --array names tensors at its vertices, or "
+                    "--tensors a volume of them; pass both, or neither"
                 )
     elif args.metric is None:
         raise ValueError("--metric: choose what the tensors at the vertices stand for: inverse, tensor or adjugate")
 
 
-def read_domain(args: argparse.Namespace) -> SurfaceMesh | TetMesh:
+def read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:
     """Read the mesh, with the metric of the tensors at its vertices if they are asked for, in the precision asked for.
 
     Raises:
@@ -70,12 +78,17 @@ def read_domain(args: argparse.Namespace) -> SurfaceMesh | TetMesh:
         ValueError: a file that is no mesh, or whose tensors make no metric.
     """
     use_dtype(args.dtype)
-    mesh = read_mesh(args.file, clean=args.clean)
+    mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))
     vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
-    if args.array is None:
+    if args.tensors:
+        volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors}), progress)
+        require_valid(volume, "--repair")
+        tensors = sample_tensors(volume, mesh.vertices).astype(args.dtype)
+    elif args.array:
+        tensors = _tensors(args).astype(args.dtype)
+    else:
         return kind(vertices, cells)
-    tensors = _tensors(args).astype(args.dtype)
     return kind.from_tensors(vertices, cells, tensors, args.metric, at="vertices", interpolation=args.interpolation)
 
 

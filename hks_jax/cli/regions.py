@@ -104,7 +104,7 @@ def _about(about: About, atlas: Path, names: Path | None, flat: bool) -> dict[st
         "lambda1_t": {"Description": "t times the first positive eigenvalue: the same numbers for all subjects"},
         "t": {"Description": "time of diffusion, (metric length)²: s for the metric D⁻¹ of mm²/s on mm", **unit},
         "mean": {"Description": f"mean over these voxels of {values}"},
-        "std": {"Description": "standard deviation over these voxels, divided by their number"},
+        "std": {"Description": "standard deviation over these voxels (the root of the mean square deviation)"},
         "median": {"Description": "median over these voxels"},
         "error": {"Description": "standard deviation of the mean that the noise of the tensors gives it"},
         "GeneratedBy": {"Name": "hks-jax", "Version": __version__},

@@ -1,6 +1,7 @@
 """What users have as sparse matrices, as operators with one symmetric pattern."""
 
 import math
+import numbers
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 from jax.experimental.sparse import BCOO, BCSR
 from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_matrix, issparse
+from scipy.sparse.linalg import LinearOperator
 
 from hks_jax.checks import real_array, require_number
 from hks_jax.fem.assembly import MassKind, assemble
@@ -94,7 +96,8 @@ def sparse_pencil(
 
 def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
     """Return the pencil of a field, a mesh, a matrix K or a pair (K, M); or the one that is given, checked."""
-    matrix = issparse(domain) or isinstance(domain, BCOO | BCSR | Operator | np.ndarray | jax.Array | list)
+    matrices = BCOO | BCSR | Operator | np.ndarray | jax.Array | list | LinearOperator
+    matrix = issparse(domain) or isinstance(domain, matrices)
     if not matrix and not isinstance(domain, SymmetricPencil | MirrorPencil | tuple):
         return assemble(domain, boundary, mass)
     if boundary != "neumann" or mass != "consistent":
@@ -161,6 +164,13 @@ def require_null_space(pencil: SymmetricPencil) -> None:
 
 
 def _pencil(K: Any, M: Any) -> SymmetricPencil:
+    for name, matrix in (("K", K), ("M", M)):
+        if isinstance(matrix, LinearOperator):
+            raise TypeError(
+                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full: it is factorised"
+            )
+    if np.ndim(M) == 0 and isinstance(M, numbers.Number):
+        raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If it is k, pass k={M}")
     stiffness = _entries("K", K)
     dtype = stiffness.values.dtype
     n = stiffness.size
@@ -266,8 +276,8 @@ def _check_symmetric(name: str, matrix: _Entries) -> None:
         at = int(np.argmax(difference.data))
         i, j = int(difference.row[at]), int(difference.col[at])
         raise ValueError(
-            f"{name}: not symmetric: entry ({i}, {j}) is {held[i, j]:.6g}, and entry ({j}, {i}) is {held[j, i]:.6g}. "
-            f"If that is what you mean, pass ({name} + {name}.T) / 2"
+            f"{name}: not symmetric: entry ({i}, {j}) is {held[i, j]:.6g}, and entry ({j}, {i}) differs from it by "
+            f"{difference.data[at]:.2g}, which is more than rounding. If it means nothing, pass ({name} + {name}.T) / 2"
         )
 
 

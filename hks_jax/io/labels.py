@@ -111,6 +111,11 @@ def _at_voxels(
     box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
     inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
     if apart > NEAR or not inside:
+        if values.shape != tuple(size) and np.allclose(place, affine):
+            raise ValueError(
+                f"{name}: its affine is the image's, and its shape {values.shape} is not, which is {tuple(size)}; "
+                "expected labels of the image's voxels. One of them was cropped or resampled without its affine"
+            )
         raise ValueError(
             f"{name}: its affine places the labels on other voxels than the image's; expected the image's own. "
             "Resample them to the image, by the nearest neighbour"

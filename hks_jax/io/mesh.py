@@ -25,7 +25,7 @@ WRITTEN = {".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".ply": "ply"}
 """The formats with room for values at the vertices, and what meshio calls them. PLY has triangles only."""
 
 
-def read_mesh(path: str | os.PathLike[str], *, clean: bool = False) -> SurfaceMesh | TetMesh:
+def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bool = False) -> SurfaceMesh | TetMesh:
     """Read a mesh: tetrahedra, where the file has any, or else triangles.
 
     ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply``, ``.stl`` through meshio; ``.obj`` and ``.off``; polygonal data in
@@ -44,15 +44,19 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False) -> SurfaceMe
             area or volume, cells that are there twice and vertices without a cell; and turn tetrahedra round whose
             vertices are in the other order. The vertices are numbered anew, in the order of the file. A warning says
             what was done.
+        in_space: take the coordinates of the scanner, in which images lie: FreeSurfer's are turned and moved by the
+            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Others are taken to
+            have them.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: an unknown kind of file, an unreadable one, cells that are neither triangles, quadrilaterals nor
+        ValueError: with ``in_space`` a surface of FreeSurfer's that does not say where its volume lies; an unknown
+            kind of file, an unreadable one, cells that are neither triangles, quadrilaterals nor
             tetrahedra, a mesh in pieces that touch at vertices at the same place, or one that `SurfaceMesh` or
             `TetMesh` refuses.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
-    loaded, said = _load(path, clean)
+    loaded, said = _load(path, clean, in_space)
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
     remedy = "" if clean else ". clean=True puts right what it can: see read_mesh"
     try:
@@ -116,12 +120,12 @@ def write(
     return Path(path)
 
 
-def _load(path: str | os.PathLike[str], clean: bool) -> tuple[Loaded, str]:
+def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
     """Return what is in a file, cleaned if asked to, and what was done about it."""
     file = existing(path)
     name = file.name.lower()
     if name.endswith((".gii", ".gii.gz")):
-        loaded = cortex.load_gifti(file)
+        loaded = cortex.load_gifti(file, in_space)
     elif name.endswith(".vtp") or (name.endswith(".vtk") and holds_dataset(file, "POLYDATA")):
         loaded = polygonal(str(file))
     elif name.endswith(".obj"):
@@ -131,7 +135,7 @@ def _load(path: str | os.PathLike[str], clean: bool) -> tuple[Loaded, str]:
     elif name.endswith(READ):
         loaded = through_meshio(str(file))
     elif cortex.is_freesurfer(file):
-        loaded = cortex.load_freesurfer(file)
+        loaded = cortex.load_freesurfer(file, in_space)
     else:
         raise ValueError(f"{file}: unknown kind of mesh; expected {', '.join(READ)}, or a surface of FreeSurfer's")
     return cleaned(loaded) if clean else (loaded, "")

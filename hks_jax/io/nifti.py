@@ -167,9 +167,12 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
     """Return the tensors of an image that was loaded."""
     shape = image.shape
     if shape[3:] not in ((6,), (1, 6)):
+        remedy = "Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi, or --bval and --bvec"
+        if shape[3:] == (8,):
+            remedy += '. Camino has an exit code and log S₀ before the six: leave them out, and pass the order "fsl"'
         raise ValueError(
             f"{name}: got an image of shape {shape}; expected six components per voxel, (nx, ny, nz, 1, 6) or "
-            "(nx, ny, nz, 6). Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi, or --bval and --bvec"
+            f"(nx, ny, nz, 6). {remedy}"
         )
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     affine, length_unit = affine_in_mm(name, image)

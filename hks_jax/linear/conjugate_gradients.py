@@ -135,7 +135,8 @@ def conjugate_gradients(
         regular = ~((curvature <= least) | (state.energy <= 0)) | begin
         length = xp.where(state.going & regular, state.energy / xp.where(regular & ~begin, curvature, 1), 0)
         length = xp.where(begin, -1, length)
-        x, r, again = state.x + length * p, state.r - length * image, begin
+        wide = length[(None,) * (p.ndim - length.ndim)]
+        x, r, again = state.x + wide * p, state.r - wide * image, begin
         kept = state.kept
         if kept is not None:
             # When all places are taken the last one is used again: what is lost first was known first.

@@ -122,7 +122,7 @@ def _require_symmetric(name: str, array: np.ndarray) -> None:
     limit = np.sqrt(np.finfo(array.dtype).eps)
     if skew[i, j] > limit * largest:
         raise ValueError(
-            f"{name}: unsymmetric, most of all in row {i}, column {j}: {array[i, j]:.6g} there, and {array[j, i]:.6g} "
-            f"in row {j}, column {i}; expected a symmetric matrix, but for {limit:.2g} of its largest entry, "
-            f"{largest:.6g}. Pass ({name} + {name}.T) / 2 if the difference is noise"
+            f"{name}: unsymmetric, most of all in row {i}, column {j}: {array[i, j]:.6g} there, and "
+            f"{array[j, i] - array[i, j]:.2g} more in row {j}, column {i}; expected a symmetric matrix, but for "
+            f"{limit:.2g} of its largest entry, {largest:.6g}. Pass ({name} + {name}.T) / 2 if the difference is noise"
         )

@@ -66,11 +66,15 @@ class Truncation(eqx.Module):
         lasting = np.asarray(self.lasting_bias)
         early = (bias > BIAS_LIMIT) & (lasting <= BIAS_LIMIT)
         if early.any():
-            first = times[early].min()
+            at = np.argmax(np.where(early, bias, 0))
+            first = times[at]
+            # The estimate is x/(1 + x) with x² = (a/t)² + c² (see `_resolution_bias`), c that which does not fall.
+            x, c, limit = (each / (1 - each) for each in (min(bias[at], 1 - 1e-15), lasting[at], BIAS_LIMIT))
+            least = first * ((x**2 - c**2) / max(limit**2 - c**2, 1e-6)) ** 0.5
             messages.append(
                 f"{int(early.sum())} of {times.size} times are too small for the grid: the discretisation biases the "
-                f"signature at t = {first:.4g} by about {bias[early].max():.1%} at half of the nodes. "
-                f"Use times from about {first * bias[early].max() / BIAS_LIMIT:.4g}, or a finer grid"
+                f"signature at t = {first:.4g} by about {bias[at]:.1%} at half of the nodes. "
+                f"Use times from about {least:.4g}, or a finer grid"
             )
         if (lasting > BIAS_LIMIT).any():
             messages.append(

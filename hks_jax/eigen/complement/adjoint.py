@@ -94,7 +94,7 @@ def definite_product(
     def product(x: Float[Array, "n b"]) -> tuple[Float[Array, "n b"], Float[Array, " b"]]:
         image = mass(x)
         energy = (x * image).sum(axis=0)
-        return stiffness(x) - shifts * image, SINGULAR * beyond * energy
+        return stiffness(x) - shifts[None] * image, SINGULAR * beyond * energy
 
     return product
 
