@@ -14,7 +14,7 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.eigen.complement.adjoint import attainable
-from hks_jax.eigen.complement.factorised import group_blocks
+from hks_jax.eigen.complement.factorised_adjoint import group_blocks
 from hks_jax.linear.dissection import dissect
 
 SHAPE = (10, 10)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hks_jax as hj
-from hks_jax.eigen.complement.factorised import FactorisedAdjoint
+from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
 from hks_jax.inverse.observation import observe
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.inverse.problem import Problem

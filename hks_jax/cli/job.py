@@ -14,8 +14,8 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.automatic import choose_solver
+from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.solve import eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil

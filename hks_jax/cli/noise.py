@@ -18,8 +18,8 @@ from hks_jax.cli.job import Bars, Result, Settings, automatic_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.solve import eigenpairs
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.hks import hks
 from hks_jax.uncertainty import TensorNoise, uncertainty

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import at_first, by_numpy, jit_quickly, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
-from hks_jax.eigen.complement.factorised import InteriorAdjoint
+from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
 from hks_jax.eigen.interior import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
@@ -77,7 +77,7 @@ def solved(
 # an eigenvector only where λᵢ is simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What
 # does not depend on the basis, such as every spectral function, must not be computed from that gauge, and `of_simple`
 # keeps it from users. For it there is the frame: its derivative has the sum over j > k alone, which no basis of the
-# first k changes (hks_jax/signatures/spectral.py).
+# first k changes (hks_jax/signatures/spectral_functions.py).
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver,

@@ -8,7 +8,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from hks_jax.eigen.complement.adjoint import Adjoint
-from hks_jax.eigen.complement.factorised import FactorisedAdjoint
+from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
 from hks_jax.linear.pencil import SymmetricPencil
 
 P = TypeVar("P", bound=SymmetricPencil)

@@ -24,12 +24,12 @@ from hks_jax.inverse.conformal import InnerProduct
 from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Loss, Observation, Signature, observe, weigh
 from hks_jax.inverse.optimise import Optimiser
+from hks_jax.inverse.outcome import more_pairs, truncation_shows
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.search import Search, choose_inner_product
 from hks_jax.inverse.stages import pairs_of_stage, stages_of
-from hks_jax.inverse.truncated import more_pairs, truncation_shows
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
 
 

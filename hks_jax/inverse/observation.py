@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from hks_jax.checks import checked_times, require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.signatures.heat import heat_trace, wks
 from hks_jax.signatures.hks import hks_of_pairs
+from hks_jax.signatures.kernels import heat_trace, wks
 from hks_jax.static_array import StaticArray
 
 Signature = Callable[[Eigenpairs], Array]

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.gauss_newton import GaussNewton
+from hks_jax.inverse.outcome import Outcome, residuals_and_outcome
 from hks_jax.inverse.problem import Problem
-from hks_jax.inverse.truncated import Outcome, residuals_and_outcome
 from hks_jax.inverse.unknowns import Values
 
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.eigen.weyl import weyl_count
 from hks_jax.fem.pencil import AnyPencil

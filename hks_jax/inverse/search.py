@@ -19,9 +19,9 @@ from hks_jax.inverse.conformal import (
 )
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.optimise import Optimiser, optimise
+from hks_jax.inverse.outcome import Outcome, more_pairs, observed_times, outcome_of, truncation_shows
 from hks_jax.inverse.parametrisation import Conformal
 from hks_jax.inverse.problem import Problem
-from hks_jax.inverse.truncated import Outcome, more_pairs, observed_times, outcome_of, truncation_shows
 from hks_jax.inverse.unknowns import Nodal, Unknowns, Values
 
 OPTIMISERS = ("gauss-newton", "lbfgs", "bfgs")

@@ -10,8 +10,8 @@ import numpy as np
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.inverse.observation import Observation
+from hks_jax.inverse.outcome import observed_times
 from hks_jax.inverse.problem import pairs_below, pairs_for, require_resolved, unknowns_of
-from hks_jax.inverse.truncated import observed_times
 
 
 def stages_of(

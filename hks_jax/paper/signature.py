@@ -11,7 +11,7 @@ from hks_jax.accuracy import AccuracyWarning
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.solve import eigenpairs
+from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.weyl import weyl_number
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.signatures.hks import Normalisation, hks_of_pairs

@@ -8,15 +8,15 @@ from jaxtyping import Array, Float
 from hks_jax.checks import checked_times
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.solve import eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, Sides, normalise_boundary
 from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.hks import hks_of_pairs
-from hks_jax.signatures.spectral import spectral_diagonal
+from hks_jax.signatures.spectral_functions import spectral_diagonal
 from hks_jax.signatures.times import require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
 

@@ -13,7 +13,12 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.signatures.filters import Filter, Heat, Power
-from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_squared_distances
+from hks_jax.signatures.spectral_functions import (
+    source_indices,
+    spectral_columns,
+    spectral_diagonal,
+    spectral_squared_distances,
+)
 from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
 from hks_jax.signatures.truncation import truncation, warn_if_truncated
 from hks_jax.traced import is_traced

@@ -14,7 +14,7 @@ from hks_jax.checks import checked_times, require_real
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
-from hks_jax.signatures.spectral import spectral_flow
+from hks_jax.signatures.spectral_functions import spectral_flow
 from hks_jax.signatures.times import require_pairs
 from hks_jax.signatures.truncation import TAIL_LIMIT
 from hks_jax.traced import is_traced

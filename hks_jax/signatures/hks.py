@@ -16,7 +16,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Heat
-from hks_jax.signatures.spectral import spectral_diagonal, spectral_trace
+from hks_jax.signatures.spectral_functions import spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import dimension_of, require_pairs, volume_of
 from hks_jax.signatures.truncation import truncation, warn_if_truncated
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free

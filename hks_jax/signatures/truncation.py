@@ -21,7 +21,7 @@ from hks_jax.fem.space import mask_for
 from hks_jax.linear.loops import for_each
 from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
-from hks_jax.signatures.spectral import spectral_diagonal
+from hks_jax.signatures.spectral_functions import spectral_diagonal
 from hks_jax.signatures.times import dimension_of, require_pairs
 from hks_jax.traced import is_traced
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.checks import checked_times, require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
-from hks_jax.signatures.spectral import source_indices, spectral_columns, spectral_diagonal, spectral_trace
+from hks_jax.signatures.spectral_functions import source_indices, spectral_columns, spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import default_energies, positive_range, require_pairs
 from hks_jax.signatures.truncation import warn_if_truncated
 from hks_jax.traced import is_traced
