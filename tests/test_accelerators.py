@@ -92,6 +92,7 @@ def pencil_of(rng, domain):
     return hj.assemble(hj.TensorField(hj.Grid((20, 23), 0.1, mask=mask), random_spd(rng, (20, 23))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("traffic", [100.0, 1e4, pytest.param(1e9, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("domain", ["mask", "mesh"])
 def test_merged_levels_solve_as_the_tree_does(rng, monkeypatch, domain, traffic):

@@ -261,8 +261,10 @@ def test_bad_voxels_are_refused_before_anything_is_computed(nifti, tmp_path, cap
         ["--boundary", "dirichlet:neumann,neumann", "--solver", "dense"],
         ["--boundary", "mean", "--normalisation", "flat"],
         ["--solver", "shift-invert", "--normalisation", "heat-trace"],
-        ["--metric", "adjugate", "--erode", "1", "--interpolation", "log-euclidean"],
-        ["--dtype", "float32", "--times", "auto:3"],
+        pytest.param(
+            ["--metric", "adjugate", "--erode", "1", "--interpolation", "log-euclidean"], marks=pytest.mark.slow
+        ),
+        pytest.param(["--dtype", "float32", "--times", "auto:3"], marks=pytest.mark.slow),
     ],
 )
 def test_options_reach_the_computation(npz, tmp_path, extra):

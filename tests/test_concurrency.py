@@ -9,6 +9,7 @@ from concurrent_programs import PROGRAMS, run
 PACKAGE = Path(__file__).parent.parent / "hks_jax"
 
 
+@pytest.mark.slow
 def test_a_program_that_stopped_within_two_calls():
     run(["count, mirror"])
 

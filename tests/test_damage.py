@@ -248,6 +248,7 @@ def test_whatever_meshio_raises_is_one_error(tmp_path, rng):
             assert error is None or name in str(error)
 
 
+@pytest.mark.slow
 def test_checks_of_random_files_pass():
     from stress.files import check
 

@@ -123,6 +123,7 @@ def test_full_spectrum_against_the_matrix_exponential(rng, name):
     assert jnp.linalg.norm(gradient - expected) < 1e-9 * jnp.linalg.norm(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("boundary", "mass", "solver"),
     [
@@ -257,8 +258,13 @@ SIGNATURES = {
 MULTIPLE = ["heat kernel", "heat trace", "wks", "scale-invariant", "diffusion distance", "custom"]
 
 
+QUICK = ["heat kernel", "wks", "diffusion distance", "custom"]
+
+
 @pytest.mark.parametrize(
-    ("name", "at"), [(name, "generic") for name in SIGNATURES] + [(name, "rotational") for name in MULTIPLE]
+    ("name", "at"),
+    [pytest.param(name, "generic", marks=[] if name in QUICK else pytest.mark.slow) for name in SIGNATURES]
+    + [(name, "rotational") for name in MULTIPLE],
 )
 def test_every_signature_against_differences(rng, name, at):
     signature = SIGNATURES[name]
@@ -365,6 +371,7 @@ def test_batched_equals_looped_and_jitted_equals_eager(rng, solver):
     np.testing.assert_allclose(jax.jit(gradient)(batch[1]), looped[1], atol=1e-9 * scale)
 
 
+@pytest.mark.slow
 def test_sparse_derivatives_are_as_good_as_dense_ones(rng):
     """48² nodes, k = 60, every solver setting at its default."""
     grid, k = hj.Grid((48, 48), 1 / 47), 60
@@ -478,6 +485,7 @@ OTHER_ADJOINTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if "," in n else ()) for n in OTHER_ADJOINTS])
 def test_any_adjoint_serves_any_solver(rng, name):
     probe = jnp.asarray(rng.standard_normal(GRID.shape))

@@ -138,6 +138,7 @@ def test_gradients_at_simple_and_multiple_eigenvalues(rng, matrices, k):
         np.testing.assert_allclose(along, (ends[1] - ends[0]) / (2 * h), rtol=1e-6, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_sums_over_eigenvectors_by_hand_are_right_or_nan():
     """The 3-cycle, whose second eigenvalue is double until a potential splits it."""
     pencil = hj.sparse_pencil(3 * np.eye(3) - 1.0)
@@ -270,6 +271,7 @@ SIMPLE_SPECTRA = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:k = 6 cuts a multiple eigenvalue")
 @pytest.mark.parametrize(
     "name",

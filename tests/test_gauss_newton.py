@@ -97,6 +97,7 @@ def test_only_a_step_with_a_tight_linear_system_may_be_the_last(changes, tight, 
     assert (bool(state.tight), bool(state.done)) == (tight, done)
 
 
+@pytest.mark.slow
 def test_no_step_is_chosen_where_what_was_taken_will_do():
     def residuals(y, args):
         return y - 2, jnp.sum((y - 2) ** 2)
@@ -154,6 +155,7 @@ def test_the_information_on_conformal_factors_is_that_of_a_power_of_the_laplacia
         assert values[-1] <= 0.03 / damping * (1 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_preconditioner_is_definite_on_masks_and_for_any_metric(rng, d):
     shape = (6, 5, 4)[:d]

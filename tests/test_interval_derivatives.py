@@ -74,6 +74,7 @@ def check(pencil, first, last, solver, rng, tolerance=1e-7):
         np.testing.assert_allclose(jax.jvp(run, (pencil,), (change,))[1], right, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, pytest.param(SOLVER, marks=pytest.mark.slow)])
 def test_multiple_eigenvalues(rng, solver):
     """A torus, whose eigenvalues come in groups of four and eight."""
@@ -127,6 +128,7 @@ def located(pencil, low, high, k):
     return translated(pencil, low, certain_count(pencil, low)[0], width / 2, width / k)
 
 
+@pytest.mark.slow
 def test_solves_between_what_is_left(rng):
     """Many rows in several groups: (K − λM)x = Qb on the complement; a row that has no solution is NaN."""
     K = lattice(20) + sp.diags(rng.uniform(0, 0.5, 400))

@@ -178,7 +178,10 @@ SIGNATURES = {
 }
 
 
-@pytest.mark.parametrize("name", SIGNATURES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[] if name in ("hks", "wks", "heat flow") else pytest.mark.slow) for name in SIGNATURES],
+)
 def test_signatures_are_those_of_the_domain(name):
     """The matrices of a mesh, with null vectors and geometry said: the same signatures and derivatives."""
     mesh = hj.examples.sphere_mesh(5)
@@ -249,6 +252,7 @@ def test_a_matrix_or_two_are_a_domain():
         hj.eigenpairs((K, M, M), 5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["neumann", "mirror", ("dirichlet", "neumann")])
 def test_a_band_is_the_difference_of_two_truncated_sums(boundary, rng):
     field = hj.TensorField(hj.Grid((16, 15), 1 / 15), random_spd(rng, (16, 15)))
@@ -326,6 +330,7 @@ def path(n):
     return sp.diags([ends, -np.ones(n - 1), -np.ones(n - 1)], [0, 1, -1]).tocsr()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.0, -1e5, 1e5])
 @pytest.mark.parametrize("solver", ["dense", "block-lanczos"])
 def test_an_offset_changes_no_derivative(offset, solver):

@@ -129,6 +129,7 @@ def test_on_a_geodesic_rim_the_expansion_holds_up_to_the_rim():
     assert np.abs(natural - expansion)[:, 2].min() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["hks", pytest.param("influence", marks=pytest.mark.slow)])
 def test_gradients_against_central_differences(rng, what):
     field = masked_field(rng, (6, 5))
@@ -216,6 +217,7 @@ def test_bad_boundaries_are_named(rng):
         hj.assemble(flat((5, 5), (1.0, 1.0)), ("neumann", "neumann", "dirichlet"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["mean", "mirror", ("mirror", "mean")])
 def test_a_part_that_others_include_has_no_more_than_its_share_of_pairs(boundary, rng):
     field = hj.TensorField(hj.Grid((9, 8), 0.1), random_spd(rng, (9, 8)))

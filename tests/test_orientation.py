@@ -166,6 +166,7 @@ def brains(tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 def test_a_brain_stored_in_another_order_is_the_same_picture(brains, tmp_path):
     pictures = {}
     for name, (path, order) in brains.items():
@@ -310,6 +311,7 @@ def test_a_centre_of_zero_is_one_of_either_sign():
     assert colours_of(np.array([0.0, 2.0]), (0, 1), centre=0.0) == (-2.0, 2.0, "RdBu_r")
 
 
+@pytest.mark.slow
 def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(

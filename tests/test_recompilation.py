@@ -65,6 +65,7 @@ def test_spacing_origin_values_and_progress_compile_nothing_anew(rng, name, grad
     assert not seen
 
 
+@pytest.mark.slow
 def test_what_the_filter_compiles_for_one_mask_serves_another(rng):
     """On two grids: that of the mask, and a coarser one."""
 
@@ -134,6 +135,7 @@ def test_all_slices_are_one_compilation(rng):
     assert len(seen) == len(set(seen)), sorted(seen)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")  # of so few pairs
 def test_plain_derivatives_use_the_solver_as_it_was_compiled(rng):
     grid, solver = hj.Grid((9, 11)), hj.BlockLanczos(block=2)

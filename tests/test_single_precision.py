@@ -30,6 +30,7 @@ def residuals_with(tolerance, boundary="neumann", signature="hks"):
     return lambda values: problem.residuals(values)[0], unknowns.start(), problem
 
 
+@pytest.mark.slow
 def test_they_are_those_in_double_precision_as_far_as_single_goes(rng):
     (residuals, values, _), (exact, *_) = residuals_with(1e-5), residuals_with(1e-10)
     direction = jnp.asarray(np.stack([np.sin(3 * X), np.cos(2 * Y), X * Y], axis=-1).reshape(values.shape))
@@ -44,6 +45,7 @@ def test_they_are_those_in_double_precision_as_far_as_single_goes(rng):
     assert abs(jnp.vdot(gradient, direction) - jnp.vdot(weights, change)) < 1e-5 * jnp.linalg.norm(weights)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tolerance", "boundary", "signature", "single"),
     [

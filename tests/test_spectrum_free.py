@@ -71,6 +71,7 @@ def test_colouring_keeps_its_bound(shape, boundary, mass, times):
     assert max(settings.error) <= 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mass", "sigma", "seed"),
     [
@@ -142,8 +143,10 @@ def test_few_vectors_serve_a_large_grid_and_the_bound_is_not_absurd():
         pytest.param((9, 8), ("periodic", "periodic"), "consistent", marks=pytest.mark.slow),
         ((8, 9), ("periodic", "periodic"), "lumped"),
         ((8, 11), ("periodic", ("dirichlet", "neumann")), "consistent"),
-        ((8, 7), "mirror", "lumped"),
-        ((6, 5, 7), ("neumann", "periodic", ("dirichlet", "neumann")), "consistent"),
+        pytest.param((8, 7), "mirror", "lumped", marks=pytest.mark.slow),
+        pytest.param(
+            (6, 5, 7), ("neumann", "periodic", ("dirichlet", "neumann")), "consistent", marks=pytest.mark.slow
+        ),
     ],
     ids=str,
 )
@@ -167,6 +170,7 @@ def derivatives_by_all_pairs(mass):
     return field, times, probe, *jax.grad(loss, (0, 1))(field.tensors, times)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 @pytest.mark.parametrize(
     ("method", "mass"),

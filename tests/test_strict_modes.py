@@ -31,6 +31,7 @@ assert hj.eigsh(K[:60, :60], interval=(0.5, 0.7)).k == 2
 """
 
 
+@pytest.mark.slow
 def test_debug_nans_and_rank_promotion_find_nothing_in_masked_fields_and_matrices():
     modes = {
         "JAX_DEBUG_NANS": "1",

@@ -219,6 +219,7 @@ def contents(folder):
 LAMBDA1 = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume")
 
 
+@pytest.mark.slow
 def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study, monkeypatch, capsys):
     monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
     assert main(command(study, "whole", *LAMBDA1, "-q")) == 0
@@ -462,6 +463,7 @@ def test_on_a_terminal_the_bar_stays_in_its_line():
     assert "\r[....................] 0 of 2: sub-01: eigenpairs, 3 of 8 pairs\x1b[K" in text
 
 
+@pytest.mark.slow
 def test_processes_share_a_study(study, capsys):
     """Two at once: each subject is computed by one of them, and both end with the whole study, as one alone does."""
     given = command(study, "shared", *LAMBDA1)
@@ -510,6 +512,7 @@ def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypat
     assert "sub-02" not in printed
 
 
+@pytest.mark.slow
 def test_a_claim_is_free_again_when_its_process_dies(tmp_path):
     file = tmp_path / "deep" / "claim"
     code = f"from hks_jax.atomic import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"

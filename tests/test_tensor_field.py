@@ -126,6 +126,7 @@ def test_integer_tensors_become_floating(rng):
     assert hj.TensorField(hj.Grid((2, 2)), np.broadcast_to(np.eye(2, dtype=int), (2, 2, 2, 2))).tensors.dtype == float
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_traced_tensors_that_are_not_positive_definite_give_nan(d):
     """Among them −I, whose determinant is positive in the plane, and whose adjugate is I in space."""

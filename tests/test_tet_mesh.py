@@ -66,6 +66,7 @@ def squares(lengths, first):
     return np.sort((terms[0][:, None, None] + terms[1][:, None] + terms[2]).ravel())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("boundary", "first"), [("neumann", 0), ("dirichlet", 1)])
 def test_box_converges_at_second_order(boundary, first):
     lengths, errors = (1.0, 1.2, 0.8), []
@@ -89,6 +90,7 @@ def bessel_squares(derivative):
     return np.sort(found)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:k = ")
 @pytest.mark.parametrize("boundary", ["neumann", "dirichlet"])
 def test_ball_converges_at_second_order(boundary):
@@ -161,6 +163,7 @@ def test_isometries(rng, small):
     assert np.abs(mapped / plain - 1).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("at", "way", "k"),
     [
@@ -189,6 +192,7 @@ def test_gradients_with_respect_to_tensors_and_vertices(rng, small, at, way, k):
         assert got == pytest.approx(float(expected), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_everything_that_takes_pairs_takes_these(small):
     mesh = hj.TetMesh(*small)
     pairs = hj.eigenpairs(mesh, 20)
@@ -201,6 +205,7 @@ def test_everything_that_takes_pairs_takes_these(small):
     assert int(hj.count_eigenvalues(mesh, (float(pairs.eigenvalues[-1]) + following) / 2)) == 20
 
 
+@pytest.mark.slow
 def test_the_estimated_bias_is_that_of_a_box():
     """The median over the nodes, against the product of three theta functions, within the factor that it is safe by."""
     n, t = 9, 0.12

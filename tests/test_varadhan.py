@@ -78,6 +78,7 @@ def test_curved_distances_converge_with_the_known_first_order():
     np.testing.assert_allclose(errors[0] / errors[1], 2, rtol=0.12)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 def test_on_a_mesh():
     n = 21

@@ -64,6 +64,7 @@ def test_a_constant_anisotropic_metric_on_the_three_torus():
 IDENTITY = np.broadcast_to(np.eye(3), (7, 7, 7, 3, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["shift-invert", pytest.param("dense", marks=pytest.mark.slow)])
 def test_multiplets_of_the_cube_are_complete(solver):
     """Neumann on a cube: n = (0,0,0), (1,0,0)×3, (1,1,0)×3, (1,1,1), (2,0,0)×3, (2,1,0)×6, …"""
@@ -80,6 +81,7 @@ def test_multiplets_of_the_cube_are_complete(solver):
         hj.eigenpairs(hj.TensorField(unit_cube(7), IDENTITY), 15, solver=solver)
 
 
+@pytest.mark.slow
 def test_an_isometry_moves_the_signature():
     """The box in other coordinates x = f(y), f a diffeomorphism of the box that keeps its sides."""
 
@@ -143,6 +145,7 @@ MASK[:3, :3, 4:] = MASK[3:, :, :2] = False
 GRID = hj.Grid(SHAPE, 0.25, mask=MASK)
 
 
+@pytest.mark.slow
 def test_outside_a_mask_there_is_nothing(rng):
     tensors = random_spd(rng, SHAPE)
     pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 40)

@@ -94,6 +94,7 @@ def test_weyl_in_three_dimensions():
 # --- the boundary's influence -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_at_straight_sides_it_is_exp_of_minus_squared_distance_over_t():
     """A strip, periodic in the other direction, which cancels; one of its sides is a mask's rim."""
     grid = hj.Grid.from_bounds(0.0, (1.1, 0.2), (34, 5), mask=np.arange(34)[:, None] < 31 + np.zeros(5))
@@ -118,6 +119,7 @@ def test_all_of_a_masks_rim_is_pinned_and_nothing_else():
     np.testing.assert_array_equal(hj.assemble(field, "dirichlet-rim").space.free, free)
 
 
+@pytest.mark.slow
 def test_influence_is_differentiable(rng):
     mask = np.ones((6, 5), bool)
     mask[:2, :2] = False
