@@ -1,7 +1,6 @@
 """Compiling for CPUs in half the time, or not at all."""
 
 import os
-from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial, wraps
 from typing import Any, ParamSpec, TypeVar
@@ -41,8 +40,8 @@ def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[
     return decorate
 
 
-_FEW, _FEW_AT_FIRST = 1 << 18, 1 << 20
-"""Numbers that NumPy computes with in less time than it takes to compile a program for them."""
+_FEW = 1 << 19
+"""Numbers that NumPy computes with in less time than it takes to compile a program for them, even for many calls."""
 
 
 def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
@@ -57,7 +56,7 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
         @wraps(function)
         def call(*args: Any) -> T:
-            return by_numpy(partial(function, np), *args) if known_and_few(_FEW, args) else compiled(*args)
+            return by_numpy(partial(function, np), *args) if known_and_few(args) else compiled(*args)
 
         return call
 
@@ -71,25 +70,14 @@ def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
         return jax.tree.map(jnp.asarray, function(*known))
 
 
-def known_and_few(most: int, args: Any) -> bool:
-    """Return whether values are concrete, no more than that, and on a CPU of this process alone."""
+def known_and_few(args: Any) -> bool:
+    """Return whether values are concrete, few, and on a CPU of this process alone: then NumPy may compute.
+
+    It depends on shapes alone, so that a computation has the same rounding each time.
+    """
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(args))
     here = jax.default_backend() == "cpu" and jax.process_count() == 1
-    return size <= most and here and not is_traced((args, jnp.zeros(())))
-
-
-_TRIES = 8
-"""Calls in which NumPy loses less time than it takes to compile a program of XLA's."""
-_calls: Counter[Any] = Counter()
-
-
-def at_first(name: str, args: Any) -> bool:
-    """Return whether NumPy should compute: few concrete values on a CPU, in the first calls with such shapes."""
-    if not known_and_few(_FEW_AT_FIRST, args):
-        return False
-    key = name, tuple((np.shape(leaf), str(jnp.result_type(leaf))) for leaf in jax.tree.leaves(args))
-    _calls[key] += 1
-    return _calls[key] <= _TRIES
+    return size <= _FEW and here and not is_traced((args, jnp.zeros(())))
 
 
 @cache

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.compilation import at_first, by_numpy, jit_quickly, numpy_where_known
+from hks_jax.compilation import by_numpy, jit_quickly, known_and_few, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
 from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
 from hks_jax.eigen.interior import first_from_origin
@@ -127,7 +127,7 @@ def _cut(
     values: Float[Array, " p"], vectors: Float[Array, "p n_dof"], k: int
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]:
     """Return the first k pairs, and the eigenvalue after them."""
-    if at_first("cut", (values, vectors)):
+    if known_and_few((values, vectors)):
         return by_numpy(partial(_first, k=k), values, vectors)
     return _first_by_jax(values, vectors, k)
 
@@ -261,7 +261,7 @@ def _exact_null_modes(
 
     Their eigenvalue is 0 and not the ±1e-13 of a solver; what rounding left of them in the other vectors is taken out.
     """
-    if not at_first("null modes", (pencil.mass, values, vectors)):
+    if not known_and_few((pencil.mass, values, vectors)):
         return _exact_by_jax(pencil, values, vectors)
     assert pencil.null_space is not None
     mass = pencil.mass.to_scipy()

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.checks import require_count
-from hks_jax.compilation import at_first, by_numpy, jit_quickly
+from hks_jax.compilation import by_numpy, jit_quickly, known_and_few
 from hks_jax.eigen.count import certain_count, count_below
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
@@ -200,7 +200,7 @@ def _quality(
     k = values.size
     if k == 0:
         return jnp.zeros(0, values.dtype), *[jnp.zeros(0, bool)] * 2, jnp.asarray(1e-6, values.dtype)
-    if not at_first("quality", (pencil, values, vectors)):
+    if not known_and_few((pencil.stiffness, values, vectors)):
         return _judged_by_jax(pencil, values, vectors, origin, tolerance, known)
 
     def by_scipy(values: np.ndarray, vectors: np.ndarray, origin: np.ndarray) -> tuple[Any, ...]:

@@ -53,9 +53,10 @@ def measured_on_host(
     pencil: SymmetricPencil, vectors: Float[np.ndarray, "m n_dof"], values: Float[np.ndarray, " m"]
 ) -> tuple[np.ndarray, np.ndarray, Any]:
     """Return ‖Kφ − λMφ‖ / ‖Mφ‖, whether a vector is in large part among those before it, and `largest`, by SciPy."""
-    stiffness, mass = pencil.stiffness.to_scipy(), pencil.mass.to_scipy()
-    image = mass @ vectors.T
-    residuals = np.linalg.norm(stiffness @ vectors.T - image * values, axis=0) / np.linalg.norm(image, axis=0)
+    stiffness, mass = (matrix.to_scipy().tocsr() for matrix in (pencil.stiffness, pencil.mass))
+    columns = np.ascontiguousarray(vectors.T)
+    image = mass @ columns
+    residuals = np.linalg.norm(stiffness @ columns - image * values, axis=0) / np.linalg.norm(image, axis=0)
     twice = np.zeros(len(values), bool)
     if vectors.dtype == np.float32:
         twice = np.any(np.abs(np.tril(vectors @ image, -1)) > _ALIKE, axis=1)
