@@ -605,6 +605,43 @@ def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit
     assert main(command(study, "kept", "--replace", "--interpolation", "log-euclidean", *other)) == 1
 
 
+def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(study, monkeypatch, capsys, rng):
+    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    lines = (study / "subjects.tsv").read_text().splitlines()
+    noises = ("noise", "second.nii.gz", "0.02", "")
+    (study / "subjects.tsv").write_text("".join(f"{a}\t{b}\n" for a, b in zip(lines, noises, strict=True)))
+
+    def scan_again():
+        other = tensors() * (1 + 0.04 * rng.standard_normal((*SHAPE, 1, 1)))
+        save_tensors(study / "second.nii.gz", TensorVolume(other, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE))
+
+    scan_again()
+    words = command(study, "out", "--times", "3e3", "6e3", "--noise", "0.01", "--draws", "4", "--save-pairs")
+    assert main(words) == 0
+    rows = table(study / "out" / "group_regions.tsv")
+    stem = study / "out" / "sub-01" / "dwi" / "sub-01_model-tensor_param-hks"
+    with np.load(f"{stem}_dwimap.npz") as saved:
+        maps = saved["noise_maps"][:, :, :4]  # the left half, 17, after 4 in the table
+    errors = np.sqrt(np.mean(maps.mean(axis=(2, 3)) ** 2, axis=0))
+    np.testing.assert_allclose([float(row["error"]) for row in rows[2:4]], errors, rtol=1e-5)
+    second, third = (float(rows[i]["error"]) / float(rows[i]["mean"]) for i in (4, 8))
+    assert 1.5 < second / third < 2.5  # the same draws, of twice the size
+    noise = json.loads(Path(f"{stem}_dwimap.json").read_text())["Noise"]
+    assert (noise["source"], noise["draws"], len(noise["signal_to_noise"])) == ("second.nii.gz", 4, 2)
+    before = contents(study / "out")
+    assert main([*words, "--draws", "6"]) == 2
+    assert "differs in --draws: 4, now 6" in capsys.readouterr().err
+    scan_again()  # nothing is solved again but the noisy maps, of the one subject
+    monkeypatch.setattr("hks_jax.cli.study_tasks.compute_pairs", None)
+    assert main(words) == 0
+    assert "2 of 3 subjects are done already" in capsys.readouterr().err
+    changed = {name for name, content in contents(study / "out").items() if before[name] != content}
+    assert {name.split("/")[0] for name in changed} == {"sub-01", "group_regions.tsv"}
+    for more, text in ((["--noise", "second.nii.gz"], "a column noise"), (["--method", "auto"], "no error bars")):
+        assert main([*words, *more]) == 2
+        assert text in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("boundary", ["neumann", pytest.param("mean", marks=pytest.mark.slow)])
 def test_saved_pairs_give_the_signature_of_other_times_without_another_computation(
     tmp_path, monkeypatch, capsys, boundary

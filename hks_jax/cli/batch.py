@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hks_jax.cli.arguments import MEAN, Times, parse_times, recorded_boundary
-from hks_jax.cli.hks import add_signature_arguments, settings_of
+from hks_jax.cli.hks import add_noise_arguments, add_signature_arguments, settings_of
 from hks_jax.cli.inputs import (
     add_eigenpair_arguments,
     add_json_argument,
@@ -19,6 +19,8 @@ from hks_jax.cli.inputs import (
     add_view_argument,
     read_volume,
     require_metric,
+    require_spectral,
+    second_scan,
 )
 from hks_jax.cli.stats import add_atlas_arguments
 from hks_jax.cli.study_progress import StudyProgress
@@ -40,7 +42,7 @@ Compute the signatures of many subjects, at the same times for all, and tables o
   {", ".join(FILES)}
                    more files of the subject, optional; paths begin where the table is
   {", ".join(OPTIONS)}
-                   options that differ between subjects, optional
+                   options that differ between subjects, optional; a noise that is a file begins where the table is
 
 and any others, such as age and group, which are kept in participants.tsv. What an option says holds for all subjects
 whose row does not say otherwise.
@@ -78,6 +80,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add_tensor_options(parser)
     add_eigenpair_arguments(parser, "that of the study in DIR, else mean, for all subjects alike")
     add_signature_arguments(parser)
+    add_noise_arguments(parser)
     add_view_argument(parser)
     add(
         "--time-unit",
@@ -112,6 +115,11 @@ def run(args: argparse.Namespace) -> None:
     from hks_jax.cli.outputs import check_folder
     from hks_jax.cli.study_tasks import run_all
 
+    if second_scan(args) is not None:
+        raise ValueError(
+            f"--noise: {args.noise} is a scan of one subject; expected a number, residuals or roughness. Second scans "
+            "belong into a column noise of the table"
+        )
     times, settle = parse_times(args.times), args.boundary is None
     if settle:
         args.boundary = _settled_boundary(args)
@@ -120,6 +128,7 @@ def run(args: argparse.Namespace) -> None:
     for subject in chosen:
         if subject.arguments is not None:
             require_metric(subject.arguments)
+            require_spectral(subject.arguments)
     with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
     if args.names is not None and not with_regions:
         raise ValueError("--names: it names labels; pass --atlas too, or a column atlas in the table")

@@ -18,6 +18,7 @@ from hks_jax.cli.inputs import (
     add_view_argument,
     read_volume,
     require_metric,
+    require_spectral,
 )
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
@@ -124,8 +125,9 @@ def add_noise_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="of the tensors, for error bars: a number, relative to the mean diffusivity, such as 0.1; residuals, what "
         "the fit to diffusion-weighted images leaves; a second FILE of tensors, from another scan of the subject; or "
-        "roughness, what neighbours differ by. Adds deviation and bias to hks.npz, signal to noise at each t to the "
-        "report, and fades in the picture what noise could make; automatic times begin where signal is",
+        "roughness, what neighbours differ by. Adds deviation and bias to the .npz, signal to noise at each t to the "
+        "report, the column error to tables of regions, and fades in the picture what noise could make; automatic "
+        "times of one subject begin where signal is",
     )
     add("--draws", type=int, default=16, metavar="N", help="noisy maps that error bars are made of (default 16)")
 
@@ -160,6 +162,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--noise: it is for tensors on a grid; leave it out for meshes and for eigenpairs")
     if args.tensors and not on_mesh:
         raise ValueError("--tensors: it is for a mesh that lies in a volume; leave it out for the volume itself")
+    require_spectral(args)
     if not (on_mesh or saved):
         require_metric(args)
     from hks_jax.cli import mesh as meshes

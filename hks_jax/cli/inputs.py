@@ -116,6 +116,23 @@ def require_metric(args: argparse.Namespace) -> None:
         )
 
 
+def require_spectral(args: argparse.Namespace) -> None:
+    """Raise ValueError where error bars are asked for of a method that has none."""
+    if args.noise is not None and args.method != "spectral":
+        raise ValueError(f"--noise: with --method {args.method} there are no error bars; leave one of them out")
+
+
+def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
+    """Return the arguments that read the second scan that ``--noise`` names; None where it names a number or a word."""
+    if args.noise in (None, "residuals", "roughness"):
+        return None
+    try:
+        float(args.noise)
+    except ValueError:
+        return argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
+    return None
+
+
 def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
     """Read the file, cut the slice, settle the mask, and refuse tensors that make no metric.
 

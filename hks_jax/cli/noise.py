@@ -3,7 +3,6 @@
 import argparse
 import warnings
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,7 +12,7 @@ from jaxtyping import Float
 
 from hks_jax.accuracy import AccuracyWarning
 from hks_jax.cli.arguments import Times
-from hks_jax.cli.inputs import read_volume
+from hks_jax.cli.inputs import read_volume, second_scan
 from hks_jax.cli.job import Bars, Result, Settings, automatic_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
@@ -45,20 +44,16 @@ def noise_of(args: argparse.Namespace, volume: TensorVolume, grid: Grid, progres
         return TensorNoise(volume.covariance, grid)
     if args.noise == "roughness":
         return TensorNoise.from_roughness(volume.tensors, grid)
-    try:
-        level = float(args.noise)
-    except ValueError:
-        again = argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
-        return TensorNoise.from_scans(volume.tensors, read_volume(again, progress).tensors, grid)
-    return TensorNoise.relative(volume.tensors, level, grid)
+    second = second_scan(args)
+    if second is not None:
+        return TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, grid)
+    return TensorNoise.relative(volume.tensors, float(args.noise), grid)
 
 
 def error_bars(
     volume: TensorVolume, noise: TensorNoise, pairs: Eigenpairs, settings: Settings, draws: int, progress: Progress
 ) -> tuple[Bars, Settings]:
     """Compute error bars; return them, and the settings with the times, which begin where there is signal."""
-    if settings.method != "spectral":
-        raise ValueError(f"--noise: with --method {settings.method} there are no error bars; leave one of them out")
     wanted = settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
     grid = noise.grid

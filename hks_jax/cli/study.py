@@ -14,10 +14,11 @@ from typing import Any
 from hks_jax import __version__
 from hks_jax.atomic import atomic_folder, atomic_path
 from hks_jax.cli.arguments import Times
+from hks_jax.cli.inputs import second_scan
 from hks_jax.cli.job import Result, Settings
 from hks_jax.cli.outputs import plain, save_result
 from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.subjects import OPTIONS, Subject
+from hks_jax.cli.subjects import NOISE, OPTIONS, Subject
 from hks_jax.io.components import is_one_of_six, siblings
 from hks_jax.io.labels import names_beside
 from hks_jax.io.nifti import is_nifti, sidecar_of
@@ -73,13 +74,14 @@ class Study:
         return _digest({"settings": asdict(self.settings), "unit": self.time_unit, "reading": reading, "files": files})
 
     def pairs_fingerprint(self, subject: Subject) -> str:
-        """Return a digest of all that a subject's eigenpairs depend on: neither times nor normalisation.
+        """Return a digest of all that a subject's eigenpairs depend on: neither times, normalisation nor noise.
 
         Raises:
             FileNotFoundError: a file is missing.
         """
         alike = replace(self.settings, times=Times((), 0), normalisation="raw", method="spectral")
-        return replace(self, settings=alike, time_unit="").fingerprint(subject)
+        args = argparse.Namespace(**{**vars(_arguments(subject)), "noise": None})
+        return replace(self, settings=alike, time_unit="").fingerprint(replace(subject, arguments=args))
 
     def regions_fingerprint(self, subject: Subject, fingerprint: str) -> str:
         """Return a digest of all that the table of a subject's regions depends on.
@@ -141,6 +143,7 @@ class Study:
                     "Eigenpairs": report["eigenpairs"],
                     "Truncation": report["times"],
                     **({"Method": report["method"]} if "method" in report else {}),
+                    **({"Noise": report["noise"]} if "noise" in report else {}),
                     "Warnings": warnings,
                     "GeneratedBy": GENERATED_BY,
                     "Fingerprint": fingerprint,
@@ -247,8 +250,14 @@ SUMMARY = {
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of reading by name."""
-    return {option: getattr(args, option.replace("-", "_")) for option in OPTIONS}
+    """Return by name the options of reading and, where error bars are asked for, of noise.
+
+    A second scan is one of the files, and said to be one alone: its path may change.
+    """
+    reading = {option: getattr(args, option.replace("-", "_")) for option in OPTIONS}
+    if args.noise is None:
+        return {option: value for option, value in reading.items() if option not in NOISE}
+    return {**reading, "noise": args.noise if second_scan(args) is None else "file"}
 
 
 def times_text(unit: str) -> str:
@@ -275,7 +284,9 @@ def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
         images = siblings(args.file)
     sidecars = [sidecar_of(path) for path in images[:1] if args.bval is None and is_nifti(path)]
     given = {"file": images, "sidecar": sidecars, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
-    return {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
+    inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
+    second = second_scan(args)
+    return inputs if second is None else {**inputs, "noise": [*_inputs(second)["file"], *_inputs(second)["sidecar"]]}
 
 
 def _arguments(subject: Subject) -> argparse.Namespace:

@@ -1,5 +1,7 @@
 """The computations of a study: what is to be done of each subject, and doing it."""
 
+import io
+import os
 import sys
 import time
 import traceback
@@ -15,6 +17,7 @@ from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.arguments import Times
 from hks_jax.cli.inputs import read_volume
 from hks_jax.cli.job import ComputationError, compute_pairs, signature_of
+from hks_jax.cli.noise import error_bars, noise_of, with_error_bars
 from hks_jax.cli.picture import draw, draw_volume
 from hks_jax.cli.progress import duration
 from hks_jax.cli.reading import image_suffix
@@ -139,9 +142,18 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
         scaled = settings.times.explicit
         own = np.array(scaled) / float(positive_range(pairs)[0])
         settings = replace(settings, times=Times(tuple(own.tolist()), 0))
+    args = subject.arguments
+    assert args is not None
+    bars = None
+    if args.noise is not None:
+        if args.noise == "residuals" and volume.covariance is None:  # pairs that were kept do not have it
+            volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
+        noise = noise_of(args, volume, field.grid, progress)
+        bars, settings = error_bars(volume, noise, pairs, settings, args.draws, progress)
     result = signature_of(volume, field, pairs, settings, progress)
-    assert subject.arguments is not None
-    drawn = partial(draw if volume.dimension == 2 else draw_volume, result, view=subject.arguments.view)
+    if bars is not None:
+        result = with_error_bars(result, bars, os.path.basename(args.noise))
+    drawn = partial(draw if volume.dimension == 2 else draw_volume, result, view=args.view)
     with progress.stage("writing"):
         study.write_signature(subject, fingerprint, result, progress.warnings, drawn, scaled)
 

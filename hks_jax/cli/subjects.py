@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
+from hks_jax.cli.hks import add_noise_arguments
+from hks_jax.cli.inputs import second_scan
 from hks_jax.cli.reading import add_file_argument, add_options, defaults
 from hks_jax.cli.stats import add_atlas_arguments
 from hks_jax.io.tables import read_table
@@ -15,8 +17,9 @@ from hks_jax.io.tables import read_table
 FILES = ("mask", "bval", "bvec", "atlas", "names")
 """Columns that are paths, beside `file`; relative ones begin where the table is."""
 
-OPTIONS = tuple(name.replace("_", "-") for name in defaults() if name not in FILES)
-"""Columns that stand for the option of the same name: those of reading tensors."""
+NOISE = ("noise", "draws")
+OPTIONS = (*(name.replace("_", "-") for name in defaults() if name not in FILES), *NOISE)
+"""Columns that stand for the option of the same name: those of reading tensors, and of their noise."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,7 @@ def _row_parser() -> argparse.ArgumentParser:
     parser = _RowParser(add_help=False)
     add_file_argument(parser)
     add_options(parser)
+    add_noise_arguments(parser)
     add_atlas_arguments(parser, required=False)
     return parser
 
@@ -115,6 +119,8 @@ def _subject(
         if not words or words[0].startswith("--"):
             raise ValueError("the row has no file")
         arguments = parser.parse_args(words, copy.copy(common))
+        if second_scan(arguments) is not None:
+            arguments.noise = str(folder / arguments.noise)
     except ValueError as error:
         return Subject(participant, session, None, str(error), covariates)
     return Subject(participant, session, arguments, "", covariates)
