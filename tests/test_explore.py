@@ -227,6 +227,15 @@ def at(node, shape=SHAPE):
     return (node[0] - low[0] + 0.5) / size[0], 1 - (node[1] - low[1] + 0.5) / size[1]
 
 
+def pixel_of(browser, node):
+    """Return red, green and blue of a node in the image of the signature."""
+    across, down = at(node)
+    return browser.run(
+        f"(() => {{ const c = document.querySelector('#signature'); return [...c.getContext('2d').getImageData("
+        f"{across} * c.width, {down} * c.height, 1, 1).data].slice(0, 3); }})()"
+    )
+
+
 def saved_columns(browser):
     """Save the curves, and return them by name."""
     for old in browser.folder.glob("hks-curves*"):
@@ -270,14 +279,38 @@ def test_colours_are_those_of_the_values(plane):
     inside = np.isfinite(flat[0])
     half = min(np.quantile(np.abs(flat[4][inside] - 1), 0.9, method="nearest"), 1)
     node = (6, 4)
-    across, down = at(node)
-    pixel = plane.run(
-        f"(() => {{ const c = document.querySelector('#signature'); return [...c.getContext('2d').getImageData("
-        f"{across} * c.width, {down} * c.height, 1, 1).data]; }})()"
-    )
+    pixel = pixel_of(plane, node)
     colour = np.array(matplotlib.colormaps["RdBu_r"]((flat[4][node] - 1 + half) / (2 * half))) * 255
-    np.testing.assert_allclose(pixel, colour, atol=5)
+    np.testing.assert_allclose(pixel, colour[:3], atol=5)
     assert plane.text("#signature-bar").endswith(f"{1 + half:.2f}".rstrip("0"))
+
+
+@needs_browser
+def test_what_noise_could_make_fades_and_points_have_bands(browser, tmp_path):
+    browser.problems.clear()
+    flat = signature() * (4 * np.pi * TIMES[:, None, None])
+    node, other = (6, 4), (15, 6)
+    noise = np.full_like(flat, 1e-9)
+    noise[:, *node] = np.abs(flat[:, *node] - 1)  # one standard deviation from flat space
+    scale = 4 * np.pi * TIMES[:, None, None]
+    path = explore(signature(), TIMES, hj.Grid(SHAPE), tmp_path / "noise.html", deviation=noise / scale)
+    browser.open(path)
+    browser.choose("#time", "4")
+
+    half_faded, untouched = np.array(pixel_of(browser, node)), pixel_of(browser, other)
+    browser.choose("#fade", "0")
+    np.testing.assert_allclose(half_faded, (np.array(pixel_of(browser, node)) + 204) / 2, atol=1)
+    assert pixel_of(browser, other) == untouched
+    browser.choose("#fade", "1")
+    assert pixel_of(browser, node) != half_faded.tolist()
+    browser.click("#signature", *at(node))
+    assert f"± {noise[4][node]:.3f}"[:6] in browser.text("#points")
+    columns = saved_columns(browser)
+    np.testing.assert_allclose(columns["4πt·HKS A standard deviation by noise"], noise[:, *node], rtol=1e-6)
+    assert browser.run("document.querySelectorAll('#chart polygon').length") == 1
+    assert all("willReadFrequently" in problem for problem in browser.problems)
+    with unchecked(), pytest.raises(ValueError, match=r"deviation: got shape \(2,\)"):
+        explore(signature(), TIMES, hj.Grid(SHAPE), path, deviation=np.ones(2))
 
 
 @needs_browser

@@ -89,6 +89,7 @@ def run(args: argparse.Namespace) -> None:
                 times,
                 domain,
                 page,
+                deviation=more.get("deviation"),
                 tensors=more.get("input_tensors"),
                 labels=labels,
                 label_names=names,

@@ -55,6 +55,7 @@ function setUp() {
   for (const id of ["time", "from", "to"]) element(id).disabled = farthest === 0;
   for (const row of document.querySelectorAll(".volume")) row.hidden = dimension === 2;
   for (const row of document.querySelectorAll(".surface")) row.hidden = !surface;
+  for (const row of document.querySelectorAll(".noise")) row.hidden = !deviations;
   options(element("plane"), AXES.map((name, a) => `across ${name} (${AXES.filter((_, b) => b !== a).join(", ")})`));
   options(element("quantity"), quantities.map((q) => q.name));
   options(element("layer-name"), layers.map((layer) => layer.name));
@@ -76,6 +77,7 @@ function setUp() {
   onInput("quantity", (input) => (state.quantity = quantities[input.value]));
   onInput("contrast", () => {});
   onInput("same", () => {});
+  onInput("fade", () => {});
   onInput("layer-name", (input) => (state.layer = Number(input.value)));
   onInput("from", (input) => setSpan(Number(input.value), Math.max(Number(input.value), state.to)));
   onInput("to", (input) => setSpan(Math.min(Number(input.value), state.from), Number(input.value)));

@@ -18,6 +18,7 @@ const dimension = about.dimension;
 const times = about.times;
 const inside = bytes("inside");
 const values = floats("values"); // time by time, for the nodes inside in the order of the grid
+const deviations = about.noise ? floats("deviation") : null; // that noise gives them
 const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
 const labels = about.labels.length ? new Int32Array(bytes("labels").buffer) : null;
 
@@ -71,7 +72,7 @@ const quantities = isFlat
       relative,
     ];
 
-const curve = (node, quantity) => times.map((_, t) => values[t * count + node] * quantity.factor[t]);
+const curve = (node, quantity, of = values) => times.map((_, t) => of[t * count + node] * quantity.factor[t]);
 
 // Weights of the trapezoidal rule over log t from one time to another; they sum to 1.
 function weights(from, to) {

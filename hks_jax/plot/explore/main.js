@@ -51,7 +51,26 @@ const byScale = (scale, numberAt) => (node, rgb) => {
   [rgb[0], rgb[1], rgb[2]] = [scale.table[e], scale.table[e + 1], scale.table[e + 2]];
 };
 
+// What noise could make of flat space, or of the mean, fades into grey; the more, the fewer deviations it is off.
+function faded(colour) {
+  const { time, quantity } = state;
+  const middle = quantity === relative ? mean[time] : isFlat ? 1 : quantiles(count, (n) => values[time * count + n], [0.5])[0];
+  const limit = Number(element("fade").value);
+  return (node, rgb) => {
+    colour(node, rgb);
+    const n = time * count + node;
+    const grey = 1 - Math.abs(values[n] - middle) / deviations[n] / limit;
+    if (grey > 0) for (let c = 0; c < 3; c++) rgb[c] += grey * (204 - rgb[c]);
+  };
+}
+
 const signatureAt = (node) => values[state.time * count + node] * state.quantity.factor[state.time];
+
+function signatureText(node) {
+  const text = number(signatureAt(node));
+  const [noise] = deviations ? curve(node, state.quantity, deviations).slice(state.time) : [];
+  return noise >= 0 ? `${text} ± ${number(noise)}` : text;
+}
 
 const NODE = surface ? "vertex" : "node";
 const images = {};
@@ -95,7 +114,7 @@ function layerText(layer, node) {
 
 function showHover(place) {
   const node = place ? nodeAt(place) : -1;
-  const texts = node < 0 ? [] : [`${NODE} ${voxel(place).join(", ")}`, `${state.quantity.name} ${number(signatureAt(node))}`, `distance ${number(apart[node], farApart)}`];
+  const texts = node < 0 ? [] : [`${NODE} ${voxel(place).join(", ")}`, `${state.quantity.name} ${signatureText(node)}`, `distance ${number(apart[node], farApart)}`];
   if (node >= 0 && layers.length) texts.push(`${layers[state.layer].name} ${layerText(layers[state.layer], node)}`);
   element("hover").textContent = texts.join("   ·   ");
 }
@@ -107,7 +126,8 @@ function drawImages() {
   for (const image of Object.values(images)) if (image.canvas.offsetParent) image.lay(plane);
 
   const scale = signatureScale();
-  images.signature.draw(byScale(scale, signatureAt), shared);
+  const coloured = byScale(scale, signatureAt);
+  images.signature.draw(deviations ? faded(coloured) : coloured, shared);
   showBar(element("signature-bar"), scale, quantity.centre);
   element("signature-name").textContent = `${quantity.name} at t = ${timeText(state.time)}`;
 
@@ -141,6 +161,8 @@ function drawLayer(layer, shared) {
   }
 }
 
+const band = (line, spread) => ({ low: line.map((m, t) => m - spread[t]), high: line.map((m, t) => m + spread[t]), spread });
+
 function seriesShown() {
   const { quantity, points, region } = state;
   const all = mean.map((m, t) => m * quantity.factor[t]);
@@ -149,11 +171,14 @@ function seriesShown() {
     if (region.quantity !== quantity) Object.assign(region, { quantity, found: statistics(region.nodes, quantity) });
     const { found } = region;
     const [line, spread] = [found.map((s) => s.mean), found.map((s) => s.deviation)];
-    const band = { low: line.map((m, t) => m - spread[t]), high: line.map((m, t) => m + spread[t]) };
-    shown.push({ name: "region", note: `${region.note}; mean ± standard deviation`, colour: "--region", line, ...band, spread });
+    shown.push({ name: "region", note: `${region.note}; mean ± standard deviation`, colour: "--region", line, ...band(line, spread) });
   }
   for (const [name, place] of Object.entries(points)) {
-    if (place) shown.push({ name, note: `${NODE} ${voxel(place).join(", ")}`, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line: curve(nodeAt(place), quantity) });
+    if (!place) continue;
+    const line = curve(nodeAt(place), quantity);
+    const noise = deviations ? band(line, curve(nodeAt(place), quantity, deviations)) : {};
+    const note = `${NODE} ${voxel(place).join(", ")}${deviations ? "; ± noise" : ""}`;
+    shown.push({ name, note, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line, ...noise });
   }
   return shown;
 }
@@ -161,7 +186,10 @@ function seriesShown() {
 function save() {
   const q = state.quantity.name;
   const columns = seriesShown().flatMap((one) => {
-    if (one.name !== "region") return [[`${q} ${one.name}${one.note ? `: ${one.note}` : ""}`, one.line]];
+    if (one.name !== "region") {
+      const noise = one.spread ? [[`${q} ${one.name} standard deviation by noise`, one.spread]] : [];
+      return [[`${q} ${one.name}${one.note ? `: ${one.note}` : ""}`, one.line], ...noise];
+    }
     const [lower, median, upper] = quartiles(state.region.nodes, state.quantity);
     const size = [`points in region: ${state.region.note}`, times.map(() => state.region.nodes.length)];
     return [
@@ -182,7 +210,7 @@ function showPoints() {
   const rows = [["", ...names], [NODE, ...names.map((name) => voxel(state.points[name]).join(", "))]];
   rows.push([withUnit("position", about.lengthUnit && `in ${about.lengthUnit}`), ...names.map((name) => position(state.points[name]).map((x) => number(x, reach)).join(", "))]);
   const nodes = names.map((name) => nodeAt(state.points[name]));
-  rows.push([`${state.quantity.name} at t`, ...nodes.map((n) => number(signatureAt(n)))]);
+  rows.push([`${state.quantity.name} at t`, ...nodes.map(signatureText)]);
   for (const layer of layers) rows.push([layer.name, ...nodes.map((n) => layerText(layer, n))]);
   element("points").replaceChildren(...rows.map((cells, r) => {
     const row = document.createElement("tr");
@@ -206,6 +234,7 @@ function showPoints() {
 function showControls() {
   const { axis, index } = planeOf();
   element("time-text").textContent = `t = ${timeText(state.time)}${spreadText(state.time)}`;
+  element("fade-text").textContent = `${element("fade").value} σ`;
   element("time").setAttribute("aria-valuetext", element("time-text").textContent);
   element("slice").max = shape[axis] - 1;
   element("slice").value = index;

@@ -36,6 +36,7 @@ def explore(
     grid: Grid | SurfaceMesh,
     path: str | os.PathLike[str],
     *,
+    deviation: Real[ArrayLike, "n_times *shape"] | None = None,
     tensors: Real[ArrayLike, "*shape d d"] | None = None,
     maps: Mapping[str, Any] | None = None,
     labels: Real[ArrayLike, "*shape"] | None = None,
@@ -64,6 +65,8 @@ def explore(
         times: (n_times,), positive and increasing.
         grid: the grid of the values, 2D or 3D, or the surface.
         path: the page; its folder is made.
+        deviation: (n_times, *shape), the standard deviation that noise gives the values (`hks_jax.uncertainty`): the
+            curves of points have a band of it, and what noise could make of flat space, or of the mean, fades.
         tensors: (*shape, d, d), as they were measured, such as diffusivities: their mean eigenvalue, anisotropy and
             principal direction (as red, green and blue for x, y and z) are shown. Not on surfaces.
         maps: more maps (*shape) by name.
@@ -106,11 +109,13 @@ def explore(
         raise ValueError(f"lengths: got shape {spread.shape}; expected {t.shape}, one finite number per time")
     layers = [] if tensors is None else tensor_layers(tensors, inside)
     layers += scalar_layers(maps or {}, inside)
+    noise = None if deviation is None else _checked(deviation, times, shape, "deviation")[1]
     parts = None if labels is None else regions(labels, label_names, inside)
-    _check_size(int(inside.sum()), t.size, layers)
+    _check_size(int(inside.sum()), t.size, layers, noise is not None)
     flat = (4 * math.pi * t) ** (d / 2)
     # (4πt)^(d/2)·HKS is of order 1 in any unit: no float32 is too small for it.
-    shown = array[:, inside] * (flat[:, None] if normalisation == "raw" else 1.0)
+    scale = flat[:, None] if normalisation == "raw" else 1.0
+    shown = {"values": scale * array[:, inside]} | ({} if noise is None else {"deviation": scale * noise[:, inside]})
     low = [int(along.min()) for along in np.nonzero(inside)]
     high = [int(along.max()) + 1 for along in np.nonzero(inside)]
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
@@ -130,6 +135,7 @@ def explore(
         "lengths": None if spread is None else spread.tolist(),
         "flat": flat.tolist(),
         "normalisation": normalisation,
+        "noise": noise is not None,
         "start": [0] if surface else _deep_node(inside[box]),
         "layers": [{"name": layer.name, "kind": layer.kind} for layer in layers],
         "labels": [] if parts is None else [[label, name] for label, name in parts.names.items()],
@@ -141,20 +147,20 @@ def explore(
     return Path(path)
 
 
-def _checked(values: Any, times: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _checked(values: Any, times: Any, shape: tuple[int, ...], name: str = "values") -> tuple[np.ndarray, np.ndarray]:
     t, array = np.atleast_1d(np.asarray(times, dtype=np.float64)), np.asarray(values, dtype=np.float64)
     if t.ndim != 1 or t.size == 0 or not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
         raise ValueError(f"times: got {times}; expected positive numbers that increase, at least one")
     if array.shape != (t.size, *shape):
         raise ValueError(
-            f"values: got shape {array.shape}; expected (n_times, *shape) = {(t.size, *shape)}, as "
+            f"{name}: got shape {array.shape}; expected (n_times, *shape) = {(t.size, *shape)}, as "
             "hks_jax.hks returns them"
         )
     return t, array
 
 
-def _check_size(n_nodes: int, n_times: int, layers: list[Layer]) -> None:
-    size = 4 * (n_nodes * n_times + sum(layer.values.size for layer in layers))
+def _check_size(n_nodes: int, n_times: int, layers: list[Layer], noise: bool) -> None:
+    size = 4 * (n_nodes * n_times * (1 + noise) + sum(layer.values.size for layer in layers))
     if size > LIMIT:
         raise ValueError(
             f"values: {n_times} times at {n_nodes} nodes take {size / 1024**2:.0f} MiB; expected at most "
@@ -195,12 +201,15 @@ def _colour_table(name: str) -> str:
 def _assemble(
     about: dict[str, Any],
     inside: Bool[np.ndarray, "*shape"],
-    shown: Real[np.ndarray, "n_times n_nodes"],
+    shown: dict[str, np.ndarray],
     layers: list[Layer],
     parts: Regions | None,
     surface: dict[str, np.ndarray],
 ) -> str:
-    numbers = {"inside": _base64(inside.astype(np.uint8)), "values": _base64(shown.astype("<f4"))}
+    numbers = {
+        "inside": _base64(inside.astype(np.uint8)),
+        **{name: _base64(array.astype("<f4")) for name, array in shown.items()},
+    }
     numbers |= {f"layer-{i}": _base64(layer.values.astype("<f4")) for i, layer in enumerate(layers)}
     if parts is not None:
         numbers["labels"] = _base64(parts.values.astype("<i4"))
