@@ -77,6 +77,15 @@ def test_limits_are_those_given_and_bars_show_what_lies_beyond():
     assert figure.axes[3].get_xlim() == (50, 300)
 
 
+def test_noise_fades_in_the_slices_that_have_it():
+    z = np.full(GRID.shape, 9.0)
+    z[1, 2, 3] = 1.0  # half of what counts as signal
+    figure = volume_panels(ramp()[None], [1.0], GRID, node=(1, 2, 3), z=z[None])
+    for ax, (i, j) in zip(figure.axes[:3], ((1, 2), (1, 3), (2, 3)), strict=True):
+        opacity = np.asarray(ax.images[1].get_array())[..., 3]
+        assert (opacity[j, i], opacity.sum()) == (0.5, 0.5)
+
+
 def test_errors():
     with unchecked(), pytest.raises(ValueError, match=r"grid: got shape .* three dimensions"):
         volume_panels(np.zeros((1, 3, 3)), [1.0], Grid((3, 3)))

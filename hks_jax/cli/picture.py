@@ -95,7 +95,7 @@ def draw(
 def draw_volume(
     result: Result, path: Path, through: tuple[int, int, int] | None = None, view: View = "neurological"
 ) -> None:
-    """Draw the signature of a volume: for each time, with its own colours, three orthogonal slices.
+    """Draw the signature of a volume: for each time, with its own colours, three orthogonal slices; noise fades.
 
     Args:
         result: what to draw.
@@ -109,6 +109,7 @@ def draw_volume(
     grid, box = cropped(volume, inside)
     deep, span = _coloured(result, inside)
     colours = [colours_of(values[deep], span, LEAST_RANGE, _centre(result)) for values in result.values]
+    z = z_of(result)
     volume_panels(
         result.values[:, *box],
         result.times,
@@ -119,6 +120,7 @@ def draw_volume(
         length_unit="mm" if volume.affine is not None else "",
         label=LABELS[result.report["settings"]["normalisation"]],
         orientation=placed(volume, box, view),
+        z=None if z is None else z[:, *box],
         path=path,
     )
 

@@ -91,6 +91,7 @@ def _slices(
     orientation: Orientation | None,
     *,
     cross: bool = True,
+    z: np.ma.MaskedArray | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the slices of values that are turned already, and return the last image."""
@@ -98,7 +99,8 @@ def _slices(
         first, second = keep = [a for a in range(3) if a != normal]
         shape, spacing, origin = (np.take(of, keep).tolist() for of in (grid.shape, grid.spacing, grid.origin))
         slab = np.take(array, chosen[normal], axis=normal)
-        image = scalar_image(ax, slab, Grid(shape, spacing, origin), colorbar=False, **kwargs)
+        faded = None if z is None else np.take(z, chosen[normal], axis=normal)
+        image = scalar_image(ax, slab, Grid(shape, spacing, origin), colorbar=False, z=faded, **kwargs)
         if orientation is not None:
             orientation.letter(ax, (first, second))
         if cross:
@@ -124,6 +126,7 @@ def volume_panels(
     label: str = "",
     suptitle: str = "",
     orientation: Orientation | None = None,
+    z: Real[ArrayLike, "n_times nx ny nz"] | None = None,
 ) -> Figure:
     """Return a figure with one column per time: three orthogonal slices of the HKS, and their colour bar.
 
@@ -142,6 +145,7 @@ def volume_panels(
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: as for `orthogonal_slices`.
+        z: (n_times, *shape), as for `hks_panels`: what noise could make fades.
 
     Raises:
         ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
@@ -149,6 +153,7 @@ def volume_panels(
     require_volume(grid)
     t, titles = panel_titles(values, times, grid, titles, unit)
     volumes = [_volume(v, grid) for v in np.asarray(values)]
+    noise = None if z is None else [masked("z", each, grid) for each in np.asarray(z)]
     if limits is None:
         limits = [colours_of(volume.compressed(), quantiles)[:2] for volume in volumes]
     elif len(limits) != t.size:
@@ -159,6 +164,7 @@ def volume_panels(
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
     if orientation is not None:
         volumes = [orientation.array(volume) for volume in volumes]
+        noise = None if noise is None else [orientation.array(each) for each in noise]
 
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
@@ -177,6 +183,7 @@ def volume_panels(
                 continue
             low, high = limits[index]
             colours: dict[str, Any] = {"cmap": cmaps[index], "vmin": low, "vmax": high}
+            colours["z"] = None if noise is None else noise[index]
             image = _slices(panels[:3, column], volumes[index], shown, chosen, orientation, **colours)
             panels[0, column].set_title(titles[index], fontsize="medium")
             _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
