@@ -822,7 +822,7 @@ def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
     words = ["-k", "30", "--times", "auto:3", "--noise", noise, "--draws", "8", "--normalisation", "flat", "-q"]
     main(["hks", str(npz), "-o", str(tmp_path / "out"), "--metric", "inverse", *words])
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    ratio = report["noise"]["signal_to_noise"]
+    ratio = report["noise"]["signal_to_noise_with_rim"]  # all of so small a disc is near its rim
     assert len(ratio) == len(report["times"]) == 3
     assert ratio[0] >= 1
     assert report["noise"]["sampling_error"] == pytest.approx(8**-0.5)
@@ -839,6 +839,17 @@ def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
     lines = (tmp_path / "out" / "regions.tsv").read_text().splitlines()
     assert lines[0].endswith("\terror")
     assert float(lines[2].split("\t")[-1]) == pytest.approx(np.sqrt(np.mean(mean**2)), rel=1e-3)
+
+
+def test_the_rim_of_a_mask_is_no_signal(tmp_path):
+    x, y = np.indices((28, 28)) - 13.5
+    np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (28, 28, 2, 2)), mask=np.hypot(x, y) < 13)
+    words = ["-k", "100", "--times", "3", "8", "120", "--noise", "0.05", "--draws", "4", "--normalisation", "flat"]
+    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) == 0
+    noise = json.loads((tmp_path / "out" / "report.json").read_text())["noise"]
+    assert noise["interior"][0] > noise["interior"][1] > 0.2 > noise["interior"][2] == 0
+    assert max(noise["signal_to_noise"][:2]) < 1 < 4 < min(noise["signal_to_noise_with_rim"])
+    assert noise["signal_to_noise"][2] is noise["exceeds_2_from_t"] is None
 
 
 def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):

@@ -52,10 +52,15 @@ class Settings:
 
 
 class Bars(NamedTuple):
-    """Error bars of a signature, and the noise (n_draws, n_times, *shape) of which they are made."""
+    """Error bars of a signature, the noise (n_draws, n_times, *shape) of which they are made, and the interior.
+
+    The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
+    few such nodes; else it is all of the domain.
+    """
 
     uncertainty: Uncertainty
     maps: np.ndarray
+    interior: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.io.volume import TensorVolume
+from hks_jax.signatures.boundary import boundary_influence
 from hks_jax.signatures.hks import hks
 from hks_jax.uncertainty import TensorNoise, uncertainty
 
@@ -27,6 +28,10 @@ _CANDIDATES = 4
 """How many times as many times are looked at as automatic ones are asked for."""
 _SIGNAL = 1.0
 """The signal to noise from which on automatic times begin."""
+_RIM = 0.1
+"""The share of a signature that the boundary may decide (`boundary_influence`) at nodes of the interior."""
+_LEAST = 0.1
+"""The share of the nodes that an interior has at least: fewer do not tell how a map varies."""
 _CLEAR = 2.0
 """The signal to noise that the report names the first time of."""
 
@@ -76,22 +81,30 @@ def error_bars(
         bars = uncertainty(
             signature, tensors, noise, method="resample", draws=draws, progress=progress.update, each=keep
         )
+        interior = np.isfinite(np.asarray(bars.value))
+        if len(pairs.pencil.parts) == 2:
+            nodes = interior[0].sum()
+            interior &= np.asarray(boundary_influence(pairs, times)) < _RIM
+            interior[interior.reshape(len(times), -1).sum(axis=1) < _LEAST * nodes] = False
     chosen = np.arange(len(times))
     if not settings.times.explicit:
-        clear = np.flatnonzero(np.asarray(bars.signal_to_noise) >= _SIGNAL)
+        ratio = np.asarray(bars.signal_to_noise_at(interior))
+        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # where all is near the rim
+        clear = np.flatnonzero(ratio >= _SIGNAL)
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
         chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)
         bars = jax.tree.map(lambda leaf: leaf[chosen] if jnp.ndim(leaf) else leaf, bars)
         times = tuple(times[i] for i in chosen)
     for message in bars.messages():
         progress.warn(message)
-    return Bars(bars, np.stack(maps)[:, chosen]), replace(settings, times=Times(times, wanted))
+    return Bars(bars, np.stack(maps)[:, chosen], interior[chosen]), replace(settings, times=Times(times, wanted))
 
 
 def with_error_bars(result: Result, found: Bars, source: str) -> Result:
     """Return a result with error bars, and with what the report says of them."""
     bars = found.uncertainty
-    ratio = np.asarray(bars.signal_to_noise)
+    ratio = np.asarray(bars.signal_to_noise_at(found.interior))
+    nodes = np.isfinite(np.asarray(bars.value[0])).sum()
     clear = np.flatnonzero(ratio > _CLEAR)
     report = {
         "source": source,
@@ -99,6 +112,8 @@ def with_error_bars(result: Result, found: Bars, source: str) -> Result:
         "sampling_error": bars.sampling_error,
         "indefinite": float(bars.indefinite),
         "signal_to_noise": ratio.tolist(),
+        "signal_to_noise_with_rim": np.asarray(bars.signal_to_noise).tolist(),
+        "interior": (found.interior.reshape(len(ratio), -1).sum(axis=1) / nodes).tolist(),
         "claimed": np.asarray(bars.trusted).tolist(),
         f"exceeds_{_CLEAR:g}_from_t": float(result.times[clear[0]]) if clear.size else None,
     }

@@ -95,7 +95,7 @@ def save_result(
     values = as_precise_as_the_data(result)
     extra = {"times": result.times, "eigenvalues": result.eigenvalues, **(more or {})}
     if result.bars is not None:
-        bars, maps = result.bars
+        bars, maps = result.bars.uncertainty, result.bars.maps
         extra |= {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": maps}
     for suffix in filter(None, (".npz", image)):
         given: dict[str, Any] = {"times": result.times} if suffix == ".nii.gz" else extra

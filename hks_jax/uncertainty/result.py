@@ -99,9 +99,18 @@ class Uncertainty(eqx.Module):
         The measured map's own variance over the nodes, less the mean variance of the noise, which it contains, over
         the latter; the root of that.
         """
+        return self.signal_to_noise_at(True)
+
+    def signal_to_noise_at(self, nodes: Any) -> Any:
+        """Return the signal to noise over some nodes, such as those that no boundary reaches: NaN where there is none.
+
+        Args:
+            nodes: bool, of the shape of the value, or one that is broadcast to it.
+        """
 
         def of(value: Array, deviation: Array) -> Array:
             axes = tuple(range(1, value.ndim))
+            value, deviation = (jnp.where(nodes, each, jnp.nan) for each in (value, deviation))
             noise = jnp.nanmean(deviation**2, axis=axes)
             return jnp.sqrt(jnp.maximum(jnp.nanvar(value, axis=axes) - noise, 0) / noise)
 
