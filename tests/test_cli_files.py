@@ -12,9 +12,8 @@ import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.cli.job import Result
 from hks_jax.cli.outputs import write_outputs
-from hks_jax.cli.progress import Progress
+from hks_jax.cli.progress import OPTIONS, Progress, as_options
 from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.spelling import OPTIONS, as_options
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12, 5)

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
         ValueError: a result that cannot be shown, or labels that do not fit it.
     """
     from hks_jax.cli.outputs import check_folder, signature_file
-    from hks_jax.io.labels import read_labels, read_names
+    from hks_jax.io.masks import read_labels, read_names
     from hks_jax.plot import explore
 
     source = signature_file(args.result)

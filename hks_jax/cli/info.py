@@ -13,9 +13,8 @@ from scipy import ndimage
 
 from hks_jax.cli.arguments import DEFAULT_K, LAST, MEAN, RESOLVED, default_boundary, n_problems
 from hks_jax.cli.inputs import add_clean_argument
-from hks_jax.cli.progress import Progress
+from hks_jax.cli.progress import READING, Progress, as_options
 from hks_jax.cli.reading import add_arguments, read
-from hks_jax.cli.spelling import READING, as_options
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.tensor_checks import MANY

@@ -9,8 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hks_jax.cli.arguments import parse_positive, parse_repair, parse_slice
-from hks_jax.cli.progress import Progress
-from hks_jax.cli.spelling import READING, as_options
+from hks_jax.cli.progress import READING, Progress, as_options
 from hks_jax.io import (
     ORDERS,
     UNITS,

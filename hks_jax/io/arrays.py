@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.io.masks import as_mask
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.tensor_order import choices, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import choices, invalid_by_order, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npy, load_npz
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.tensor_order import FRAMES, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import FRAMES, invalid_by_order, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
 

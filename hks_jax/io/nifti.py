@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from hks_jax.checks import require_real
-from hks_jax.io.order_check import invalid_by_order
 from hks_jax.io.provenance import own_record
 from hks_jax.io.questions import OPEN_FRAME
-from hks_jax.io.tensor_order import FRAMES, choices, pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
 from hks_jax.io.units import scaled_beside
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading

@@ -12,9 +12,8 @@ from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import check_data, check_header
-from hks_jax.io.order_check import invalid_by_order
 from hks_jax.io.provenance import own_record
-from hks_jax.io.tensor_order import choices, nearest_rotation, pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from hks_jax.checks import require_real
 from hks_jax.describe import describe_array
 from hks_jax.domain.grid import Grid
-from hks_jax.io.order_check import InvalidByOrder
+from hks_jax.io.tensor_order import InvalidByOrder
 
 AXES = "xyz"
 
