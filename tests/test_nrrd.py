@@ -1,6 +1,5 @@
 """NRRD: files that pynrrd wrote, against what pynrrd reads and the format's definition of axes."""
 
-import builtins
 import json
 
 import nibabel as nib
@@ -190,19 +189,6 @@ def test_damaged_files(tmp_path, tensors):
             read_tensors(tmp_path / name)
     with pytest.raises(FileNotFoundError, match="no such file"):
         read_tensors(tmp_path / "absent.nrrd")
-
-
-def test_without_pynrrd_the_extra_is_named(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name == "nrrd":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r'pip install "hks-jax\[nrrd\]"'):
-        read_tensors(tmp_path / "t.nrrd")
 
 
 # ---------------------------------------------------------------------------------------------------- writing

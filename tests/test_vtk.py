@@ -1,6 +1,5 @@
 """VTK image data: files that VTK wrote, against what VTK reads and where it puts the points."""
 
-import builtins
 import json
 
 import numpy as np
@@ -144,19 +143,6 @@ def test_damaged_files(tmp_path, tensors):
     assert writer.Write()
     with pytest.raises(ValueError, match="structured points"):
         read_tensors(tmp_path / "mesh.vtk")
-
-
-def test_without_vtk_the_extra_is_named(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.startswith("vtkmodules"):
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r'pip install "hks-jax\[vtk\]"'):
-        read_tensors(tmp_path / "t.vti")
 
 
 # ---------------------------------------------------------------------------------------------------- writing

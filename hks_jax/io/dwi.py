@@ -17,6 +17,7 @@ from hks_jax.io.provenance import digest
 from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
 from hks_jax.io.volume import TensorVolume
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 _LENGTH = 0.05
@@ -91,7 +92,7 @@ def fit_dwi(
             have no length, or another than 1; a mask of another shape; too few images, also to estimate noise from
             residuals; residuals that are zero; no signal.
     """
-    dti, gradients, segmentation = _dipy()
+    dti, gradients, segmentation = map(optional, ("dipy.reconst.dti", "dipy.core.gradients", "dipy.segment.mask"))
     image = nifti.load(path)
     affine, _ = nifti.affine_in_mm(os.fspath(path), image)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
@@ -259,16 +260,6 @@ def _inside(
     if lost := int((inside & ~usable).sum()):
         notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: their signal is NaN or infinite")
     return usable, notes
-
-
-def _dipy() -> tuple[ModuleType, ModuleType, ModuleType]:
-    try:
-        from dipy.core import gradients
-        from dipy.reconst import dti
-        from dipy.segment import mask as segmentation
-    except ImportError as error:
-        raise ImportError('fitting tensors needs DIPY, which is not installed: pip install "hks-jax[dti]"') from error
-    return dti, gradients, segmentation
 
 
 def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:

@@ -15,8 +15,9 @@ from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.io import cortex
 from hks_jax.io.mesh_cleaning import cleaned, require_joined
-from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, meshio, polygonal, through_meshio
+from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
 from hks_jax.io.vtk_image import holds_dataset
+from hks_jax.optional import optional
 from hks_jax.reading import existing
 
 READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", ".gii.gz")
@@ -111,7 +112,7 @@ def write(
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
         raise ValueError(f"path: got {name!r}; {what} are written as {', '.join(allowed)} or .npz")
-    library = meshio()
+    library = optional("meshio")
     cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # what PLY has room for
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})
     with atomic_path(name + ".json") as beside, atomic_path(name) as temporary:

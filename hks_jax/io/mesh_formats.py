@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Float, Int
 
 from hks_jax.io.mesh_checks import MeshChecks
 from hks_jax.io.vtk_checks import check_legacy, check_xml
-from hks_jax.io.vtk_image import require_vtk
+from hks_jax.optional import optional
 from hks_jax.reading import reading
 
 
@@ -25,25 +24,10 @@ class Loaded(NamedTuple):
 _OF_SURFACES, _OF_BOUNDARIES = {"triangle", "quad"}, {"triangle", "quad", "line", "vertex"}
 
 
-def meshio() -> ModuleType:
-    """Import meshio.
-
-    Raises:
-        ImportError: it is not installed; says how to get it.
-    """
-    try:
-        import meshio
-    except ImportError as error:
-        raise ImportError(
-            'reading and writing meshes needs meshio, which is not installed: pip install "hks-jax[mesh]"'
-        ) from error
-    return meshio
-
-
 def through_meshio(name: str) -> Loaded:
     """Load triangles or tetrahedra through meshio."""
     suffix = Path(name).suffix.lower()
-    library = meshio()
+    library = optional("meshio")
     # Overflow is of a text's letters, which it takes for a number of triangles first.
     with reading(name, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
         # The format's own reader: meshio.read ends the process where it cannot read a file.
@@ -70,7 +54,7 @@ def through_meshio(name: str) -> Loaded:
 
 def polygonal(name: str) -> Loaded:
     """Load polygonal data through VTK, its polygons cut into triangles."""
-    require_vtk()
+    optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkTriangleFilter
     from vtkmodules.vtkIOLegacy import vtkPolyDataReader

@@ -5,7 +5,6 @@ import json
 import math
 import os
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
 from hks_jax.io.units import scaled_beside
 from hks_jax.io.volume import TensorVolume
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
@@ -34,22 +34,6 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
-def nibabel() -> ModuleType:
-    """Import nibabel.
-
-    Raises:
-        ImportError: it is not installed; says how to get it.
-    """
-    try:
-        import nibabel
-    except ImportError as error:
-        raise ImportError(
-            "reading and writing NIfTI, GIFTI and FreeSurfer's files needs nibabel, which is not installed: "
-            'pip install "hks-jax[dti]"'
-        ) from error
-    return nibabel
-
-
 def load(path: str | os.PathLike[str]) -> Any:
     """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared.
 
@@ -57,7 +41,7 @@ def load(path: str | os.PathLike[str]) -> Any:
         FileNotFoundError: no such file.
         ValueError: not a NIfTI image, or a damaged one.
     """
-    nib, file = nibabel(), existing(path)
+    nib, file = optional("nibabel"), existing(path)
     with reading(file, "a readable NIfTI image"):
         if file.name.lower().endswith(".gz"):
             with gzip.open(file) as stream:

@@ -4,7 +4,6 @@ import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from hks_jax.io.provenance import own_record
 from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import TensorVolume
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nrrd", ".nhdr")
@@ -82,21 +82,6 @@ def is_nrrd(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
-def pynrrd() -> ModuleType:
-    """Import pynrrd.
-
-    Raises:
-        ImportError: it is not installed; says how to get it.
-    """
-    try:
-        import nrrd
-    except ImportError as error:
-        raise ImportError(
-            'reading and writing NRRD needs pynrrd, which is not installed: pip install "hks-jax[nrrd]"'
-        ) from error
-    return nrrd
-
-
 def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the array, first axis fastest in the file, in native floating point or as it is; and the header.
 
@@ -104,7 +89,7 @@ def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
         FileNotFoundError: no such file.
         ValueError: not an NRRD file, or a damaged one.
     """
-    nrrd, file = pynrrd(), existing(path)
+    nrrd, file = optional("nrrd"), existing(path)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not
         header = dict(nrrd.read_header(stream))
@@ -211,7 +196,7 @@ def write(
     """
     if not os.fspath(path).lower().endswith(".nrrd"):
         raise ValueError(f"path: got {os.fspath(path)!r}; NRRD is written as one file, .nrrd")
-    nrrd = pynrrd()
+    nrrd = optional("nrrd")
     placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
     if placed:
         d, linear, origin = 3, volume.volume_affine[:3, :3], volume.volume_affine[:3, 3]

@@ -16,6 +16,7 @@ from hks_jax.io import mesh, nifti, nrrd, vtk_image
 from hks_jax.io.provenance import describe, describe_tensors
 from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.volume import TensorVolume
+from hks_jax.optional import optional
 
 SUFFIXES = (".npz", ".nii.gz", ".nii", ".nrrd", ".vti")
 """What results on a grid can be written as."""
@@ -168,7 +169,7 @@ def _write_nifti(
     name: str = "",
     symmetric: bool = False,
 ) -> Path:
-    nib = nifti.nibabel()
+    nib = optional("nibabel")
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     image = nib.Nifti1Image(array, volume.volume_affine)

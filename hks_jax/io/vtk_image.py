@@ -15,6 +15,7 @@ from hks_jax.atomic import atomic_path
 from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.io.vtk_checks import check_legacy, check_xml
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".vti", ".vtk")
@@ -32,16 +33,6 @@ def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
     return head.startswith(b"# vtk DataFile") and kind.encode() in head.upper()
 
 
-def require_vtk() -> None:
-    """Raise ImportError, and say what to install, where VTK is missing."""
-    try:
-        import vtkmodules.vtkIOXML  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            'reading and writing VTK images needs VTK, which is not installed: pip install "hks-jax[vtk]"'
-        ) from error
-
-
 def load(path: str | os.PathLike[str]) -> Any:
     """Return the vtkImageData of a file.
 
@@ -49,7 +40,7 @@ def load(path: str | os.PathLike[str]) -> Any:
         FileNotFoundError: no such file.
         ValueError: not image data, or a damaged file.
     """
-    require_vtk()
+    optional("vtkmodules.vtkIOXML")
     from vtkmodules.vtkIOLegacy import vtkStructuredPointsReader
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
@@ -150,7 +141,7 @@ def write(
     """
     if not os.fspath(path).lower().endswith(".vti"):
         raise ValueError(f"path: got {os.fspath(path)!r}; VTK images are written as .vti")
-    require_vtk()
+    optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkCommonDataModel import vtkImageData

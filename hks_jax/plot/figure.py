@@ -2,7 +2,6 @@
 
 import math
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, Locator, MaxNLocator, ScalarFormatter
 from matplotlib.transforms import ScaledTranslation
 
+from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
 
 SMALL = "small"
@@ -44,18 +44,8 @@ def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) 
             f"path: got {str(target)!r}; expected a name that ends in a format matplotlib can write "
             f"({', '.join(sorted(formats))})"
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    try:
+    with atomic_path(target) as temporary:
         fig.savefig(temporary, dpi=dpi, format=suffix)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp's files are private; pictures are like any other file
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
     return target
 
 

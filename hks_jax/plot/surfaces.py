@@ -18,6 +18,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.optional import optional
 from hks_jax.plot.images import colours_of, masked
 from hks_jax.plot.volumes import require_volume
 
@@ -138,7 +139,7 @@ def isosurfaces(
         raise ValueError(f"opacity: got {opacity}; expected more than 0 and at most 1")
     if not np.isfinite(view).all() or np.hypot(view[0], view[1]) == 0:
         raise ValueError(f"view: got {view}; expected a direction that is not along z")
-    pyvista = _pyvista()
+    pyvista = optional("pyvista")
     with _quiet_about_displays():
         plotter = pyvista.Plotter(off_screen=True, window_size=_pixels(ax, resolution))
         try:
@@ -193,17 +194,6 @@ def _pixels(ax: Axes, resolution: float) -> tuple[int, int]:
     """Return the axes' size in pixels."""
     width, height = ax.get_figure().get_size_inches() * ax.get_position().size  # type: ignore[union-attr]
     return max(round(resolution * width), 64), max(round(resolution * height), 64)
-
-
-def _pyvista() -> ModuleType:
-    try:
-        import pyvista
-    except ImportError as error:
-        raise ImportError(
-            'rendering volumes needs PyVista, which is not installed: pip install "hks-jax[pyvista]"'
-        ) from error
-    module: ModuleType = pyvista
-    return module
 
 
 @contextmanager
