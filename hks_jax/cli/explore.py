@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.inputs import add_command, add_json_argument
 from hks_jax.cli.plot import read_saved
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
@@ -31,13 +31,7 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "explore",
-        help="write a page to explore a signature in a browser",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "explore", "write a page to explore a signature in a browser", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("result", metavar="OUT", type=Path, help="the folder that 'hks-jax hks' wrote, or an .npz from there")
     add("-o", "--output", metavar="PAGE", type=Path, help="the page (default: explore.html in OUT)")
@@ -61,7 +55,7 @@ def run(args: argparse.Namespace) -> None:
         FileNotFoundError: no such result, labels or names.
         ValueError: a result that cannot be shown, or labels that do not fit it.
     """
-    from hks_jax.cli.outputs import check_folder, signature_file
+    from hks_jax.cli.outputs import check_folder, show_summary, signature_file
     from hks_jax.io.masks import read_labels, read_names
     from hks_jax.plot import explore
 
@@ -100,10 +94,7 @@ def run(args: argparse.Namespace) -> None:
                 length_unit="" if place.affine is None else "mm",
                 world=place.world,
             )
-    if args.json:
-        print(json.dumps({"source": str(source), "times": times.tolist(), "files": [str(page)]}))
-    elif not args.quiet:
-        print(page)
+    show_summary(args, [page], {"source": str(source), "times": times.tolist()})
 
 
 def _read(source: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, Grid | SurfaceMesh]:

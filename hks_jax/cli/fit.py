@@ -13,11 +13,11 @@ from jaxtyping import Float
 
 from hks_jax.cli.arguments import NATURAL, parse_boundary, recorded_boundary, unreached_sides
 from hks_jax.cli.explore import About
-from hks_jax.cli.inputs import add_interpolation_argument, add_json_argument, add_view_argument
+from hks_jax.cli.inputs import add_command, add_interpolation_argument, add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.io import ORDERS, TensorVolume, atomic_folder, read_tensors, save, save_tensors
+from hks_jax.io import ORDERS, TensorVolume, read_tensors, save, save_tensors
 from hks_jax.io.masks import as_mask
 from hks_jax.io.provenance import digest
 from hks_jax.npz import load_npz
@@ -64,13 +64,7 @@ class Target(NamedTuple):
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "fit",
-        help="find the metric that has a given signature",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "fit", "find the metric that has a given signature", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("target", metavar="TARGET", type=Path, help="the signature: .npz")
     add("-o", "--output", metavar="OUT", type=Path, required=True, help="folder for the results")
@@ -275,7 +269,7 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
 
 def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress: Progress) -> list[Path]:
     """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json; return their paths."""
-    from hks_jax.cli.outputs import write_report
+    from hks_jax.cli.outputs import writing
     from hks_jax.cli.picture import placed
     from hks_jax.plot import fit_panels, save_figure
 
@@ -286,9 +280,8 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
         "stages": [step.stage for step in fit.history],
         "starts": [step.start for step in fit.history],
     }
-    stale = [args.output / "fit.png"]
-    with progress.stage("writing", str(args.output)), atomic_folder(args.output, lambda: stale) as folder:
-        report = _report(args, fit, target)
+    report, stale = _report(args, fit, target), [args.output / "fit.png"]
+    with writing(args.output, report, progress, lambda: stale) as (folder, files):
         origin = {"command": sys.argv, "settings": report["settings"]}
         save_tensors(folder / "tensors.npz", volume, provenance=origin)
         extra = {"times": target.times, **{name: np.asarray(array) for name, array in history.items()}}
@@ -296,9 +289,7 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
         if volume.dimension == 2:
             orientation = placed(volume, [slice(0, n) for n in volume.shape], args.view)
             save_figure(fit_panels(fit, target.values, target.times, orientation=orientation), folder / "fit.png")
-        write_report(folder / "report.json", report, progress, sys.argv)
-        names = sorted(file.name for file in folder.iterdir())
-    return [args.output / name for name in names]
+    return files
 
 
 def _report(args: argparse.Namespace, fit: "MetricFit", target: Target) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """``hks-jax hks FILE -o OUT``: the heat kernel signature of a tensor field in a file."""
 
 import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from hks_jax.cli.arguments import Times, parse_times, parse_voxel
 from hks_jax.cli.inputs import (
     add_clean_argument,
+    add_command,
     add_eigenpair_arguments,
     add_json_argument,
     add_tensor_arguments,
@@ -53,13 +53,8 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "hks",
-        help="compute the signature of a tensor field in a file",
-        usage="%(prog)s FILE -o OUT [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "hks", "compute the signature of a tensor field in a file", DESCRIPTION, EPILOG, "FILE -o OUT"
     )
     add = parser.add_argument
     add_tensor_arguments(parser)
@@ -207,7 +202,7 @@ def run(args: argparse.Namespace) -> None:
                 result = with_error_bars(result, bars, args.noise)
             flat = volume.dimension == 2
             draw_to = partial(draw if flat else partial(draw_volume, through=args.through), result, view=args.view)
-        files = write_outputs(args.output, result, progress, draw=draw_to, image=image, command=sys.argv)
+        files = write_outputs(args.output, result, progress, draw=draw_to, image=image)
     show_files(files, args.quiet, args.json)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from hks_jax.cli.arguments import DEFAULT_K, LAST, MEAN, RESOLVED, default_boundary, n_problems
-from hks_jax.cli.inputs import add_clean_argument
+from hks_jax.cli.inputs import add_clean_argument, add_command
 from hks_jax.cli.progress import READING, Progress, as_options
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.domain.components import label_nodes
@@ -46,13 +46,8 @@ COARSE = 6.0
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "info",
-        help="say what is in a file, and which k and t would suit it",
-        usage="%(prog)s FILE [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "info", "say what is in a file, and which k and t would suit it", DESCRIPTION, EPILOG, "FILE"
     )
     add_arguments(parser)
     add_clean_argument(parser)

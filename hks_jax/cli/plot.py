@@ -1,7 +1,6 @@
 """``hks-jax plot RESULT -o PICTURE``: pictures of results that are in files."""
 
 import argparse
-import json
 import math
 import re
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
-from hks_jax.cli.inputs import add_json_argument, add_view_argument
+from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.grid import Grid
 from hks_jax.npz import load_npz
@@ -55,13 +54,7 @@ class Saved(NamedTuple):
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "plot",
-        help="draw a result that is in a file",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "plot", "draw a result that is in a file", DESCRIPTION, EPILOG)
     # What begins with a minus and a digit is a point, such as -20,35, and no option.
     parser._negative_number_matcher = re.compile(r"-[\d.]")
     add = parser.add_argument
@@ -108,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
     """
     from matplotlib import colormaps
 
-    from hks_jax.cli.outputs import check_folder
+    from hks_jax.cli.outputs import check_folder, show_summary
     from hks_jax.plot import new_figure, save_figure
 
     limits = _limits(args.range)
@@ -129,13 +122,10 @@ def run(args: argparse.Namespace) -> None:
         saved = saved._replace(values=saved.values[chosen], times=None if saved.times is None else saved.times[chosen])
         figure = _panels(saved, args, limits) if args.points is None else _curves(saved, args)
         save_figure(figure, args.output, dpi=args.dpi)
-    if args.json:
-        times = [] if saved.times is None else saved.times.tolist()
-        finite = saved.values[np.isfinite(saved.values)]
-        summary = {"least": float(finite.min()), "greatest": float(finite.max())}
-        print(json.dumps({"source": str(args.result), "times": times, "values": summary, "files": [str(args.output)]}))
-    elif not args.quiet:
-        print(args.output)
+    finite = saved.values[np.isfinite(saved.values)]
+    values = {"least": float(finite.min()), "greatest": float(finite.max())}
+    times = [] if saved.times is None else saved.times.tolist()
+    show_summary(args, [args.output], {"source": str(args.result), "times": times, "values": values})
 
 
 def read_saved(path: Path, name: str | None = None) -> Saved:

@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from hks_jax.cli.arguments import NATURAL
 from hks_jax.cli.inputs import (
+    add_command,
     add_eigenpair_arguments,
     add_json_argument,
     add_tensor_arguments,
@@ -18,7 +18,6 @@ from hks_jax.cli.inputs import (
     require_metric,
 )
 from hks_jax.cli.progress import Progress
-from hks_jax.io import atomic_folder
 
 if TYPE_CHECKING:
     from hks_jax.domain.tensor_field import TensorField
@@ -41,13 +40,8 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "spectrum",
-        help="compute eigenvalues, and compare them with Weyl's law",
-        usage="%(prog)s FILE -o OUT [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "spectrum", "compare eigenvalues with Weyl's law", DESCRIPTION, EPILOG, "FILE -o OUT"
     )
     add_tensor_arguments(parser)
     add_eigenpair_arguments(parser, "neumann, also of a mask: mean would join the eigenvalues of two problems", NATURAL)
@@ -59,7 +53,7 @@ def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     require_metric(args)
     from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
-    from hks_jax.cli.outputs import check_folder, show_files, write_report
+    from hks_jax.cli.outputs import check_folder, show_files, writing
     from hks_jax.eigen.weyl import weyl_count
     from hks_jax.plot import save_figure
 
@@ -93,7 +87,7 @@ def run(args: argparse.Namespace) -> None:
             "volume": np.asarray(pairs.pencil.volume).item(),
             "eigenvalues": columns["eigenvalue"].tolist(),
         }
-        with progress.stage("writing", str(args.output)), atomic_folder(args.output) as folder:
+        with writing(args.output, report, progress) as (folder, files):
             np.savez_compressed(
                 folder / "spectrum.npz",
                 eigenvalues=columns["eigenvalue"],
@@ -102,9 +96,7 @@ def run(args: argparse.Namespace) -> None:
             )
             write_csv(folder / "spectrum.csv", columns)
             save_figure(draw(pairs, field), folder / "spectrum.png")
-            write_report(folder / "report.json", report, progress, sys.argv)
-            names = sorted(file.name for file in folder.iterdir())
-    show_files([args.output / name for name in names], args.quiet, args.json)
+    show_files(files, args.quiet, args.json)
 
 
 def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
