@@ -9,11 +9,11 @@ from hks_jax.cli.inputs import add_command, add_json_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.io import find_invalid, save_tensors
-from hks_jax.io.save import SUFFIXES
+from hks_jax.io.formats import WRITTEN
 
 DESCRIPTION = f"""\
 Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT in the format of its suffix:
-{", ".join(SUFFIXES)}. Components are turned to the axes that the format has them in, which OUT says itself:
+{", ".join(WRITTEN)}. Components are turned to the axes that the format has them in, which OUT says itself:
 it needs neither --order nor --frame. Numbers are converted only from the unit that --unit says, to mm2/s.
 """
 
@@ -38,8 +38,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
-    if not args.output.name.lower().endswith(SUFFIXES):
-        raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(SUFFIXES)}")
+    if not args.output.name.lower().endswith(WRITTEN):
+        raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(WRITTEN)}")
     if args.output.is_dir():
         raise IsADirectoryError(f"OUT: {args.output} is a folder; expected a file")
     if args.output.exists() and args.output.samefile(args.file):

@@ -17,7 +17,7 @@ from hks_jax.cli.inputs import (
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume, save
-from hks_jax.io.save import SUFFIXES
+from hks_jax.io.formats import WRITTEN
 
 if TYPE_CHECKING:
     from hks_jax.plot.orientation import View
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> None:
             },
         }
         volume = volume.with_mask(field.grid.mask)
-        stale = [args.output / f"curvature{suffix}" for suffix in SUFFIXES]
+        stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]
         with writing(args.output, report, progress, lambda: stale) as (folder, files):
             save(folder / "curvature.npz", curvature, volume, name="curvature")
             if image := image_suffix(args.file):

@@ -2,15 +2,15 @@
 
 import os
 import re
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Integer
 from scipy import ndimage
 
-from hks_jax.checks import require_real
-from hks_jax.io import mrtrix, nifti, nrrd
-from hks_jax.npz import load_npy, load_npz
+from hks_jax.io import nifti
+from hks_jax.io.formats import IMAGES, format_of
+from hks_jax.io.volume import as_mask
 from hks_jax.reading import existing, reading
 
 
@@ -27,48 +27,10 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         ImportError: NIfTI without nibabel, NRRD without pynrrd.
     """
     name = os.fspath(path)
-    if nifti.is_nifti(path):
-        image = nifti.load(path)
-        values = nifti.voxels(path, image)
-        while values.ndim > 3 and values.shape[-1] == 1:
-            values = values[..., 0]
-        if affine is not None:
-            _check_same_place(name, nifti.affine_beside(name, image, affine), affine, values.shape)
-    elif mrtrix.is_mrtrix(path):
-        mask = mrtrix.load(path)
-        values = mask.values[..., 0] if mask.values.ndim == 4 and mask.values.shape[-1] == 1 else mask.values
-        if affine is not None:
-            _check_same_place(name, mask.affine, affine, values.shape)
-    elif name.endswith(".npz"):
-        arrays = load_npz(path)
-        if "mask" not in arrays:
-            raise ValueError(f"{name}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
-        values = arrays["mask"]
-    elif nrrd.is_nrrd(path):
-        values, place = nrrd.read_image(path, affine)
-        if affine is not None and place is not None:
-            _check_same_place(name, place, affine, values.shape)
-    elif name.endswith(".npy"):
-        values = load_npy(path)
-    else:
-        expected = ".nii, .nii.gz, .mif, .mif.gz, .nrrd, .nhdr, .npz or .npy"
-        raise ValueError(f"{name}: unknown kind of file; expected {expected}{of_mrtrix(name)}")
+    values, place = _image(path, affine, IMAGES)
+    if affine is not None and place is not None:
+        _check_same_place(name, place, affine, values.shape)
     return as_mask(name, values)
-
-
-def of_mrtrix(name: str) -> str:
-    """Return the advice for images of MRtrix in two files, which are not read; the empty text for others."""
-    stem, _, suffix = name.rpartition(".")
-    return "" if suffix.lower() != "mih" else f". MRtrix makes one file of it: mrconvert {name} {stem}.mif"
-
-
-def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
-    """Return zeros and ones as booleans; raise ValueError for anything else."""
-    array = np.asarray(values)
-    require_real(name, array)
-    if array.dtype != bool and not np.isin(array, (0, 1)).all():
-        raise ValueError(f"{name}: got mask values other than 0 and 1; threshold it first, for example mask > 0.5")
-    return array.astype(bool)
 
 
 def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndarray, "*shape"]:
@@ -128,18 +90,9 @@ def read_labels(
         ImportError: NIfTI without nibabel.
     """
     name = os.fspath(path)
-    if nifti.is_nifti(path):
-        image = nifti.load(path)
-        values = np.asarray(nifti.voxels(path, image))
-        while values.ndim > 3 and values.shape[-1] == 1:
-            values = values[..., 0]
-        if affine is not None and values.ndim == 3:
-            place = nifti.affine_beside(name, image, affine)
-            values = _at_voxels(name, values, place, affine, shape, slice_axis)
-    elif name.endswith(".npy"):
-        values = load_npy(path)
-    else:
-        raise ValueError(f"{name}: unknown kind of file; expected labels as .nii, .nii.gz or .npy")
+    values, place = _image(path, affine, (*nifti.SUFFIXES, ".npy"))
+    if affine is not None and place is not None and values.ndim == 3:
+        values = _at_voxels(name, values, place, affine, shape, slice_axis)
     if values.shape != shape:
         raise ValueError(f"{name}: got labels of shape {values.shape}; expected the shape of the image, {shape}")
     if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
@@ -180,12 +133,18 @@ def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
 
 def names_beside(path: str | os.PathLike[str]) -> str | None:
     """Return the table of names beside a label map, in BIDS ``…_dseg.tsv`` for ``…_dseg.nii.gz``, if it is there."""
-    name = os.fspath(path)
-    for suffix in (*nifti.SUFFIXES[::-1], ".npy"):
-        if name.lower().endswith(suffix):
-            table = name[: -len(suffix)] + ".tsv"
-            return table if os.path.isfile(table) else None
-    return None
+    table = Path(os.fspath(path).removesuffix(".gz")).with_suffix(".tsv")
+    return str(table) if table.is_file() else None
+
+
+def _image(
+    path: str | os.PathLike[str], affine: np.ndarray | None, suffixes: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the voxel values, without a fourth axis of one entry, and the affine where the file has one."""
+    values, place = format_of(path, suffixes).read_image(path, affine)
+    while values.ndim > 3 and values.shape[-1] == 1:
+        values = values[..., 0]
+    return values, place
 
 
 def _at_voxels(

@@ -11,14 +11,18 @@ from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import check_data, check_header
-from hks_jax.io.provenance import own_record
+from hks_jax.io.provenance import describe_tensors, own_record
+from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.units import millimetres, scaled_beside
-from hks_jax.io.volume import TensorVolume
+from hks_jax.io.volume import TensorVolume, images_of
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nrrd", ".nhdr")
+WRITTEN = (".nrrd",)
+IMAGE = ".nrrd"
+OPTIONS = ("confidence",)
 
 TO_RAS = {
     "right-anterior-superior": (1.0, 1.0, 1.0),
@@ -75,11 +79,6 @@ class Placement(NamedTuple):
         signs = np.ones(3) if self.signs is None else self.signs
         affine[:3, :3], affine[:3, 3] = signs[:, None] * self.directions, signs * self.origin
         return affine
-
-
-def is_nrrd(path: str | os.PathLike[str]) -> bool:
-    """Tell by the name whether a file is NRRD."""
-    return os.fspath(path).lower().endswith(SUFFIXES)
 
 
 def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
@@ -176,14 +175,35 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
 
 
 def write(
-    path: str | os.PathLike[str],
+    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
+) -> None:
+    """Write scalars with times along the last axis; see `hks_jax.io.save`."""
+    if volume.affine is not None:
+        array = images_of(array, volume)
+    elif array.ndim > volume.dimension:
+        array = np.moveaxis(array, 0, -1)
+    _write(path, array, volume, record, more=extra)
+
+
+def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
+    """Write tensors as masked symmetric matrices, the mask as confidence, the voxel axes as measurement frame."""
+    require_symmetric(volume)
+    confidence = volume.inside[..., None].astype(volume.tensors.dtype)
+    components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
+    record = describe_tensors(volume, "nrrd", "measurement", provenance)
+    kind = f"{volume.dimension}D-masked-symmetric-matrix"
+    _write(path, np.moveaxis(components, -1, 0), volume, record, kind=kind)
+
+
+def _write(
+    path: Path,
     array: np.ndarray,
     volume: TensorVolume,
     record: str,
     *,
     kind: str | None = None,
     more: Mapping[str, Any] | None = None,
-) -> Path:
+) -> None:
     """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
 
     Args:
@@ -194,8 +214,6 @@ def write(
         kind: of the components' axis; None: scalars.
         more: arrays for the header, as text.
     """
-    if not os.fspath(path).lower().endswith(".nrrd"):
-        raise ValueError(f"path: got {os.fspath(path)!r}; NRRD is written as one file, .nrrd")
     nrrd = optional("nrrd")
     placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
     if placed:
@@ -219,15 +237,6 @@ def write(
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     with atomic_path(path) as temporary:
         nrrd.write(str(temporary), array, {**header, "provenance": record}, index_order="F")
-    return Path(path)
-
-
-def write_tensors(path: str | os.PathLike[str], volume: TensorVolume, record: str) -> Path:
-    """Write tensors as masked symmetric matrices, the mask as confidence, the voxel axes as measurement frame."""
-    confidence = volume.inside[..., None].astype(volume.tensors.dtype)
-    components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
-    kind = f"{volume.dimension}D-masked-symmetric-matrix"
-    return write(path, np.moveaxis(components, -1, 0), volume, record, kind=kind)
 
 
 def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -> tuple[int, str | None]:

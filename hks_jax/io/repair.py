@@ -266,3 +266,12 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     note = f"{formula} of all tensors S, {before} of {int(inside.sum())} of which are not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
     return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))
+
+
+def require_symmetric(volume: TensorVolume) -> None:
+    """Raise ValueError where a format that keeps one half of each tensor would lose the other."""
+    if unsymmetric := int(find_unsymmetric(volume).sum()):
+        raise ValueError(
+            f"volume: {unsymmetric} tensors are unsymmetric, and this format keeps one half of them only. Write their "
+            "symmetric part (T + Tᵀ)/2, or an .npz or .vti"
+        )

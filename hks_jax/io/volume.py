@@ -177,3 +177,20 @@ class TensorVolume:
     def thin_axis(self) -> int:
         """For a slice, the axis along which it is one voxel thick as a volume: z unless it was cut otherwise."""
         return 2 if self.slice_axis is None else self.slice_axis
+
+
+def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
+    """Return scalars (*shape,) or (n_times, *shape) as image files have them: slices one voxel thick, times last."""
+    n = array.ndim - volume.dimension
+    if volume.dimension == 2:
+        array = np.expand_dims(array, n + volume.thin_axis)
+    return np.moveaxis(array, 0, -1) if n else array
+
+
+def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
+    """Return zeros and ones as booleans; raise ValueError for anything else."""
+    array = np.asarray(values)
+    require_real(name, array)
+    if array.dtype != bool and not np.isin(array, (0, 1)).all():
+        raise ValueError(f"{name}: got mask values other than 0 and 1; threshold it first, for example mask > 0.5")
+    return array.astype(bool)
