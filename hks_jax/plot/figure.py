@@ -64,6 +64,14 @@ def cell_extent(grid: Grid) -> tuple[float, float, float, float]:
     return x0 - hx / 2, x1 + hx / 2, y0 - hy / 2, y1 + hy / 2
 
 
+def panel_size(grid: Grid, side: float, steepest: float = 4.0) -> tuple[float, float]:
+    """Return an image's width and height: `side`, or less width where it is high, their ratio at most `steepest`."""
+    x0, x1, y0, y1 = cell_extent(grid)
+    aspect = min(max((y1 - y0) / (x1 - x0), 1 / steepest), steepest)
+    width = side / max(1.0, aspect**0.5)
+    return width, width * aspect
+
+
 def frame(ax: Axes, grid: Grid) -> None:
     """Show the grid in `ax`: equal aspect, array axis 0 horizontal, few ticks."""
     x0, x1, y0, y1 = cell_extent(grid)

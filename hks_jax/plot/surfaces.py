@@ -130,8 +130,7 @@ def isosurfaces(
     """
     require_volume(grid)
     array = masked("values", values, grid)
-    low, high, _ = colours_of(array.compressed(), quantiles)
-    low, high = low if vmin is None else vmin, high if vmax is None else vmax
+    low, high, _ = colours_of(array.compressed(), quantiles, limits=(vmin, vmax))
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
         raise ValueError(f"levels: got {levels}; expected a number from 1, or finite values")
