@@ -18,8 +18,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import ORDERS, TensorVolume, read_tensors, save, save_tensors
-from hks_jax.io.provenance import digest
-from hks_jax.io.volume import as_mask
+from hks_jax.io.volume import as_mask, digest
 from hks_jax.npz import load_npz
 
 if TYPE_CHECKING:

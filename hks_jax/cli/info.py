@@ -23,9 +23,9 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.mesh import is_mesh
-from hks_jax.io.provenance import digest
 from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.units import MM2_PER_S, is_plausible
+from hks_jax.io.volume import digest
 
 DESCRIPTION = f"""\
 Say what is in a file of tensors: shape, order of components and how it was determined, frame, units, mask and its

@@ -128,10 +128,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def defaults() -> dict[str, Any]:
-    """Return what the options are unless given."""
+def defaults(*adding: Callable[[argparse.ArgumentParser], None]) -> dict[str, Any]:
+    """Return what the options are that functions add, here `add_options`, unless they are given."""
     parser = argparse.ArgumentParser(add_help=False)
-    add_options(parser)
+    for add in adding or (add_options,):
+        add(parser)
     return vars(parser.parse_args([]))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.arguments import recorded_boundary
+from hks_jax.cli.inputs import add_eigenpair_arguments, add_tensor_options
 from hks_jax.cli.job import Settings, field_of
 from hks_jax.cli.outputs import plain
 from hks_jax.cli.progress import Progress
@@ -24,17 +25,7 @@ from hks_jax.npz import load_npz
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that belong to the pairs."""
-_OPTIONS = {
-    **defaults(),
-    "metric": None,
-    "components": "raise",
-    "dtype": "float64",
-    "interpolation": "linear",
-    "boundary": None,
-    "k": None,
-    "solver": "auto",
-    "save_pairs": False,
-}
+_OPTIONS = {**defaults(add_tensor_options, lambda parser: add_eigenpair_arguments(parser, "")), "save_pairs": False}
 """Options that were settled when the pairs were computed, and what they are unless given."""
 
 

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.provenance import describe_tensors
 from hks_jax.io.tensor_order import choices, invalid_by_order, to_voxel_axes, unpack
-from hks_jax.io.volume import TensorVolume, as_mask
+from hks_jax.io.volume import TensorVolume, as_mask, describe_tensors
 from hks_jax.npz import load_npy, load_npz
 
 SUFFIXES = (".npz", ".npy")

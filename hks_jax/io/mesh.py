@@ -128,13 +128,13 @@ def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> 
     if name.endswith((".gii", ".gii.gz")):
         loaded = cortex.load_gifti(file, in_space)
     elif name.endswith(".vtp") or (name.endswith(".vtk") and holds_dataset(file, "POLYDATA")):
-        loaded = polygonal(str(file))
+        loaded = polygonal(file)
     elif name.endswith(".obj"):
         loaded = load_obj(file)
     elif name.endswith(".off"):
         loaded = load_off(file)
     elif name.endswith(READ):
-        loaded = through_meshio(str(file))
+        loaded = through_meshio(file)
     elif cortex.is_freesurfer(file):
         loaded = cortex.load_freesurfer(file, in_space)
     else:

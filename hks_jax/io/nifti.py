@@ -12,13 +12,12 @@ import numpy as np
 
 from hks_jax.atomic import atomic_path
 from hks_jax.checks import require_real
-from hks_jax.io.provenance import describe_tensors, own_record
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
 from hks_jax.io.units import scaled_beside
-from hks_jax.io.volume import TensorVolume, images_of
+from hks_jax.io.volume import TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 

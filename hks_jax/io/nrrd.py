@@ -11,11 +11,10 @@ from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import check_data, check_header
-from hks_jax.io.provenance import describe_tensors, own_record
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.units import millimetres, scaled_beside
-from hks_jax.io.volume import TensorVolume, images_of
+from hks_jax.io.volume import TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 

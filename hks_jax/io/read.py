@@ -12,11 +12,10 @@ from hks_jax.checks import require_number
 from hks_jax.io import components, nifti
 from hks_jax.io.formats import format_of
 from hks_jax.io.masks import read_mask
-from hks_jax.io.provenance import digest
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
-from hks_jax.io.volume import TensorVolume, as_mask
+from hks_jax.io.volume import TensorVolume, as_mask, digest
 
 
 def read_tensors(

@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.provenance import describe_tensors
 from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, to_voxel_axes, unpack
-from hks_jax.io.volume import TensorVolume, as_mask
+from hks_jax.io.volume import TensorVolume, as_mask, describe_tensors
 from hks_jax.io.vtk_checks import check_legacy, check_xml
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
