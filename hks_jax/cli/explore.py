@@ -3,13 +3,15 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from hks_jax.cli.inputs import add_command, add_json_argument
-from hks_jax.cli.plot import read_saved
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.saved import About as About
+from hks_jax.cli.saved import Place as Place
+from hks_jax.cli.saved import read_saved
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.npz import load_npz
@@ -103,51 +105,9 @@ def _read(source: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
         raise ValueError(f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu beside it")
     if "faces" in arrays and {"hks", "times", "vertices"} <= set(arrays):
         return arrays["hks"], arrays["times"], SurfaceMesh(arrays["vertices"], arrays["faces"])
-    saved = read_saved(source, "hks")
-    if saved.times is None:
-        raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
+    saved = read_saved(source, "hks", over_times=True)
+    assert saved.times is not None
     return saved.values, saved.times, saved.grid
-
-
-class Place(NamedTuple):
-    """Where the grid lies in space: the affine of its volume, the axis that it cuts, and what its indices become."""
-
-    affine: np.ndarray | None
-    slice_axis: int | None
-    world: np.ndarray | None
-
-    @classmethod
-    def of(cls, arrays: dict[str, np.ndarray], dimension: int) -> "Place":
-        """Return where the grid of a saved result lies."""
-        affine = arrays.get("affine")
-        slice_axis = int(arrays["slice_axis"]) if "slice_axis" in arrays else None
-        if affine is None:
-            return cls(None, slice_axis, None)
-        thin = 2 if slice_axis is None else slice_axis
-        return cls(affine, slice_axis, affine[:3, [a for a in range(4) if dimension == 3 or a != thin]])
-
-
-class About(NamedTuple):
-    """What the result says of its origin."""
-
-    settings: dict[str, Any]
-    title: str
-    unit: str
-    cut: str
-    k: int | None
-
-    @classmethod
-    def of(cls, arrays: dict[str, np.ndarray]) -> "About":
-        """Return what a saved result says."""
-        record = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
-        settings = record.get("settings") or {}
-        # Fitted tensors are in mm²/s, and their grids in mm.
-        seconds = record.get("order") == "fit" and settings.get("metric") == "inverse"
-        k = len(arrays["eigenvalues"]) if "eigenvalues" in arrays else None
-        cuts = [
-            note.partition(":")[0].removeprefix("slice ") for note in record.get("notes", ()) if "slice " in note[:6]
-        ]
-        return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", "".join(cuts[-1:]), k)
 
 
 def _spread(tensors: np.ndarray | None, values: np.ndarray, times: np.ndarray, about: About) -> np.ndarray | None:

@@ -12,14 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.arguments import NATURAL, parse_boundary, recorded_boundary, unreached_sides
-from hks_jax.cli.explore import About
 from hks_jax.cli.inputs import add_command, add_interpolation_argument, add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
+from hks_jax.cli.saved import About, read_saved
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import ORDERS, TensorVolume, read_tensors, save, save_tensors
 from hks_jax.io.volume import as_mask, digest
-from hks_jax.npz import load_npz
 
 if TYPE_CHECKING:
     from hks_jax.domain.grid import Grid
@@ -39,7 +38,6 @@ example:
   hks-jax fit out/hks.npz -o fitted --parametrisation conformal --noise 0.01 --h1 1e-4 --checkpoint fit.part.npz
 """
 
-REQUIRED = ("hks", "times", "spacing", "origin")
 PARAMETRISATIONS = ("log-euclidean", "cholesky", "conformal", "eigenvalues", "rotation")
 OPTIMISERS = ("gauss-newton", "lbfgs", "bfgs")
 """As in `hks_jax.inverse`, which is slow to import: a test keeps them the same."""
@@ -195,34 +193,20 @@ def read_target(path: Path) -> Target:
         FileNotFoundError: no such file.
         ValueError: no npz; arrays that are missing, not real numbers, or of shapes that disagree.
     """
-    arrays = load_npz(path)
-    missing = [name for name in REQUIRED if name not in arrays]
-    if missing:
-        raise ValueError(
-            f"{path}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {', '.join(REQUIRED)} and, "
-            f"optional, mask, affine. Add {', '.join(missing)}"
-        )
-    for name in REQUIRED:
-        if arrays[name].dtype.kind not in "fiu":
-            raise ValueError(f"{path}: {name}: got dtype {arrays[name].dtype}; expected real numbers")
-    values, times = arrays["hks"].astype(np.float64), arrays["times"].astype(np.float64)
-    if values.ndim not in (3, 4) or times.shape != values.shape[:1]:
-        raise ValueError(
-            f"{path}: got hks of shape {values.shape} and times of shape {times.shape}; expected (n_times, nx, ny) or "
-            "(n_times, nx, ny, nz), and (n_times,)"
-        )
-    d, mask, affine = values.ndim - 1, arrays.get("mask"), arrays.get("affine")
+    saved = read_saved(path, "hks", over_times=True)
+    assert saved.times is not None
+    arrays, d = saved.arrays, saved.grid.dimension
     volume = TensorVolume(
-        np.broadcast_to(np.eye(d), (*values.shape[1:], d, d)),
-        tuple(arrays["spacing"].astype(float).ravel().tolist()),
-        tuple(arrays["origin"].astype(float).ravel().tolist()),
-        None if mask is None else as_mask(f"{path}: mask", mask),
-        None if affine is None else np.asarray(affine, np.float64),
+        np.broadcast_to(np.eye(d), (*saved.grid.shape, d, d)),
+        saved.grid.spacing,
+        saved.grid.origin,
+        as_mask("mask", arrays["mask"]) if "mask" in arrays else None,
+        None if saved.place.affine is None else saved.place.affine.astype(np.float64),
         int(arrays["slice_axis"]) if "slice_axis" in arrays else None,
         source=str(path),
         digest=digest(path),
     )
-    return Target(values, times, volume, recorded_boundary(About.of(arrays).settings))
+    return Target(saved.values, saved.times, volume, recorded_boundary(About.of(arrays).settings))
 
 
 def _weight(text: str) -> float:

@@ -4,16 +4,16 @@ import argparse
 import math
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
 from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.saved import NAMES, Saved
+from hks_jax.cli.saved import read_saved as read_saved
 from hks_jax.domain.grid import Grid
-from hks_jax.npz import load_npz
 
 DESCRIPTION = """\
 Draw a result that 'hks-jax hks', 'fit' or 'curvature' has written as npz: an image for each time, or with --points a
@@ -26,30 +26,8 @@ examples:
   hks-jax plot out/hks.npz -o curves.pdf --points -22,5 24,5 --unit s --scaled
 """
 
-NAMES = ("hks", "curvature")
 MANY = 12
 """Images at most, unless times are chosen."""
-
-
-class Saved(NamedTuple):
-    """A result as it was saved.
-
-    Attributes:
-        values: (n_times, *shape).
-        times: (n_times,), or None for a result without.
-        grid: the grid, with the mask.
-        eigenvalues: (k,), where they were saved.
-        affine: (4, 4), from the nodes' indices to space, where that was saved; of a slice that of a volume one voxel
-            thick.
-        slice_axis: the axis of the volume that a slice cuts; None for a volume.
-    """
-
-    values: Float[np.ndarray, "n_times *shape"]
-    times: Float[np.ndarray, " n_times"] | None
-    grid: Grid
-    eigenvalues: Float[np.ndarray, " k"] | None
-    affine: Float[np.ndarray, "4 4"] | None
-    slice_axis: int | None
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -128,44 +106,6 @@ def run(args: argparse.Namespace) -> None:
     show_summary(args, [args.output], {"source": str(args.result), "times": times, "values": values})
 
 
-def read_saved(path: Path, name: str | None = None) -> Saved:
-    """Read a result on a grid.
-
-    Args:
-        path: the npz.
-        name: the array; None: the first of `NAMES` that is there.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no npz; arrays that are missing or of shapes that disagree.
-    """
-    arrays = load_npz(path)
-    chosen = next((n for n in NAMES if n in arrays), None) if name is None else name
-    lacking = [n for n in (chosen, "spacing", "origin") if n not in arrays]
-    if chosen is None or lacking:
-        expected = " or ".join(NAMES) if name is None else name
-        raise ValueError(
-            f"{path}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {expected}, spacing and origin, "
-            "as 'hks-jax hks' and 'hks-jax curvature' write them"
-        )
-    values, spacing = np.asarray(arrays[chosen]), np.atleast_1d(arrays["spacing"])
-    if values.dtype.kind not in "fiu" or values.ndim - spacing.size not in (0, 1) or spacing.size not in (2, 3):
-        raise ValueError(
-            f"{path}: got {chosen} of shape {values.shape}, dtype {values.dtype}, and spacing of shape "
-            f"{spacing.shape}; expected real numbers, one per node or (n_times, *shape)"
-        )
-    times = None
-    if values.ndim > spacing.size:
-        times = np.asarray(arrays.get("times", np.arange(len(values))), dtype=np.float64)
-        if times.shape != values.shape[:1]:
-            raise ValueError(f"{path}: got {chosen} of shape {values.shape} and times of shape {times.shape}")
-    shape = values.shape[values.ndim - spacing.size :]
-    grid = Grid(shape, spacing.tolist(), arrays["origin"].tolist(), arrays.get("mask"), "all")
-    values = values.reshape(-1, *grid.shape).astype(np.float64)
-    cut = None if grid.dimension == 3 else int(arrays.get("slice_axis", 2))
-    return Saved(values, times, grid, arrays.get("eigenvalues"), arrays.get("affine"), cut)
-
-
 def _choose_times(saved: Saved, args: argparse.Namespace) -> np.ndarray:
     """Return the indices of the times to draw."""
     if saved.times is None:
@@ -194,7 +134,7 @@ def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] 
     from hks_jax.cli.picture import LEAST_RANGE, bounding_box, orientation_of
     from hks_jax.plot import hks_panels, middle_node
 
-    values, grid, title, thin = saved.values, saved.grid, args.title, saved.slice_axis
+    values, grid, title, thin = saved.values, saved.grid, args.title, saved.place.slice_axis
     if grid.dimension == 3:
         axis, index = args.slice or ("z", middle_node(grid.inside)[2])
         a = thin = "xyz".index(axis)
@@ -227,7 +167,7 @@ def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] 
         quantiles=args.quantiles,
         least_range=LEAST_RANGE,
         suptitle=title,
-        orientation=None if saved.affine is None else orientation_of(saved.affine, thin, box, args.view),
+        orientation=None if saved.place.affine is None else orientation_of(saved.place.affine, thin, box, args.view),
     )
 
 
@@ -236,14 +176,14 @@ def _curves(saved: Saved, args: argparse.Namespace) -> Any:
 
     assert saved.times is not None
     values, grid = saved.values, saved.grid
-    if saved.affine is not None:  # points have the coordinates that the images show
-        orientation = Orientation.of(saved.affine, saved.slice_axis)
+    if saved.place.affine is not None:  # points have the coordinates that the images show
+        orientation = Orientation.of(saved.place.affine, saved.place.slice_axis)
         values, grid = orientation.array(values), orientation.grid(grid)
     d, limit = grid.dimension, None
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates each")
-    if saved.eigenvalues is not None:
-        limit = RESOLVED[d] / float(saved.eigenvalues[-1])
+    if "eigenvalues" in saved.arrays:
+        limit = RESOLVED[d] / float(saved.arrays["eigenvalues"][-1])
     figure = new_figure(5.4, 4.0)
     hks_curves(
         figure.subplots(),
