@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.job import describe_input
+from hks_jax.cli.outputs import show_summary
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.io import find_invalid, save_tensors
@@ -53,7 +55,5 @@ def run(args: argparse.Namespace) -> None:
             progress.warn(f"{invalid} tensors are not positive definite and are written as they are; see --repair")
         with progress.stage("writing", str(args.output)):
             save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
-    from hks_jax.cli.job import describe_input
-    from hks_jax.cli.outputs import show_summary
 
     show_summary(args, [args.output], {**describe_input(volume, volume.mask), "not_positive_definite": invalid})

@@ -14,8 +14,11 @@ from hks_jax.cli.inputs import (
     read_volume,
     require_metric,
 )
+from hks_jax.cli.job import describe_input, field_of
+from hks_jax.cli.outputs import check_folder, show_files, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
+from hks_jax.curvature import gaussian_curvature
 from hks_jax.io import TensorVolume, save
 from hks_jax.io.formats import WRITTEN
 
@@ -60,9 +63,6 @@ def run(args: argparse.Namespace) -> None:
         ValueError: tensors that have no Gaussian curvature that could be computed.
     """
     require_metric(args)
-    from hks_jax.cli.job import describe_input, field_of
-    from hks_jax.cli.outputs import check_folder, show_files, writing
-    from hks_jax.curvature import gaussian_curvature
     from hks_jax.plot import save_figure
 
     check_folder(args.output)

@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.cli.arguments import Times
 from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
+from hks_jax.cli.job import Settings, compute
+from hks_jax.cli.outputs import check_folder, show_files, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
 
@@ -47,9 +50,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
-    from hks_jax.cli.arguments import Times
-    from hks_jax.cli.job import Settings, compute
-    from hks_jax.cli.outputs import check_folder, show_files, write_outputs
     from hks_jax.cli.picture import draw
     from hks_jax.plot import number_text
 

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.outputs import check_folder, show_summary, signature_file
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.saved import About as About
 from hks_jax.cli.saved import Place as Place
 from hks_jax.cli.saved import read_saved
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.io.masks import read_labels, read_names
 from hks_jax.npz import load_npz
 
 DESCRIPTION = """\
@@ -57,8 +59,6 @@ def run(args: argparse.Namespace) -> None:
         FileNotFoundError: no such result, labels or names.
         ValueError: a result that cannot be shown, or labels that do not fit it.
     """
-    from hks_jax.cli.outputs import check_folder, show_summary, signature_file
-    from hks_jax.io.masks import read_labels, read_names
     from hks_jax.plot import explore
 
     source = signature_file(args.result)

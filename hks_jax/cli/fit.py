@@ -13,16 +13,18 @@ from jaxtyping import Float
 
 from hks_jax.cli.arguments import NATURAL, parse_boundary, recorded_boundary, unreached_sides
 from hks_jax.cli.inputs import add_command, add_interpolation_argument, add_json_argument, add_view_argument
+from hks_jax.cli.job import ComputationError, use_dtype
+from hks_jax.cli.outputs import check_folder, show_files, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
 from hks_jax.cli.saved import About, read_saved
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import ORDERS, TensorVolume, read_tensors, save, save_tensors
 from hks_jax.io.volume import as_mask, digest
 
 if TYPE_CHECKING:
-    from hks_jax.domain.grid import Grid
-    from hks_jax.domain.tensor_field import TensorField
     from hks_jax.inverse.metric_fit import MetricFit
 
 DESCRIPTION = """\
@@ -133,8 +135,6 @@ def run(args: argparse.Namespace) -> None:
             "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors D, which are no metric"
         )
 
-    from hks_jax.cli.job import ComputationError, use_dtype
-    from hks_jax.cli.outputs import check_folder, show_files
     from hks_jax.inverse.fit import fit_metric
     from hks_jax.inverse.metric_fit import RESULTS
     from hks_jax.inverse.regulariser import H1, Regulariser, TotalVariation
@@ -220,9 +220,8 @@ def _weight(text: str) -> float:
     return weight
 
 
-def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: Progress) -> "TensorField":
+def _initial(args: argparse.Namespace, target: Target, grid: Grid, progress: Progress) -> TensorField:
     """Return the field to start from, on the target's grid."""
-    from hks_jax.domain.tensor_field import TensorField
 
     if args.init is None:
         return TensorField(grid, target.volume.tensors.astype(args.dtype), args.interpolation)
@@ -252,7 +251,6 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
 
 def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress: Progress) -> list[Path]:
     """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json; return their paths."""
-    from hks_jax.cli.outputs import writing
     from hks_jax.cli.picture import placed
     from hks_jax.plot import fit_panels, save_figure
 

@@ -176,20 +176,8 @@ def versions() -> dict[str, str]:
         "system": platform.platform(),
         "device": jax.devices()[0].device_kind,
     }
-    for package in (
-        "hks-jax",
-        "jax",
-        "jaxlib",
-        "optimistix",
-        "numpy",
-        "scipy",
-        "matplotlib",
-        "nibabel",
-        "dipy",
-        "pynrrd",
-        "vtk",
-        "meshio",
-    ):
+    optional = "optimistix numpy scipy matplotlib nibabel dipy pynrrd vtk meshio"
+    for package in ("hks-jax", "jax", "jaxlib", *optional.split()):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.job import use_dtype
+from hks_jax.cli.outputs import check_folder, plain, versions
 from hks_jax.cli.progress import Progress
 
 EPILOG = """\
@@ -35,8 +37,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
-    from hks_jax.cli.job import use_dtype
-    from hks_jax.cli.outputs import check_folder, plain, versions
 
     check_folder(args.output)
     use_dtype("float64")

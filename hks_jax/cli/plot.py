@@ -10,6 +10,7 @@ import numpy as np
 
 from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
 from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
+from hks_jax.cli.outputs import check_folder, show_summary
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.saved import NAMES, Saved
 from hks_jax.cli.saved import read_saved as read_saved
@@ -79,7 +80,6 @@ def run(args: argparse.Namespace) -> None:
     """
     from matplotlib import colormaps
 
-    from hks_jax.cli.outputs import check_folder, show_summary
     from hks_jax.plot import new_figure, save_figure
 
     limits = _limits(args.range)

@@ -4,11 +4,12 @@ import argparse
 import csv
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import NATURAL
+from hks_jax.cli.arguments import DEFAULT_TIMES, NATURAL
+from hks_jax.cli.hks import settings_of
 from hks_jax.cli.inputs import (
     add_command,
     add_eigenpair_arguments,
@@ -17,11 +18,12 @@ from hks_jax.cli.inputs import (
     read_volume,
     require_metric,
 )
+from hks_jax.cli.job import compute_pairs, describe_input, describe_pairs
+from hks_jax.cli.outputs import check_folder, show_files, writing
 from hks_jax.cli.progress import Progress
-
-if TYPE_CHECKING:
-    from hks_jax.domain.tensor_field import TensorField
-    from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.weyl import weyl_count
 
 DESCRIPTION = """\
 Compute the lowest eigenvalues of the Laplace-Beltrami operator of a field of diffusion tensors. FILE is read as by
@@ -52,9 +54,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     require_metric(args)
-    from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
-    from hks_jax.cli.outputs import check_folder, show_files, writing
-    from hks_jax.eigen.weyl import weyl_count
     from hks_jax.plot import save_figure
 
     check_folder(args.output)
@@ -62,15 +61,7 @@ def run(args: argparse.Namespace) -> None:
     with progress.catching_warnings():
         with progress.stage("reading", str(args.file)):
             volume = read_volume(args, progress)
-        settings = Settings(
-            metric=args.metric or "tensor",
-            interpolation=args.interpolation,
-            k=args.k,
-            boundary=args.boundary,
-            components=args.components,
-            solver=args.solver,
-            dtype=args.dtype,
-        )
+        settings = settings_of(args, DEFAULT_TIMES, args.metric or "tensor")
         field, pairs, settings = compute_pairs(volume, settings, progress)
         columns = {
             "eigenvalue": np.asarray(pairs.eigenvalues),
@@ -108,7 +99,7 @@ def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
         writer.writerows([i, *row] for i, row in enumerate(rows))
 
 
-def draw(pairs: "Eigenpairs", field: "TensorField") -> Any:
+def draw(pairs: Eigenpairs, field: TensorField) -> Any:
     """Return the picture: the eigenvalues' count beside Weyl's law, and what is left when that is taken off."""
     from hks_jax.plot import new_figure, spectrum
 

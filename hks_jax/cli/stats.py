@@ -5,7 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.outputs import check_folder, show_summary, signature_file
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.regions import region_table
+from hks_jax.io.tables import write_table
 
 DESCRIPTION = """\
 Write a table of regions: for each label of an image, and each t of the signature that 'hks-jax hks' has left in the
@@ -62,9 +65,6 @@ def run(args: argparse.Namespace) -> None:
         FileNotFoundError: no such result, labels or names.
         ValueError: a result that has no regions, or labels that do not fit it.
     """
-    from hks_jax.cli.outputs import check_folder, show_summary, signature_file
-    from hks_jax.cli.regions import region_table
-    from hks_jax.io.tables import write_table
 
     source = signature_file(args.result)
     table = source.with_name("regions.tsv") if args.output is None else args.output
