@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.cli.arguments import NATURAL, parse_boundary, recorded_boundary, unreached_sides
+from hks_jax.cli.arguments import NATURAL, parse_boundary, parse_weight, recorded_boundary, unreached_sides
 from hks_jax.cli.inputs import add_command, add_interpolation_argument, add_json_argument, add_view_argument
 from hks_jax.cli.job import ComputationError, use_dtype
 from hks_jax.cli.outputs import check_folder, show_files, writing
@@ -107,8 +107,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="length, in units of the spacing, below which steps are smooth (default a tenth of the domain, and 0 for "
         "conformal without --noise)",
     )
-    add("--h1", type=_weight, metavar="WEIGHT", help="penalise slopes: ½ WEIGHT · mean |∇p|² of the parameters p")
-    add("--tv", type=_weight, metavar="WEIGHT", help="penalise total variation, which keeps edges sharp")
+    add("--h1", type=parse_weight, metavar="WEIGHT", help="penalise slopes: ½ WEIGHT · mean |∇p|² of the parameters p")
+    add("--tv", type=parse_weight, metavar="WEIGHT", help="penalise total variation, which keeps edges sharp")
     add("--max-steps", type=int, default=50, metavar="N", help="steps per stage (default 50)")
     add("--continuation", type=int, default=1, metavar="N", help="stages, large times first (default 1)")
     add("--starts", type=int, default=1, metavar="N", help="starts, from random changes of --init (default 1)")
@@ -207,17 +207,6 @@ def read_target(path: Path) -> Target:
         digest=digest(path),
     )
     return Target(saved.values, saved.times, volume, recorded_boundary(About.of(arrays).settings))
-
-
-def _weight(text: str) -> float:
-    """Read a positive number."""
-    try:
-        weight = float(text)
-    except ValueError:
-        weight = math.nan
-    if not 0 < weight < math.inf:
-        raise argparse.ArgumentTypeError(f"got {text!r}; expected a positive number")
-    return weight
 
 
 def _initial(args: argparse.Namespace, target: Target, grid: Grid, progress: Progress) -> TensorField:

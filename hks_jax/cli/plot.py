@@ -1,14 +1,13 @@
 """``hks-jax plot RESULT -o PICTURE``: pictures of results that are in files."""
 
 import argparse
-import math
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
+from hks_jax.cli.arguments import RESOLVED, parse_numbers, parse_slice, parse_times
 from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
 from hks_jax.cli.outputs import check_folder, show_summary
 from hks_jax.cli.progress import Progress
@@ -201,24 +200,16 @@ def _curves(saved: Saved, args: argparse.Namespace) -> Any:
     return figure
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(piece) for piece in text.split(","))
-    except ValueError:
-        numbers = ()
-    return numbers if all(math.isfinite(x) for x in numbers) else ()
-
-
 def _point(text: str) -> tuple[float, ...]:
     """Read ``1.5,2`` or ``1.5,2,3``."""
-    if len(numbers := _numbers(text)) not in (2, 3):
+    if len(numbers := parse_numbers(text)) not in (2, 3):
         raise argparse.ArgumentTypeError(f"got {text!r}; expected coordinates, such as 1.5,2")
     return numbers
 
 
 def _pair(text: str) -> tuple[float, float]:
     """Read ``0.01,0.99``."""
-    if len(numbers := _numbers(text)) != 2 or not 0 <= numbers[0] < numbers[1] <= 1:
+    if len(numbers := parse_numbers(text)) != 2 or not 0 <= numbers[0] < numbers[1] <= 1:
         raise argparse.ArgumentTypeError(f"got {text!r}; expected two numbers from 0 to 1, such as 0.01,0.99")
     return numbers[0], numbers[1]
 
@@ -227,6 +218,6 @@ def _limits(text: str) -> tuple[float, float] | None:
     """Read ``own`` or ``shared`` (None) or ``LOW,HIGH``."""
     if text in ("own", "shared"):
         return None
-    if len(numbers := _numbers(text)) != 2 or not numbers[0] < numbers[1]:
+    if len(numbers := parse_numbers(text)) != 2 or not numbers[0] < numbers[1]:
         raise ValueError(f"--range: got {text!r}; expected own, shared, or two ascending numbers LOW,HIGH")
     return numbers[0], numbers[1]

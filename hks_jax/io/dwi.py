@@ -218,15 +218,10 @@ def _of_length_one(
         )
     rounded = weighted & (np.abs(lengths - 1) > 1e-3)
     unit = np.where(weighted[:, None], directions / np.where(weighted, lengths, 1.0)[:, None], 0.0)
-    notes = (
-        [
-            f"{int(rounded.sum())} directions divided by their lengths, {lengths[rounded].min():.4g} to "
-            f"{lengths[rounded].max():.4g}"
-        ]
-        if rounded.any()
-        else []
-    )
-    return unit, notes
+    if not rounded.any():
+        return unit, []
+    low, high = lengths[rounded].min(), lengths[rounded].max()
+    return unit, [f"{int(rounded.sum())} directions divided by their lengths, {low:.4g} to {high:.4g}"]
 
 
 def _inside(

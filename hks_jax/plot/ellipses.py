@@ -56,8 +56,7 @@ def ellipses(
         raise ValueError(f'sizes: got {sizes!r}; expected "common" or "fit"')
     if not 0 < fill <= 1:
         raise ValueError(f"fill: got {fill}; expected a number in (0, 1]; ellipses overlap beyond 1")
-    steps = node_steps(grid.shape, grid.spacing, every, ax)
-    pick = tuple(centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
+    steps, pick = nodes_drawn(grid, every, ax)
     inside = grid.inside[pick]
     if not inside.any():
         raise ValueError(f"every: got {every}; no node drawn lies inside the mask. Use a smaller step")
@@ -106,25 +105,23 @@ def ellipses(
     return collection
 
 
-def centred(n: int, step: int) -> slice:
-    """Return every step-th of n nodes: as many as there is room for, in the middle."""
-    count = max(1, n // step)
-    first = (n - count * step) // 2 + step // 2
-    return slice(first, first + (count - 1) * step + 1, step)
+def nodes_drawn(grid: Grid, every: int | Sequence[int] | None, ax: Axes) -> tuple[tuple[int, ...], tuple[slice, ...]]:
+    """Return the step along each axis, and which nodes are drawn: as many as there is room for, in the middle.
 
-
-def node_steps(
-    shape: tuple[int, ...], spacing: tuple[float, ...], every: int | Sequence[int] | None, ax: Axes
-) -> tuple[int, ...]:
-    """Return the step along each axis: as given, or for some 10 nodes an inch of the longer side, 24 at most."""
+    Steps are as given, or for some 10 nodes an inch of the longer side, 24 at most.
+    """
     if every is None:
-        width, height = (n * h for n, h in zip(shape, spacing, strict=True))
+        width, height = (n * h for n, h in zip(grid.shape, grid.spacing, strict=True))
         cell = max(width, height) / min(24, max(4, 10.5 * side_in_inches(ax, (width, height))))
-        return tuple(max(1, round(cell / h)) for h in spacing)
-    steps = np.broadcast_to(np.asarray(every), (len(shape),))
-    if not np.issubdtype(steps.dtype, np.integer) or steps.min() < 1:
-        raise ValueError(f"every: got {every}; expected positive integers, one or {len(shape)}")
-    return tuple(int(s) for s in steps)
+        steps = tuple(max(1, round(cell / h)) for h in grid.spacing)
+    else:
+        given = np.broadcast_to(np.asarray(every), (grid.dimension,))
+        if not np.issubdtype(given.dtype, np.integer) or given.min() < 1:
+            raise ValueError(f"every: got {every}; expected positive integers, one or {grid.dimension}")
+        steps = tuple(given.tolist())
+    counts = [max(1, n // step) for n, step in zip(grid.shape, steps, strict=True)]
+    firsts = [(n - m * s) // 2 + s // 2 for n, m, s in zip(grid.shape, counts, steps, strict=True)]
+    return steps, tuple(slice(a, a + (m - 1) * s + 1, s) for a, m, s in zip(firsts, counts, steps, strict=True))
 
 
 def sensitivity(
@@ -163,8 +160,7 @@ def sensitivity(
     array = np.asarray(gradient, dtype=np.float64)
     if array.shape != (*grid.shape, 2, 2):
         raise ValueError(f"gradient: got shape {array.shape}; expected {(*grid.shape, 2, 2)}, as jax.grad returns it")
-    steps = node_steps(grid.shape, grid.spacing, every, ax)
-    pick = tuple(centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
+    steps, pick = nodes_drawn(grid, every, ax)
     inside = grid.inside[pick]
     matrices, centres = array[pick][inside], grid.nodes[pick][inside]
     if not np.isfinite(matrices).all():
