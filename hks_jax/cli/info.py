@@ -24,7 +24,7 @@ from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.mesh import is_mesh
 from hks_jax.io.repair import find_unsymmetric
-from hks_jax.io.units import MM2_PER_S, is_plausible
+from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
 from hks_jax.io.volume import digest
 
 DESCRIPTION = f"""\
@@ -186,10 +186,6 @@ def _times(d: int, volume: float, width2: float, size: float, nodes: int, proble
 
 def _lines(description: dict[str, Any]) -> list[str]:
     """Return the description as lines of text."""
-
-    def numbers(values: Any) -> str:
-        return " × ".join(f"{v:.5g}" for v in values)
-
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     words = next((words for words in WORDS.values() if words.simplices in description), None)
     if words is not None:
@@ -205,8 +201,8 @@ def _lines(description: dict[str, Any]) -> list[str]:
         length = f" {description['length_unit']}" if description["length_unit"] else ", in no declared unit"
         placed = "without an affine" if description["affine"] is None else "placed by an affine"
         lines += [
-            f"tensors         {numbers(description['shape'])}, {description['dtype']}, {placed}",
-            f"spacing         {numbers(description['spacing'])}{length}",
+            f"tensors         {by_axis(description['shape'])}, {description['dtype']}, {placed}",
+            f"spacing         {by_axis(description['spacing'])}{length}",
             f"order, frame    {description['order']}, {description['frame']} axes",
             *(f"                {as_options(note, READING)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",

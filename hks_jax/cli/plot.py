@@ -130,7 +130,7 @@ def _choose_times(saved: Saved, args: argparse.Namespace) -> np.ndarray:
 
 
 def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] | None) -> Any:
-    from hks_jax.cli.picture import LEAST_RANGE, bounding_box, orientation_of
+    from hks_jax.cli.picture import LEAST_RANGE, cropped, orientation_of
     from hks_jax.plot import hks_panels, middle_node
 
     values, grid, title, thin = saved.values, saved.grid, args.title, saved.place.slice_axis
@@ -149,9 +149,8 @@ def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] 
     drawn = inside & np.isfinite(values).all(axis=0)
     if not drawn.any():
         raise ValueError(f"--slice: no value of {args.result} is finite there; choose another")
-    box = bounding_box(drawn)
-    origin = [grid.origin[b] + grid.spacing[b] * part.start for b, part in zip(keep, box, strict=True)]
-    plane = Grid(drawn[box].shape, [grid.spacing[b] for b in keep], origin)
+    plane = Grid(drawn.shape, [grid.spacing[b] for b in keep], [grid.origin[b] for b in keep])
+    plane, box = cropped(plane, drawn)
     vmin, vmax = limits or (None, None)
     return hks_panels(
         np.where(drawn, values, np.nan)[:, *box],

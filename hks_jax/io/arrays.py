@@ -79,14 +79,14 @@ def write(
 ) -> None:
     """Write scalars and the place that they have; see `hks_jax.io.save`."""
     slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
-    write_npz(path, {**_place(volume), name: array, **slice_axis, **extra, "provenance": record})
+    write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})
 
 
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     """Write the arrays that `read_tensors` reads."""
     record = describe_tensors(volume, "matrix", "voxel", provenance)
     units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
-    content = {"tensors": volume.tensors, **_place(volume), "frame": "voxel", **units, "provenance": record}
+    content = {"tensors": volume.tensors, **place_of(volume), "frame": "voxel", **units, "provenance": record}
     write_npz(path, content)
 
 
@@ -96,7 +96,8 @@ def write_npz(path: Path, content: Mapping[str, Any]) -> None:
         np.savez_compressed(stream, **content)
 
 
-def _place(volume: TensorVolume) -> dict[str, Any]:
+def place_of(volume: TensorVolume) -> dict[str, Any]:
+    """Return the arrays that say where the voxels are, and which of them are inside."""
     optional = {"mask": volume.mask, "affine": volume.affine}
     given = {key: value for key, value in optional.items() if value is not None}
     return {"spacing": volume.spacing, "origin": volume.origin, **given}

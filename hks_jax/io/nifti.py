@@ -16,7 +16,7 @@ from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
-from hks_jax.io.units import scaled_beside
+from hks_jax.io.units import by_axis, scaled_beside
 from hks_jax.io.volume import TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
@@ -201,10 +201,10 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
         notes.append("the affine's axes are not orthogonal: the shear is ignored")
     stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
     if length_unit not in ("", "mm"):
-        notes.append(f"lengths in {length_unit}, as the file declares: voxels of {_sizes(stored)} are in mm here")
+        notes.append(f"lengths in {length_unit}, as the file declares: voxels of {by_axis(stored)} are in mm here")
     header = np.asarray(image.header.get_zooms()[:3], np.float64)
     if np.abs(header / stored - 1).max() > 1e-3:
-        notes.append(f"voxel sizes {_sizes(stored)} are those of the affine; the header's own are {_sizes(header)}")
+        notes.append(f"voxel sizes {by_axis(stored)} are those of the affine; the header's own are {by_axis(header)}")
     if open_frame and np.linalg.det(affine[:3, :3]) > 0:
         notes.append(OPEN_FRAME)
     notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
@@ -242,10 +242,6 @@ def placement_notes(image: Any) -> list[str]:
         f"the file places its voxels twice, by its sform (code {sform}) and its qform (code {qform}), up to "
         f"{apart:.3g} apart{', and one mirrors the other' * bool(mirrored)}: the sform is used"
     ]
-
-
-def _sizes(values: np.ndarray) -> str:
-    return " × ".join(f"{v:.5g}" for v in values)
 
 
 def write(
