@@ -1,6 +1,7 @@
 """The command line on files: what is in them, other formats, and scans to signatures."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,8 @@ import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.cli.job import Result
 from hks_jax.cli.outputs import write_outputs
-from hks_jax.cli.progress import Progress
+from hks_jax.cli.progress import OPTIONS, Progress, as_options
 from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.spelling import OPTIONS, as_options
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 
 SHAPE = (14, 12, 5)
@@ -298,7 +298,7 @@ def test_convert_fits_scans_and_refuses_what_cannot_be(scan, tmp_path, capsys):
     np.testing.assert_allclose(
         read_tensors(target).tensors[disc()], np.broadcast_to(D, (disc().sum(), 3, 3)), rtol=1e-4, atol=1e-12
     )
-    assert "expected a name that ends in .npz" in error_of(capsys, ["convert", str(target), str(tmp_path / "t.mif")])
+    assert "expected a name that ends in .nii.gz" in error_of(capsys, ["convert", str(target), str(tmp_path / "t.mif")])
     assert "is FILE itself" in error_of(capsys, ["convert", str(target), str(target)])
     before = sorted(tmp_path.iterdir())
     arguments = ["convert", str(target), str(tmp_path / "s.nii.gz"), "--slice", "z=9"]
@@ -339,14 +339,14 @@ def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library
     volume = replace(volume, tensors=volume.tensors.astype(np.float32))
     result = Result(volume, np.array([1.0, 2.0]), np.ones((2, *SHAPE)), np.arange(3.0), report)
     out = tmp_path / "out"
-    write_outputs(out, result, Progress(quiet=True), Path.touch, suffix, ["hks-jax", "hks"])
+    write_outputs(out, result, Progress(quiet=True), Path.touch, suffix)
     names = {f"hks{suffix}", "hks.npz", "hks.png", "report.json"} | ({"hks.json"} if suffix == ".nii.gz" else set())
     assert {file.name for file in out.iterdir()} == names
     assert b"hks-jax " in (out / f"hks{suffix}").read_bytes() or suffix != ".nrrd"  # headers are text
     with np.load(out / "hks.npz") as read:
         record = json.loads(str(read["provenance"]))
         assert read["hks"].dtype == np.float32  # as the tensors are
-    assert (record["command"], record["settings"], record["times"]) == (["hks-jax", "hks"], report["settings"], [1, 2])
+    assert (record["command"], record["settings"], record["times"]) == (sys.argv, report["settings"], [1, 2])
     assert record["source"] == str(tensors)
 
 

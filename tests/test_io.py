@@ -1,12 +1,12 @@
 """Files: what is written is what is read, by this package and by nibabel."""
 
-import builtins
 import gzip
 import hashlib
 import importlib.metadata
 import json
 import os
 import stat
+import sys
 
 import nibabel as nib
 import numpy as np
@@ -20,7 +20,6 @@ from dipy.segment.mask import median_otsu
 
 import hks_jax as hj
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, atomic_path, erode, find_example_brain, read_mask
-from hks_jax.io import nifti as nifti_module
 from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
 
 SHAPE = (4, 5, 6)
@@ -226,17 +225,21 @@ def test_an_image_that_is_no_tensor_image_is_refused(tmp_path):
         hj.io.read_tensors(tmp_path / "dwi.nii")
 
 
-def test_nifti_without_nibabel_names_the_extra(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without_nibabel(name, *args, **kwargs):
-        if name == "nibabel":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_nibabel)
-    with pytest.raises(ImportError, match=r'pip install "hks-jax\[dti\]"'):
-        hj.io.read_tensors(tmp_path / "t.nii")
+@pytest.mark.parametrize(
+    ("module", "name", "extra"),
+    [
+        ("nibabel", "t.nii", "dti"),
+        ("nrrd", "t.nrrd", "nrrd"),
+        ("vtkmodules.vtkIOXML", "t.vti", "vtk"),
+        ("meshio", "m.ply", "mesh"),
+    ],
+)
+def test_of_a_missing_library_the_extra_is_named(tmp_path, monkeypatch, module, name, extra):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_text("")
+    read = hj.io.read_mesh if extra == "mesh" else hj.io.read_tensors
+    with pytest.raises(ImportError, match=rf'pip install "hks-jax\[{extra}\]"'):
+        read(tmp_path / name)
 
 
 # ---------------------------------------------------------------------------------------------------- slices
@@ -381,7 +384,7 @@ def test_times_of_an_image_are_beside_it(tmp_path, volume):
 def test_results_that_cannot_be_saved(tmp_path, volume):
     with pytest.raises(ValueError, match=r"values: got shape \(5, 4, 6\); expected \(4, 5, 6\)"):
         hj.io.save(tmp_path / "v.npz", np.zeros((5, 4, 6)), volume)
-    with pytest.raises(ValueError, match=r"expected a name that ends in \.npz, \.nii\.gz, \.nii, \.nrrd, \.vti"):
+    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii\.gz, \.nii, \.nrrd, \.vti, \.npz"):
         hj.io.save(tmp_path / "v.txt", np.zeros(SHAPE), volume)
     with pytest.raises(ValueError, match="NIfTI has no place for more arrays"):
         hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"eigenvalues": [1]})
@@ -403,7 +406,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, volume, m
         target.write(b"half") if hasattr(target, "write") else target.write_bytes(b"half")
         raise OSError("disk full")
 
-    owner = np if name.endswith("npz") else nifti_module.nibabel()
+    owner = np if name.endswith("npz") else nib
     monkeypatch.setattr(owner, "savez_compressed" if name.endswith("npz") else "save", half)
     with pytest.raises(OSError, match="disk full"):
         hj.io.save(path, np.ones(SHAPE), volume)

@@ -1,7 +1,7 @@
 """Surfaces of equal value in volumes: where they are seen, and what is refused."""
 
-import builtins
 import importlib.util
+import sys
 
 import numpy as np
 import pytest
@@ -83,13 +83,6 @@ def test_bad_input_is_refused():
 
 
 def test_missing_pyvista_says_what_to_install(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.partition(".")[0] == "pyvista":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(ImportError, match=r'pip install "hks-jax\[pyvista\]"'):
         plot.isosurfaces(plot.new_figure(3, 2).subplots(), EGG, GRID)

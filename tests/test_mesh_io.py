@@ -1,6 +1,5 @@
 """Meshes: files that meshio and VTK wrote, against what meshio reads; values at vertices, read by meshio."""
 
-import builtins
 import json
 
 import numpy as np
@@ -243,17 +242,3 @@ def test_bad_meshes(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"expected \(6,\), or n_times before it"):
         save(tmp_path / "v.ply", np.zeros(7), mesh)
     assert capsys.readouterr().out == ""  # meshio's own reader prints, and ends the process
-
-
-def test_without_meshio_the_extra_is_named(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name == "meshio":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    (tmp_path / "m.ply").write_text("")
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r'pip install "hks-jax\[mesh\]"'):
-        read_mesh(tmp_path / "m.ply")

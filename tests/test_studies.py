@@ -29,7 +29,7 @@ from hks_jax.cli.study_times import Range, common_times, suitable_range
 from hks_jax.cli.subjects import read_subjects
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.components import component_of
-from hks_jax.io.labels import names_beside, read_names
+from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.pairs import pairs_of
 from hks_jax.io.tables import read_table, write_table
 
@@ -738,6 +738,6 @@ def test_pairs_that_were_kept_do_not_stand_beside_an_older_signature(tmp_path, m
     (out / "regions.tsv").write_text("not made of a signature")
     monkeypatch.setattr("hks_jax.cli.picture.draw", lambda result, path, **_: path.write_text("picture"))
     assert main(["hks", str(tmp_path / "one.nii.gz"), "-o", str(out), *options]) == 0
-    monkeypatch.setattr("hks_jax.cli.job.signature_of", None)
+    monkeypatch.setattr("hks_jax.cli.hks.signature_of", None)
     assert main(["hks", str(tmp_path / "two.nii.gz"), "-o", str(out), *options, "--save-pairs"]) == 1
     assert sorted(path.name for path in out.iterdir()) == ["pairs.npz", "regions.tsv"]

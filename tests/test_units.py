@@ -9,7 +9,7 @@ from annotations import unchecked
 
 from hks_jax.cli import main
 from hks_jax.io import TensorVolume, questions, read_mask, read_tensors, save, save_tensors
-from hks_jax.io.labels import read_labels
+from hks_jax.io.masks import read_labels
 from hks_jax.io.units import b_value_question, millimetres
 
 SHAPE = (8, 7, 5)

@@ -1,6 +1,5 @@
 """VTK image data: files that VTK wrote, against what VTK reads and where it puts the points."""
 
-import builtins
 import json
 
 import numpy as np
@@ -146,19 +145,6 @@ def test_damaged_files(tmp_path, tensors):
         read_tensors(tmp_path / "mesh.vtk")
 
 
-def test_without_vtk_the_extra_is_named(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.startswith("vtkmodules"):
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r'pip install "hks-jax\[vtk\]"'):
-        read_tensors(tmp_path / "t.vti")
-
-
 # ---------------------------------------------------------------------------------------------------- writing
 
 
@@ -215,7 +201,7 @@ def test_results_with_their_times(tmp_path, volume):
     np.testing.assert_array_equal(vtk_to_numpy(data.GetFieldData().GetArray("times")), [0.5, 2])
     record = json.loads(data.GetFieldData().GetAbstractArray("provenance").GetValue(0))
     assert (record["k"], record["software"]) == (7, f"hks-jax {hj.__version__}")
-    with pytest.raises(ValueError, match=r"written as \.vti"):
+    with pytest.raises(ValueError, match=r"unknown kind of file; expected .*\.vti"):
         save(tmp_path / "v.vtk", values, volume)
 
 

@@ -10,8 +10,7 @@ import pytest
 
 import hks_jax as hj
 from hks_jax.cli import main
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.tensor_order import ORDERS, pack
+from hks_jax.io.tensor_order import ORDERS, invalid_by_order, pack
 
 VOXEL = 1e-3 * np.array([[1.7, 0.3, 0.2], [0.3, 0.6, 0.1], [0.2, 0.1, 0.4]])
 """The tensor along the voxel axes, in mm²/s; every voxel has a multiple of it."""

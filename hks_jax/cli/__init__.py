@@ -14,7 +14,7 @@ import numpy as np
 from hks_jax import __version__
 from hks_jax.cache import keep_compiled
 from hks_jax.cli import batch, convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum, stats
-from hks_jax.cli.spelling import OPTIONS, as_options
+from hks_jax.cli.progress import OPTIONS, as_options
 
 EPILOG = """\
 examples:

@@ -41,10 +41,7 @@ def parse_slice(text: str) -> tuple[str, int]:
 def parse_repair(text: str) -> tuple[Repair, float | None]:
     """Read ``clip``, ``mask``, ``nearest``, or one of them with a floor, ``clip:1e-4``."""
     name, colon, number = text.partition(":")
-    try:
-        floor = float(number) if colon else None
-    except ValueError:
-        floor = math.nan
+    floor = _number(number) if colon else None
     if name not in REPAIRS or not (floor is None or 0 < floor < math.inf):
         raise ArgumentTypeError(f"got {text!r}; expected {', '.join(REPAIRS)}, or one with a floor, such as clip:1e-4")
     return cast(Repair, name), floor
@@ -53,16 +50,33 @@ def parse_repair(text: str) -> tuple[Repair, float | None]:
 def parse_positive(text: str) -> tuple[PositiveMap, float]:
     """Read ``exp:2e6`` or ``shift:5e6``."""
     name, _, number = text.partition(":")
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
+    value = _number(number)
     if name not in MAPS or not math.isfinite(value) or (name == "exp" and value <= 0):
         raise ArgumentTypeError(
             f"got {text!r}; expected exp:S for exp(T/S), or shift:C for T + C·I, with a number in the tensors' units, "
             "such as exp:2e6"
         )
     return cast(PositiveMap, name), value
+
+
+def parse_weight(text: str) -> float:
+    """Read a positive number."""
+    if not 0 < (weight := _number(text)) < math.inf:
+        raise ArgumentTypeError(f"got {text!r}; expected a positive number")
+    return weight
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def parse_numbers(text: str) -> tuple[float, ...]:
+    """Read finite numbers between commas; none where there is anything else."""
+    numbers = tuple(map(_number, text.split(",")))
+    return numbers if all(map(math.isfinite, numbers)) else ()
 
 
 def parse_voxel(text: str) -> tuple[int, int, int]:
@@ -98,10 +112,7 @@ def parse_times(words: list[str] | None) -> Times:
         if count.isdecimal() and int(count) >= 1:
             return Times((), int(count))
         pieces = [pieces[0]]
-    try:
-        times = tuple(float(piece) for piece in pieces)
-    except ValueError:
-        times = ()
+    times = tuple(map(_number, pieces))
     if not times or not all(0 < t < float("inf") for t in times):
         raise ValueError(f"--times: got {' '.join(words)!r}; expected positive numbers, or auto, or auto:N")
     return Times(tuple(sorted(times)), 0)

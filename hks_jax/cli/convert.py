@@ -1,20 +1,21 @@
 """``hks-jax convert FILE OUT``: tensors from any format that is read to any that is written."""
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.job import describe_input
+from hks_jax.cli.outputs import show_summary
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import add_arguments, read
 from hks_jax.io import find_invalid, save_tensors
-from hks_jax.io.save import SUFFIXES
+from hks_jax.io.formats import WRITTEN
 
 DESCRIPTION = f"""\
 Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT in the format of its suffix:
-{", ".join(SUFFIXES)}. Components are turned to the axes that the format has them in, which OUT says itself:
+{", ".join(WRITTEN)}. Components are turned to the axes that the format has them in, which OUT says itself:
 it needs neither --order nor --frame. Numbers are converted only from the unit that --unit says, to mm2/s.
 """
 
@@ -28,13 +29,8 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "convert",
-        help="write the tensors of a file in another format",
-        usage="%(prog)s FILE OUT [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "convert", "write the tensors of a file in another format", DESCRIPTION, EPILOG, "FILE OUT"
     )
     add_arguments(parser)
     parser.add_argument("output", metavar="OUT", type=Path, help="the file to write; an existing one is replaced")
@@ -44,8 +40,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
-    if not args.output.name.lower().endswith(SUFFIXES):
-        raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(SUFFIXES)}")
+    if not args.output.name.lower().endswith(WRITTEN):
+        raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(WRITTEN)}")
     if args.output.is_dir():
         raise IsADirectoryError(f"OUT: {args.output} is a folder; expected a file")
     if args.output.exists() and args.output.samefile(args.file):
@@ -59,11 +55,5 @@ def run(args: argparse.Namespace) -> None:
             progress.warn(f"{invalid} tensors are not positive definite and are written as they are; see --repair")
         with progress.stage("writing", str(args.output)):
             save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
-    if args.json:
-        from hks_jax.cli.job import describe_input
-        from hks_jax.cli.outputs import plain
 
-        report = {**describe_input(volume, volume.mask), "not_positive_definite": invalid, "files": [str(args.output)]}
-        print(json.dumps(plain(report), ensure_ascii=False))
-    elif not args.quiet:
-        print(args.output)
+    show_summary(args, [args.output], {**describe_input(volume, volume.mask), "not_positive_definite": invalid})

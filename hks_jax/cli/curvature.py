@@ -1,23 +1,26 @@
 """``hks-jax curvature FILE -o OUT``: the Gaussian curvature of a two-dimensional tensor field in a file."""
 
 import argparse
-import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hks_jax.cli.inputs import (
+    add_command,
     add_json_argument,
     add_tensor_arguments,
     add_view_argument,
     read_volume,
     require_metric,
 )
+from hks_jax.cli.job import describe_input, field_of
+from hks_jax.cli.outputs import check_folder, show_files, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
-from hks_jax.io import TensorVolume, atomic_folder, save
-from hks_jax.io.save import SUFFIXES
+from hks_jax.curvature import gaussian_curvature
+from hks_jax.io import TensorVolume, save
+from hks_jax.io.formats import WRITTEN
 
 if TYPE_CHECKING:
     from hks_jax.plot.orientation import View
@@ -41,13 +44,8 @@ COLOURED = 0.98
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "curvature",
-        help="compute the Gaussian curvature of a two-dimensional field",
-        usage="%(prog)s FILE -o OUT [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "curvature", "compute the Gaussian curvature of a 2D field", DESCRIPTION, EPILOG, "FILE -o OUT"
     )
     add_tensor_arguments(parser)
     parser.add_argument(
@@ -65,9 +63,6 @@ def run(args: argparse.Namespace) -> None:
         ValueError: tensors that have no Gaussian curvature that could be computed.
     """
     require_metric(args)
-    from hks_jax.cli.job import describe_input, field_of
-    from hks_jax.cli.outputs import check_folder, show_files, write_report
-    from hks_jax.curvature import gaussian_curvature
     from hks_jax.plot import save_figure
 
     check_folder(args.output)
@@ -104,15 +99,13 @@ def run(args: argparse.Namespace) -> None:
             },
         }
         volume = volume.with_mask(field.grid.mask)
-        stale = [args.output / f"curvature{suffix}" for suffix in SUFFIXES]
-        with progress.stage("writing", str(args.output)), atomic_folder(args.output, lambda: stale) as folder:
+        stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]
+        with writing(args.output, report, progress, lambda: stale) as (folder, files):
             save(folder / "curvature.npz", curvature, volume, name="curvature")
             if image := image_suffix(args.file):
                 save(folder / f"curvature{image}", curvature, volume, name="curvature")
             save_figure(draw(curvature, volume, args.view), folder / "curvature.png")
-            write_report(folder / "report.json", report, progress, sys.argv)
-            names = sorted(file.name for file in folder.iterdir())
-    show_files([args.output / name for name in names], args.quiet, args.json)
+    show_files(files, args.quiet, args.json)
 
 
 def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume, view: "View") -> Any:

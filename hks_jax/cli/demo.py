@@ -2,13 +2,15 @@
 
 import argparse
 import importlib.util
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.inputs import add_json_argument, add_view_argument
+from hks_jax.cli.arguments import Times
+from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
+from hks_jax.cli.job import Settings, compute
+from hks_jax.cli.outputs import check_folder, show_files, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
 
@@ -37,13 +39,7 @@ PHANTOM_SHAPE = (72, 80)
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "demo",
-        help="compute and draw the signature of a brain slice",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "demo", "compute and draw the signature of a brain slice", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="folder for the results (demo)")
     add("--phantom", action="store_true", help="use the phantom in any case")
@@ -54,9 +50,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
-    from hks_jax.cli.arguments import Times
-    from hks_jax.cli.job import Settings, compute
-    from hks_jax.cli.outputs import check_folder, show_files, write_outputs
     from hks_jax.cli.picture import draw
     from hks_jax.plot import number_text
 
@@ -94,7 +87,6 @@ def run(args: argparse.Namespace) -> None:
                 view=args.view,
             ),
             image="" if brain is None else ".nii.gz",
-            command=sys.argv,
         )
     if args.json:
         show_files(files, args.quiet, as_json=True)

@@ -3,15 +3,19 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.inputs import add_json_argument
-from hks_jax.cli.plot import read_saved
+from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.outputs import check_folder, show_summary, signature_file
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.saved import About as About
+from hks_jax.cli.saved import Place as Place
+from hks_jax.cli.saved import read_saved
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.io.masks import read_labels, read_names
 from hks_jax.npz import load_npz
 
 DESCRIPTION = """\
@@ -31,13 +35,7 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "explore",
-        help="write a page to explore a signature in a browser",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "explore", "write a page to explore a signature in a browser", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("result", metavar="OUT", type=Path, help="the folder that 'hks-jax hks' wrote, or an .npz from there")
     add("-o", "--output", metavar="PAGE", type=Path, help="the page (default: explore.html in OUT)")
@@ -61,8 +59,6 @@ def run(args: argparse.Namespace) -> None:
         FileNotFoundError: no such result, labels or names.
         ValueError: a result that cannot be shown, or labels that do not fit it.
     """
-    from hks_jax.cli.outputs import check_folder, signature_file
-    from hks_jax.io.labels import read_labels, read_names
     from hks_jax.plot import explore
 
     source = signature_file(args.result)
@@ -101,10 +97,7 @@ def run(args: argparse.Namespace) -> None:
                 length_unit="" if place.affine is None else "mm",
                 world=place.world,
             )
-    if args.json:
-        print(json.dumps({"source": str(source), "times": times.tolist(), "files": [str(page)]}))
-    elif not args.quiet:
-        print(page)
+    show_summary(args, [page], {"source": str(source), "times": times.tolist()})
 
 
 def _read(source: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, Grid | SurfaceMesh]:
@@ -113,51 +106,9 @@ def _read(source: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
         raise ValueError(f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu beside it")
     if "faces" in arrays and {"hks", "times", "vertices"} <= set(arrays):
         return arrays["hks"], arrays["times"], SurfaceMesh(arrays["vertices"], arrays["faces"])
-    saved = read_saved(source, "hks")
-    if saved.times is None:
-        raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
+    saved = read_saved(source, "hks", over_times=True)
+    assert saved.times is not None
     return saved.values, saved.times, saved.grid
-
-
-class Place(NamedTuple):
-    """Where the grid lies in space: the affine of its volume, the axis that it cuts, and what its indices become."""
-
-    affine: np.ndarray | None
-    slice_axis: int | None
-    world: np.ndarray | None
-
-    @classmethod
-    def of(cls, arrays: dict[str, np.ndarray], dimension: int) -> "Place":
-        """Return where the grid of a saved result lies."""
-        affine = arrays.get("affine")
-        slice_axis = int(arrays["slice_axis"]) if "slice_axis" in arrays else None
-        if affine is None:
-            return cls(None, slice_axis, None)
-        thin = 2 if slice_axis is None else slice_axis
-        return cls(affine, slice_axis, affine[:3, [a for a in range(4) if dimension == 3 or a != thin]])
-
-
-class About(NamedTuple):
-    """What the result says of its origin."""
-
-    settings: dict[str, Any]
-    title: str
-    unit: str
-    cut: str
-    k: int | None
-
-    @classmethod
-    def of(cls, arrays: dict[str, np.ndarray]) -> "About":
-        """Return what a saved result says."""
-        record = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
-        settings = record.get("settings") or {}
-        # Fitted tensors are in mm²/s, and their grids in mm.
-        seconds = record.get("order") == "fit" and settings.get("metric") == "inverse"
-        k = len(arrays["eigenvalues"]) if "eigenvalues" in arrays else None
-        cuts = [
-            note.partition(":")[0].removeprefix("slice ") for note in record.get("notes", ()) if "slice " in note[:6]
-        ]
-        return cls(settings, Path(record.get("source") or "").name, "s" if seconds else "", "".join(cuts[-1:]), k)
 
 
 def _spread(tensors: np.ndarray | None, values: np.ndarray, times: np.ndarray, about: About) -> np.ndarray | None:

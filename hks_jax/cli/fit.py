@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.cli.arguments import NATURAL, parse_boundary, recorded_boundary, unreached_sides
-from hks_jax.cli.explore import About
-from hks_jax.cli.inputs import add_interpolation_argument, add_json_argument, add_view_argument
+from hks_jax.cli.arguments import NATURAL, parse_boundary, parse_weight, recorded_boundary, unreached_sides
+from hks_jax.cli.inputs import add_command, add_interpolation_argument, add_json_argument, add_view_argument
+from hks_jax.cli.job import ComputationError, use_dtype
+from hks_jax.cli.outputs import check_folder, show_files, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import FILES, image_suffix
+from hks_jax.cli.saved import About, read_saved
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.io import ORDERS, TensorVolume, atomic_folder, read_tensors, save, save_tensors
-from hks_jax.io.masks import as_mask
-from hks_jax.io.provenance import digest
-from hks_jax.npz import load_npz
+from hks_jax.io import ORDERS, TensorVolume, read_tensors, save, save_tensors
+from hks_jax.io.volume import as_mask, digest
 
 if TYPE_CHECKING:
-    from hks_jax.domain.grid import Grid
-    from hks_jax.domain.tensor_field import TensorField
     from hks_jax.inverse.metric_fit import MetricFit
 
 DESCRIPTION = """\
@@ -40,7 +40,6 @@ example:
   hks-jax fit out/hks.npz -o fitted --parametrisation conformal --noise 0.01 --h1 1e-4 --checkpoint fit.part.npz
 """
 
-REQUIRED = ("hks", "times", "spacing", "origin")
 PARAMETRISATIONS = ("log-euclidean", "cholesky", "conformal", "eigenvalues", "rotation")
 OPTIMISERS = ("gauss-newton", "lbfgs", "bfgs")
 """As in `hks_jax.inverse`, which is slow to import: a test keeps them the same."""
@@ -64,13 +63,7 @@ class Target(NamedTuple):
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "fit",
-        help="find the metric that has a given signature",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "fit", "find the metric that has a given signature", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("target", metavar="TARGET", type=Path, help="the signature: .npz")
     add("-o", "--output", metavar="OUT", type=Path, required=True, help="folder for the results")
@@ -114,8 +107,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="length, in units of the spacing, below which steps are smooth (default a tenth of the domain, and 0 for "
         "conformal without --noise)",
     )
-    add("--h1", type=_weight, metavar="WEIGHT", help="penalise slopes: ½ WEIGHT · mean |∇p|² of the parameters p")
-    add("--tv", type=_weight, metavar="WEIGHT", help="penalise total variation, which keeps edges sharp")
+    add("--h1", type=parse_weight, metavar="WEIGHT", help="penalise slopes: ½ WEIGHT · mean |∇p|² of the parameters p")
+    add("--tv", type=parse_weight, metavar="WEIGHT", help="penalise total variation, which keeps edges sharp")
     add("--max-steps", type=int, default=50, metavar="N", help="steps per stage (default 50)")
     add("--continuation", type=int, default=1, metavar="N", help="stages, large times first (default 1)")
     add("--starts", type=int, default=1, metavar="N", help="starts, from random changes of --init (default 1)")
@@ -142,8 +135,6 @@ def run(args: argparse.Namespace) -> None:
             "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors D, which are no metric"
         )
 
-    from hks_jax.cli.job import ComputationError, use_dtype
-    from hks_jax.cli.outputs import check_folder, show_files
     from hks_jax.inverse.fit import fit_metric
     from hks_jax.inverse.metric_fit import RESULTS
     from hks_jax.inverse.regulariser import H1, Regulariser, TotalVariation
@@ -202,50 +193,24 @@ def read_target(path: Path) -> Target:
         FileNotFoundError: no such file.
         ValueError: no npz; arrays that are missing, not real numbers, or of shapes that disagree.
     """
-    arrays = load_npz(path)
-    missing = [name for name in REQUIRED if name not in arrays]
-    if missing:
-        raise ValueError(
-            f"{path}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {', '.join(REQUIRED)} and, "
-            f"optional, mask, affine. Add {', '.join(missing)}"
-        )
-    for name in REQUIRED:
-        if arrays[name].dtype.kind not in "fiu":
-            raise ValueError(f"{path}: {name}: got dtype {arrays[name].dtype}; expected real numbers")
-    values, times = arrays["hks"].astype(np.float64), arrays["times"].astype(np.float64)
-    if values.ndim not in (3, 4) or times.shape != values.shape[:1]:
-        raise ValueError(
-            f"{path}: got hks of shape {values.shape} and times of shape {times.shape}; expected (n_times, nx, ny) or "
-            "(n_times, nx, ny, nz), and (n_times,)"
-        )
-    d, mask, affine = values.ndim - 1, arrays.get("mask"), arrays.get("affine")
+    saved = read_saved(path, "hks", over_times=True)
+    assert saved.times is not None
+    arrays, d = saved.arrays, saved.grid.dimension
     volume = TensorVolume(
-        np.broadcast_to(np.eye(d), (*values.shape[1:], d, d)),
-        tuple(arrays["spacing"].astype(float).ravel().tolist()),
-        tuple(arrays["origin"].astype(float).ravel().tolist()),
-        None if mask is None else as_mask(f"{path}: mask", mask),
-        None if affine is None else np.asarray(affine, np.float64),
+        np.broadcast_to(np.eye(d), (*saved.grid.shape, d, d)),
+        saved.grid.spacing,
+        saved.grid.origin,
+        as_mask("mask", arrays["mask"]) if "mask" in arrays else None,
+        None if saved.place.affine is None else saved.place.affine.astype(np.float64),
         int(arrays["slice_axis"]) if "slice_axis" in arrays else None,
         source=str(path),
         digest=digest(path),
     )
-    return Target(values, times, volume, recorded_boundary(About.of(arrays).settings))
+    return Target(saved.values, saved.times, volume, recorded_boundary(About.of(arrays).settings))
 
 
-def _weight(text: str) -> float:
-    """Read a positive number."""
-    try:
-        weight = float(text)
-    except ValueError:
-        weight = math.nan
-    if not 0 < weight < math.inf:
-        raise argparse.ArgumentTypeError(f"got {text!r}; expected a positive number")
-    return weight
-
-
-def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: Progress) -> "TensorField":
+def _initial(args: argparse.Namespace, target: Target, grid: Grid, progress: Progress) -> TensorField:
     """Return the field to start from, on the target's grid."""
-    from hks_jax.domain.tensor_field import TensorField
 
     if args.init is None:
         return TensorField(grid, target.volume.tensors.astype(args.dtype), args.interpolation)
@@ -275,7 +240,6 @@ def _initial(args: argparse.Namespace, target: Target, grid: "Grid", progress: P
 
 def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress: Progress) -> list[Path]:
     """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json; return their paths."""
-    from hks_jax.cli.outputs import write_report
     from hks_jax.cli.picture import placed
     from hks_jax.plot import fit_panels, save_figure
 
@@ -286,9 +250,8 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
         "stages": [step.stage for step in fit.history],
         "starts": [step.start for step in fit.history],
     }
-    stale = [args.output / "fit.png"]
-    with progress.stage("writing", str(args.output)), atomic_folder(args.output, lambda: stale) as folder:
-        report = _report(args, fit, target)
+    report, stale = _report(args, fit, target), [args.output / "fit.png"]
+    with writing(args.output, report, progress, lambda: stale) as (folder, files):
         origin = {"command": sys.argv, "settings": report["settings"]}
         save_tensors(folder / "tensors.npz", volume, provenance=origin)
         extra = {"times": target.times, **{name: np.asarray(array) for name, array in history.items()}}
@@ -296,9 +259,7 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Target, progress:
         if volume.dimension == 2:
             orientation = placed(volume, [slice(0, n) for n in volume.shape], args.view)
             save_figure(fit_panels(fit, target.values, target.times, orientation=orientation), folder / "fit.png")
-        write_report(folder / "report.json", report, progress, sys.argv)
-        names = sorted(file.name for file in folder.iterdir())
-    return [args.output / name for name in names]
+    return files
 
 
 def _report(args: argparse.Namespace, fit: "MetricFit", target: Target) -> dict[str, Any]:

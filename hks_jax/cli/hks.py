@@ -1,17 +1,19 @@
 """``hks-jax hks FILE -o OUT``: the heat kernel signature of a tensor field in a file."""
 
 import argparse
-import sys
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from hks_jax.cli import saved_pairs
 from hks_jax.cli.arguments import Times, parse_times, parse_voxel
 from hks_jax.cli.inputs import (
     add_clean_argument,
+    add_command,
     add_eigenpair_arguments,
     add_json_argument,
     add_tensor_arguments,
@@ -20,14 +22,14 @@ from hks_jax.cli.inputs import (
     require_metric,
     require_spectral,
 )
+from hks_jax.cli.job import Settings, compute_on_mesh, compute_pairs, signature_of
+from hks_jax.cli.noise import error_bars, noise_of, with_error_bars
+from hks_jax.cli.outputs import PAIRS, check_folder, of_earlier, show_files, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.io import TensorVolume
 from hks_jax.io.mesh import is_mesh
-
-if TYPE_CHECKING:
-    from hks_jax.cli.job import Settings
 
 DESCRIPTION = """\
 Compute the heat kernel signature of a field of diffusion tensors. FILE holds one of
@@ -54,13 +56,8 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "hks",
-        help="compute the signature of a tensor field in a file",
-        usage="%(prog)s FILE -o OUT [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "hks", "compute the signature of a tensor field in a file", DESCRIPTION, EPILOG, "FILE -o OUT"
     )
     add = parser.add_argument
     add_tensor_arguments(parser)
@@ -132,30 +129,18 @@ def add_noise_arguments(parser: argparse.ArgumentParser) -> None:
     add("--draws", type=int, default=16, metavar="N", help="noisy maps that error bars are made of (default 16)")
 
 
-def settings_of(args: argparse.Namespace, times: Times, metric: MetricChoice | None) -> "Settings":
+def settings_of(args: argparse.Namespace, times: Times, metric: MetricChoice | None) -> Settings:
     """Return what the arguments ask for."""
-    from hks_jax.cli.job import Settings
 
-    return Settings(
-        metric=metric,
-        interpolation=args.interpolation,
-        k=args.k,
-        boundary=args.boundary,
-        times=times,
-        components=args.components,
-        solver=args.solver,
-        normalisation=args.normalisation,
-        method=args.method,
-        dtype=args.dtype,
-    )
+    given = {field.name: getattr(args, field.name) for field in fields(Settings) if field.name in args}
+    return Settings(**given | {"metric": metric, "times": times})
 
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     times = parse_times(args.times)
-    from hks_jax.cli.saved_pairs import is_saved_pairs
 
-    on_mesh, saved = is_mesh(args.file), is_saved_pairs(args.file)
+    on_mesh, saved = is_mesh(args.file), saved_pairs.is_saved_pairs(args.file)
     if args.clean and not on_mesh:
         raise ValueError("--clean: it is for meshes; leave it out for tensors on a grid, and see --repair")
     if args.noise is not None and (on_mesh or saved):
@@ -166,10 +151,6 @@ def run(args: argparse.Namespace) -> None:
     if not (on_mesh or saved):
         require_metric(args)
     from hks_jax.cli import mesh as meshes
-    from hks_jax.cli import saved_pairs
-    from hks_jax.cli.job import compute_on_mesh, compute_pairs, signature_of
-    from hks_jax.cli.noise import error_bars, noise_of, with_error_bars
-    from hks_jax.cli.outputs import PAIRS, check_folder, of_earlier, show_files, write_outputs
     from hks_jax.cli.picture import draw, draw_volume
 
     if on_mesh:
@@ -210,7 +191,7 @@ def run(args: argparse.Namespace) -> None:
                 result = with_error_bars(result, bars, args.noise)
             flat = volume.dimension == 2
             draw_to = partial(draw if flat else partial(draw_volume, through=args.through), result, view=args.view)
-        files = write_outputs(args.output, result, progress, draw=draw_to, image=image, command=sys.argv)
+        files = write_outputs(args.output, result, progress, draw=draw_to, image=image)
     show_files(files, args.quiet, args.json)
 
 

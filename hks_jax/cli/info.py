@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from hks_jax.cli.arguments import DEFAULT_K, LAST, MEAN, RESOLVED, default_boundary, n_problems
-from hks_jax.cli.inputs import add_clean_argument
-from hks_jax.cli.progress import Progress
+from hks_jax.cli.inputs import add_clean_argument, add_command
+from hks_jax.cli.progress import READING, Progress, as_options
 from hks_jax.cli.reading import add_arguments, read
-from hks_jax.cli.spelling import READING, as_options
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.tensor_checks import MANY
@@ -24,9 +23,9 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.mesh import is_mesh
-from hks_jax.io.provenance import digest
 from hks_jax.io.repair import find_unsymmetric
-from hks_jax.io.units import MM2_PER_S, is_plausible
+from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
+from hks_jax.io.volume import digest
 
 DESCRIPTION = f"""\
 Say what is in a file of tensors: shape, order of components and how it was determined, frame, units, mask and its
@@ -47,13 +46,8 @@ COARSE = 6.0
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "info",
-        help="say what is in a file, and which k and t would suit it",
-        usage="%(prog)s FILE [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "info", "say what is in a file, and which k and t would suit it", DESCRIPTION, EPILOG, "FILE"
     )
     add_arguments(parser)
     add_clean_argument(parser)
@@ -192,10 +186,6 @@ def _times(d: int, volume: float, width2: float, size: float, nodes: int, proble
 
 def _lines(description: dict[str, Any]) -> list[str]:
     """Return the description as lines of text."""
-
-    def numbers(values: Any) -> str:
-        return " × ".join(f"{v:.5g}" for v in values)
-
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     words = next((words for words in WORDS.values() if words.simplices in description), None)
     if words is not None:
@@ -211,8 +201,8 @@ def _lines(description: dict[str, Any]) -> list[str]:
         length = f" {description['length_unit']}" if description["length_unit"] else ", in no declared unit"
         placed = "without an affine" if description["affine"] is None else "placed by an affine"
         lines += [
-            f"tensors         {numbers(description['shape'])}, {description['dtype']}, {placed}",
-            f"spacing         {numbers(description['spacing'])}{length}",
+            f"tensors         {by_axis(description['shape'])}, {description['dtype']}, {placed}",
+            f"spacing         {by_axis(description['spacing'])}{length}",
             f"order, frame    {description['order']}, {description['frame']} axes",
             *(f"                {as_options(note, READING)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",

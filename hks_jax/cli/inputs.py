@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from hks_jax.cli.arguments import parse_boundary
 from hks_jax.cli.progress import Progress
@@ -9,6 +10,30 @@ from hks_jax.cli.reading import add_file_argument, add_options, image_suffix, re
 from hks_jax.eigen.automatic import SOLVERS
 from hks_jax.io import TensorVolume
 from hks_jax.io.repair import require_valid
+
+
+def add_command(
+    subparsers: Any, name: str, summary: str, description: str, examples: str, usage: str = ""
+) -> argparse.ArgumentParser:
+    """Add a subcommand's parser, whose help keeps the lines of its texts.
+
+    Args:
+        subparsers: what it is added to.
+        name: of the subcommand.
+        summary: what it does, in one line.
+        description: what it does, reads and writes.
+        examples: what ends the help.
+        usage: the arguments that a line of usage names before the options; empty for a line of all options.
+    """
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        name,
+        help=summary,
+        usage=f"%(prog)s {usage} [options]" if usage else None,
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    return parser
 
 
 def add_tensor_arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,9 +18,9 @@ from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN
-from hks_jax.io.provenance import digest
 from hks_jax.io.repair import require_valid
 from hks_jax.io.tensor_order import unpack
+from hks_jax.io.volume import digest
 from hks_jax.plot import new_figure, number_text, save_figure, surface
 
 _OF_GRIDS = {

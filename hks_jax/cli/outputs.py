@@ -1,12 +1,15 @@
 """What a job leaves in its folder: all of it or nothing."""
 
+import argparse
 import importlib.metadata
 import json
 import math
 import os
 import platform
+import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,17 +74,39 @@ def _are_pairs(path: Path, eigenvalues: np.ndarray) -> bool:
 
 
 def write_outputs(
-    folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], image: str, command: list[str]
+    folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], image: str
 ) -> list[Path]:
     """Write hks.npz, hks.png (by `draw`), report.json and, unless its suffix is empty, an image; return their paths."""
     stale = partial(of_earlier, folder, result.eigenvalues, progress)
-    with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
-        origin = {"command": command, "settings": plain(result.report["settings"]), "times": result.times}
+    with writing(folder, result.report, progress, stale) as (temporary, files):
+        origin = {"command": sys.argv, "settings": plain(result.report["settings"]), "times": result.times}
         save_result(temporary / SIGNATURE, result, image, origin)
         draw(temporary / f"{SIGNATURE}.png")
-        write_report(temporary / REPORT, result.report, progress, command)
-        names = sorted(file.name for file in temporary.iterdir())
-    return [folder / name for name in names]
+    return files
+
+
+@contextmanager
+def writing(
+    folder: Path,
+    report: dict[str, Any],
+    progress: Progress,
+    stale: Callable[[], Iterable[Path]] = tuple,
+) -> Iterator[tuple[Path, list[Path]]]:
+    """Yield a temporary folder, and a list that has the paths of the results at the end.
+
+    At the end report.json is written beside the other files, and all of them move to `folder`, or none of them does.
+
+    Args:
+        folder: for the results.
+        report: what report.json says.
+        progress: what says that they are written.
+        stale: returns the files of earlier results that the new ones take away.
+    """
+    files = list[Path]()
+    with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
+        yield temporary, files
+        write_report(temporary / REPORT, report, progress)
+        files += sorted(folder / file.name for file in temporary.iterdir())
 
 
 def save_result(
@@ -111,10 +136,10 @@ def as_precise_as_the_data(result: Result) -> np.ndarray:
     return result.values.astype(np.float32) if single else result.values
 
 
-def write_report(path: Path, report: dict[str, Any], progress: Progress, command: list[str]) -> None:
+def write_report(path: Path, report: dict[str, Any], progress: Progress) -> None:
     """Write a report as JSON, with the command before it, and warnings, versions and seconds of each stage after it."""
     whole = {
-        "command": command,
+        "command": sys.argv,
         **report,
         "warnings": progress.warnings,
         "versions": versions(),
@@ -134,6 +159,14 @@ def show_files(files: list[Path], quiet: bool, as_json: bool) -> None:
         print("\n".join(map(str, files)))
 
 
+def show_summary(args: argparse.Namespace, files: list[Path], summary: dict[str, Any]) -> None:
+    """Print the files' names, or a summary as JSON together with the names, as the arguments ask."""
+    if args.json:
+        print(json.dumps(plain({**summary, "files": [str(file) for file in files]}), ensure_ascii=False))
+    elif not args.quiet:
+        print("\n".join(map(str, files)))
+
+
 def versions() -> dict[str, str]:
     """Return the versions of what took part, and the device."""
     import jax
@@ -143,20 +176,8 @@ def versions() -> dict[str, str]:
         "system": platform.platform(),
         "device": jax.devices()[0].device_kind,
     }
-    for package in (
-        "hks-jax",
-        "jax",
-        "jaxlib",
-        "optimistix",
-        "numpy",
-        "scipy",
-        "matplotlib",
-        "nibabel",
-        "dipy",
-        "pynrrd",
-        "vtk",
-        "meshio",
-    ):
+    optional = "optimistix numpy scipy matplotlib nibabel dipy pynrrd vtk meshio"
+    for package in ("hks-jax", "jax", "jaxlib", *optional.split()):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:

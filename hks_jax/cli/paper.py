@@ -5,7 +5,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.job import use_dtype
+from hks_jax.cli.outputs import check_folder, plain, versions
 from hks_jax.cli.progress import Progress
 
 EPILOG = """\
@@ -17,13 +19,13 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "paper",
-        help="reproduce the paper's table and figures",
-        description="Reproduce Table 1 and Figures 1 to 6 of Zobel, Reininghaus and Hotz, and count the triangles of a "
+        "reproduce the paper's table and figures",
+        "Reproduce Table 1 and Figures 1 to 6 of Zobel, Reininghaus and Hotz, and count the triangles of a "
         "remark: tables and PNG pictures.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        EPILOG,
     )
     add = parser.add_argument
     add("-o", "--output", metavar="OUT", type=Path, default=Path("paper"), help="folder for the results (paper)")
@@ -35,8 +37,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
-    from hks_jax.cli.job import use_dtype
-    from hks_jax.cli.outputs import check_folder, plain, versions
 
     check_folder(args.output)
     use_dtype("float64")

@@ -147,7 +147,7 @@ def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) 
     return tuple(voxels[np.argmin(np.sum((voxels - voxel) ** 2, axis=1))].tolist())
 
 
-def cropped(volume: TensorVolume, inside: Bool[np.ndarray, "*shape"]) -> tuple[Grid, tuple[slice, ...]]:
+def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> tuple[Grid, tuple[slice, ...]]:
     """Return the grid of the domain's bounding box, without a mask, and the slices that cut the box out."""
     box = bounding_box(inside)
     origin = [o + h * part.start for o, h, part in zip(volume.origin, volume.spacing, box, strict=True)]

@@ -1,20 +1,19 @@
 """``hks-jax plot RESULT -o PICTURE``: pictures of results that are in files."""
 
 import argparse
-import json
-import math
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from hks_jax.cli.arguments import RESOLVED, parse_slice, parse_times
-from hks_jax.cli.inputs import add_json_argument, add_view_argument
+from hks_jax.cli.arguments import RESOLVED, parse_numbers, parse_slice, parse_times
+from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
+from hks_jax.cli.outputs import check_folder, show_summary
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.saved import NAMES, Saved
+from hks_jax.cli.saved import read_saved as read_saved
 from hks_jax.domain.grid import Grid
-from hks_jax.npz import load_npz
 
 DESCRIPTION = """\
 Draw a result that 'hks-jax hks', 'fit' or 'curvature' has written as npz: an image for each time, or with --points a
@@ -27,41 +26,13 @@ examples:
   hks-jax plot out/hks.npz -o curves.pdf --points -22,5 24,5 --unit s --scaled
 """
 
-NAMES = ("hks", "curvature")
 MANY = 12
 """Images at most, unless times are chosen."""
 
 
-class Saved(NamedTuple):
-    """A result as it was saved.
-
-    Attributes:
-        values: (n_times, *shape).
-        times: (n_times,), or None for a result without.
-        grid: the grid, with the mask.
-        eigenvalues: (k,), where they were saved.
-        affine: (4, 4), from the nodes' indices to space, where that was saved; of a slice that of a volume one voxel
-            thick.
-        slice_axis: the axis of the volume that a slice cuts; None for a volume.
-    """
-
-    values: Float[np.ndarray, "n_times *shape"]
-    times: Float[np.ndarray, " n_times"] | None
-    grid: Grid
-    eigenvalues: Float[np.ndarray, " k"] | None
-    affine: Float[np.ndarray, "4 4"] | None
-    slice_axis: int | None
-
-
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "plot",
-        help="draw a result that is in a file",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "plot", "draw a result that is in a file", DESCRIPTION, EPILOG)
     # What begins with a minus and a digit is a point, such as -20,35, and no option.
     parser._negative_number_matcher = re.compile(r"-[\d.]")
     add = parser.add_argument
@@ -108,7 +79,6 @@ def run(args: argparse.Namespace) -> None:
     """
     from matplotlib import colormaps
 
-    from hks_jax.cli.outputs import check_folder
     from hks_jax.plot import new_figure, save_figure
 
     limits = _limits(args.range)
@@ -129,51 +99,10 @@ def run(args: argparse.Namespace) -> None:
         saved = saved._replace(values=saved.values[chosen], times=None if saved.times is None else saved.times[chosen])
         figure = _panels(saved, args, limits) if args.points is None else _curves(saved, args)
         save_figure(figure, args.output, dpi=args.dpi)
-    if args.json:
-        times = [] if saved.times is None else saved.times.tolist()
-        finite = saved.values[np.isfinite(saved.values)]
-        summary = {"least": float(finite.min()), "greatest": float(finite.max())}
-        print(json.dumps({"source": str(args.result), "times": times, "values": summary, "files": [str(args.output)]}))
-    elif not args.quiet:
-        print(args.output)
-
-
-def read_saved(path: Path, name: str | None = None) -> Saved:
-    """Read a result on a grid.
-
-    Args:
-        path: the npz.
-        name: the array; None: the first of `NAMES` that is there.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no npz; arrays that are missing or of shapes that disagree.
-    """
-    arrays = load_npz(path)
-    chosen = next((n for n in NAMES if n in arrays), None) if name is None else name
-    lacking = [n for n in (chosen, "spacing", "origin") if n not in arrays]
-    if chosen is None or lacking:
-        expected = " or ".join(NAMES) if name is None else name
-        raise ValueError(
-            f"{path}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {expected}, spacing and origin, "
-            "as 'hks-jax hks' and 'hks-jax curvature' write them"
-        )
-    values, spacing = np.asarray(arrays[chosen]), np.atleast_1d(arrays["spacing"])
-    if values.dtype.kind not in "fiu" or values.ndim - spacing.size not in (0, 1) or spacing.size not in (2, 3):
-        raise ValueError(
-            f"{path}: got {chosen} of shape {values.shape}, dtype {values.dtype}, and spacing of shape "
-            f"{spacing.shape}; expected real numbers, one per node or (n_times, *shape)"
-        )
-    times = None
-    if values.ndim > spacing.size:
-        times = np.asarray(arrays.get("times", np.arange(len(values))), dtype=np.float64)
-        if times.shape != values.shape[:1]:
-            raise ValueError(f"{path}: got {chosen} of shape {values.shape} and times of shape {times.shape}")
-    shape = values.shape[values.ndim - spacing.size :]
-    grid = Grid(shape, spacing.tolist(), arrays["origin"].tolist(), arrays.get("mask"), "all")
-    values = values.reshape(-1, *grid.shape).astype(np.float64)
-    cut = None if grid.dimension == 3 else int(arrays.get("slice_axis", 2))
-    return Saved(values, times, grid, arrays.get("eigenvalues"), arrays.get("affine"), cut)
+    finite = saved.values[np.isfinite(saved.values)]
+    values = {"least": float(finite.min()), "greatest": float(finite.max())}
+    times = [] if saved.times is None else saved.times.tolist()
+    show_summary(args, [args.output], {"source": str(args.result), "times": times, "values": values})
 
 
 def _choose_times(saved: Saved, args: argparse.Namespace) -> np.ndarray:
@@ -201,10 +130,10 @@ def _choose_times(saved: Saved, args: argparse.Namespace) -> np.ndarray:
 
 
 def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] | None) -> Any:
-    from hks_jax.cli.picture import LEAST_RANGE, bounding_box, orientation_of
+    from hks_jax.cli.picture import LEAST_RANGE, cropped, orientation_of
     from hks_jax.plot import hks_panels, middle_node
 
-    values, grid, title, thin = saved.values, saved.grid, args.title, saved.slice_axis
+    values, grid, title, thin = saved.values, saved.grid, args.title, saved.place.slice_axis
     if grid.dimension == 3:
         axis, index = args.slice or ("z", middle_node(grid.inside)[2])
         a = thin = "xyz".index(axis)
@@ -220,9 +149,8 @@ def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] 
     drawn = inside & np.isfinite(values).all(axis=0)
     if not drawn.any():
         raise ValueError(f"--slice: no value of {args.result} is finite there; choose another")
-    box = bounding_box(drawn)
-    origin = [grid.origin[b] + grid.spacing[b] * part.start for b, part in zip(keep, box, strict=True)]
-    plane = Grid(drawn[box].shape, [grid.spacing[b] for b in keep], origin)
+    plane = Grid(drawn.shape, [grid.spacing[b] for b in keep], [grid.origin[b] for b in keep])
+    plane, box = cropped(plane, drawn)
     vmin, vmax = limits or (None, None)
     return hks_panels(
         np.where(drawn, values, np.nan)[:, *box],
@@ -237,7 +165,7 @@ def _panels(saved: Saved, args: argparse.Namespace, limits: tuple[float, float] 
         quantiles=args.quantiles,
         least_range=LEAST_RANGE,
         suptitle=title,
-        orientation=None if saved.affine is None else orientation_of(saved.affine, thin, box, args.view),
+        orientation=None if saved.place.affine is None else orientation_of(saved.place.affine, thin, box, args.view),
     )
 
 
@@ -246,14 +174,14 @@ def _curves(saved: Saved, args: argparse.Namespace) -> Any:
 
     assert saved.times is not None
     values, grid = saved.values, saved.grid
-    if saved.affine is not None:  # points have the coordinates that the images show
-        orientation = Orientation.of(saved.affine, saved.slice_axis)
+    if saved.place.affine is not None:  # points have the coordinates that the images show
+        orientation = Orientation.of(saved.place.affine, saved.place.slice_axis)
         values, grid = orientation.array(values), orientation.grid(grid)
     d, limit = grid.dimension, None
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates each")
-    if saved.eigenvalues is not None:
-        limit = RESOLVED[d] / float(saved.eigenvalues[-1])
+    if "eigenvalues" in saved.arrays:
+        limit = RESOLVED[d] / float(saved.arrays["eigenvalues"][-1])
     figure = new_figure(5.4, 4.0)
     hks_curves(
         figure.subplots(),
@@ -271,24 +199,16 @@ def _curves(saved: Saved, args: argparse.Namespace) -> Any:
     return figure
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(piece) for piece in text.split(","))
-    except ValueError:
-        numbers = ()
-    return numbers if all(math.isfinite(x) for x in numbers) else ()
-
-
 def _point(text: str) -> tuple[float, ...]:
     """Read ``1.5,2`` or ``1.5,2,3``."""
-    if len(numbers := _numbers(text)) not in (2, 3):
+    if len(numbers := parse_numbers(text)) not in (2, 3):
         raise argparse.ArgumentTypeError(f"got {text!r}; expected coordinates, such as 1.5,2")
     return numbers
 
 
 def _pair(text: str) -> tuple[float, float]:
     """Read ``0.01,0.99``."""
-    if len(numbers := _numbers(text)) != 2 or not 0 <= numbers[0] < numbers[1] <= 1:
+    if len(numbers := parse_numbers(text)) != 2 or not 0 <= numbers[0] < numbers[1] <= 1:
         raise argparse.ArgumentTypeError(f"got {text!r}; expected two numbers from 0 to 1, such as 0.01,0.99")
     return numbers[0], numbers[1]
 
@@ -297,6 +217,6 @@ def _limits(text: str) -> tuple[float, float] | None:
     """Read ``own`` or ``shared`` (None) or ``LOW,HIGH``."""
     if text in ("own", "shared"):
         return None
-    if len(numbers := _numbers(text)) != 2 or not numbers[0] < numbers[1]:
+    if len(numbers := parse_numbers(text)) != 2 or not numbers[0] < numbers[1]:
         raise ValueError(f"--range: got {text!r}; expected own, shared, or two ascending numbers LOW,HIGH")
     return numbers[0], numbers[1]

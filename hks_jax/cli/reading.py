@@ -9,8 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hks_jax.cli.arguments import parse_positive, parse_repair, parse_slice
-from hks_jax.cli.progress import Progress
-from hks_jax.cli.spelling import READING, as_options
+from hks_jax.cli.progress import READING, Progress, as_options
 from hks_jax.io import (
     ORDERS,
     UNITS,
@@ -22,14 +21,10 @@ from hks_jax.io import (
     read_tensors,
     repair_tensors,
 )
-from hks_jax.io.mrtrix import is_mrtrix
-from hks_jax.io.nifti import is_nifti
-from hks_jax.io.nrrd import is_nrrd
+from hks_jax.io.formats import SUFFIXES, format_of
 from hks_jax.io.questions import reviewed
-from hks_jax.io.read import SUFFIXES
 from hks_jax.io.repair import find_background, without_background
 from hks_jax.io.units import unit_question
-from hks_jax.io.vtk_image import is_vtk_image
 
 FILES = ", ".join(SUFFIXES)
 
@@ -133,10 +128,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def defaults() -> dict[str, Any]:
-    """Return what the options are unless given."""
+def defaults(*adding: Callable[[argparse.ArgumentParser], None]) -> dict[str, Any]:
+    """Return what the options are that functions add, here `add_options`, unless they are given."""
     parser = argparse.ArgumentParser(add_help=False)
-    add_options(parser)
+    for add in adding or (add_options,):
+        add(parser)
     return vars(parser.parse_args([]))
 
 
@@ -222,8 +218,7 @@ def _count_clipped(volume: TensorVolume) -> int:
 
 def image_suffix(path: Path) -> str:
     """Return the suffix of images in the format of a file; of NumPy's files none."""
-    known = ((is_nifti, ".nii.gz"), (is_mrtrix, ".nii.gz"), (is_nrrd, ".nrrd"), (is_vtk_image, ".vti"))
-    return next((suffix for test, suffix in known if test(path)), "")
+    return str(format_of(path).IMAGE)
 
 
 def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:

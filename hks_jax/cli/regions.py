@@ -10,8 +10,8 @@ from hks_jax import __version__
 from hks_jax.cli.explore import About, Place
 from hks_jax.cli.plot import read_saved
 from hks_jax.cli.progress import Progress
-from hks_jax.io.labels import names_beside, read_labels, read_names
-from hks_jax.io.provenance import digest
+from hks_jax.io.masks import names_beside, read_labels, read_names
+from hks_jax.io.volume import digest
 from hks_jax.npz import load_npz
 from hks_jax.signatures.regions import region_statistics
 

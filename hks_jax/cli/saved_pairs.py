@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.arguments import recorded_boundary
+from hks_jax.cli.inputs import add_eigenpair_arguments, add_tensor_options
 from hks_jax.cli.job import Settings, field_of
 from hks_jax.cli.outputs import plain
 from hks_jax.cli.progress import Progress
@@ -17,6 +18,7 @@ from hks_jax.cli.reading import defaults
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.assembly import assemble
+from hks_jax.io.arrays import place_of
 from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npz
@@ -24,17 +26,7 @@ from hks_jax.npz import load_npz
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that belong to the pairs."""
-_OPTIONS = {
-    **defaults(),
-    "metric": None,
-    "components": "raise",
-    "dtype": "float64",
-    "interpolation": "linear",
-    "boundary": None,
-    "k": None,
-    "solver": "auto",
-    "save_pairs": False,
-}
+_OPTIONS = {**defaults(add_tensor_options, lambda parser: add_eigenpair_arguments(parser, "")), "save_pairs": False}
 """Options that were settled when the pairs were computed, and what they are unless given."""
 
 
@@ -85,9 +77,7 @@ def write_pairs(
     record = {name: getattr(volume, name) for name in (*_ABOUT, "notes")}
     record |= {"repair": dict(volume.repair), "image": image, "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: value for name, value in asdict(settings).items() if name in _SETTLED}
-    place = {"tensors": volume.tensors, "spacing": volume.spacing, "origin": volume.origin}
-    place |= {name: value for name in ("mask", "affine") if (value := getattr(volume, name)) is not None}
-    save_pairs(path, pairs, {**place, _RECORD: json.dumps(plain(record))})
+    save_pairs(path, pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
 
 
 def are_of(path: Path, fingerprint: str) -> bool:

@@ -2,27 +2,28 @@
 
 import argparse
 import csv
-import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import NATURAL
+from hks_jax.cli.arguments import DEFAULT_TIMES, NATURAL
+from hks_jax.cli.hks import settings_of
 from hks_jax.cli.inputs import (
+    add_command,
     add_eigenpair_arguments,
     add_json_argument,
     add_tensor_arguments,
     read_volume,
     require_metric,
 )
+from hks_jax.cli.job import compute_pairs, describe_input, describe_pairs
+from hks_jax.cli.outputs import check_folder, show_files, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.io import atomic_folder
-
-if TYPE_CHECKING:
-    from hks_jax.domain.tensor_field import TensorField
-    from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.weyl import weyl_count
 
 DESCRIPTION = """\
 Compute the lowest eigenvalues of the Laplace-Beltrami operator of a field of diffusion tensors. FILE is read as by
@@ -41,13 +42,8 @@ examples:
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "spectrum",
-        help="compute eigenvalues, and compare them with Weyl's law",
-        usage="%(prog)s FILE -o OUT [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "spectrum", "compare eigenvalues with Weyl's law", DESCRIPTION, EPILOG, "FILE -o OUT"
     )
     add_tensor_arguments(parser)
     add_eigenpair_arguments(parser, "neumann, also of a mask: mean would join the eigenvalues of two problems", NATURAL)
@@ -58,9 +54,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> None:
     """Run the subcommand."""
     require_metric(args)
-    from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
-    from hks_jax.cli.outputs import check_folder, show_files, write_report
-    from hks_jax.eigen.weyl import weyl_count
     from hks_jax.plot import save_figure
 
     check_folder(args.output)
@@ -68,15 +61,7 @@ def run(args: argparse.Namespace) -> None:
     with progress.catching_warnings():
         with progress.stage("reading", str(args.file)):
             volume = read_volume(args, progress)
-        settings = Settings(
-            metric=args.metric or "tensor",
-            interpolation=args.interpolation,
-            k=args.k,
-            boundary=args.boundary,
-            components=args.components,
-            solver=args.solver,
-            dtype=args.dtype,
-        )
+        settings = settings_of(args, DEFAULT_TIMES, args.metric or "tensor")
         field, pairs, settings = compute_pairs(volume, settings, progress)
         columns = {
             "eigenvalue": np.asarray(pairs.eigenvalues),
@@ -93,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
             "volume": np.asarray(pairs.pencil.volume).item(),
             "eigenvalues": columns["eigenvalue"].tolist(),
         }
-        with progress.stage("writing", str(args.output)), atomic_folder(args.output) as folder:
+        with writing(args.output, report, progress) as (folder, files):
             np.savez_compressed(
                 folder / "spectrum.npz",
                 eigenvalues=columns["eigenvalue"],
@@ -102,9 +87,7 @@ def run(args: argparse.Namespace) -> None:
             )
             write_csv(folder / "spectrum.csv", columns)
             save_figure(draw(pairs, field), folder / "spectrum.png")
-            write_report(folder / "report.json", report, progress, sys.argv)
-            names = sorted(file.name for file in folder.iterdir())
-    show_files([args.output / name for name in names], args.quiet, args.json)
+    show_files(files, args.quiet, args.json)
 
 
 def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
@@ -116,7 +99,7 @@ def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
         writer.writerows([i, *row] for i, row in enumerate(rows))
 
 
-def draw(pairs: "Eigenpairs", field: "TensorField") -> Any:
+def draw(pairs: Eigenpairs, field: TensorField) -> Any:
     """Return the picture: the eigenvalues' count beside Weyl's law, and what is left when that is taken off."""
     from hks_jax.plot import new_figure, spectrum
 

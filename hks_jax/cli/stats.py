@@ -1,12 +1,14 @@
 """``hks-jax stats OUT --atlas LABELS``: the statistics of a signature over the regions of a label map."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from hks_jax.cli.inputs import add_json_argument
+from hks_jax.cli.inputs import add_command, add_json_argument
+from hks_jax.cli.outputs import check_folder, show_summary, signature_file
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.regions import region_table
+from hks_jax.io.tables import write_table
 
 DESCRIPTION = """\
 Write a table of regions: for each label of an image, and each t of the signature that 'hks-jax hks' has left in the
@@ -26,12 +28,8 @@ Of many subjects, 'hks-jax batch --atlas' writes all tables and joins them.
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "stats",
-        help="write a table of regions' means over the labels of an atlas",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, "stats", "write a table of regions' means over the labels of an atlas", DESCRIPTION, EPILOG
     )
     add = parser.add_argument
     add("result", metavar="OUT", type=Path, help="the folder that 'hks-jax hks' wrote, or an .npz from there")
@@ -67,9 +65,6 @@ def run(args: argparse.Namespace) -> None:
         FileNotFoundError: no such result, labels or names.
         ValueError: a result that has no regions, or labels that do not fit it.
     """
-    from hks_jax.cli.outputs import check_folder, signature_file
-    from hks_jax.cli.regions import region_table
-    from hks_jax.io.tables import write_table
 
     source = signature_file(args.result)
     table = source.with_name("regions.tsv") if args.output is None else args.output
@@ -79,9 +74,5 @@ def run(args: argparse.Namespace) -> None:
     progress = Progress(args.quiet)
     with progress.catching_warnings(), progress.stage("regions", f"{args.atlas} on {source}"):
         columns, rows, about = region_table(source, args.atlas, args.names, progress)
-        files = [str(file) for file in write_table(table, columns, rows, about)]
-    if args.json:
-        regions = list(dict.fromkeys(row[1] for row in rows))
-        print(json.dumps({"source": str(source), "regions": regions, "files": files}, ensure_ascii=False))
-    elif not args.quiet:
-        print("\n".join(files))
+        files = write_table(table, columns, rows, about)
+    show_summary(args, files, {"source": str(source), "regions": list(dict.fromkeys(row[1] for row in rows))})

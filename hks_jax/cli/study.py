@@ -20,10 +20,10 @@ from hks_jax.cli.outputs import plain, save_result
 from hks_jax.cli.reading import image_suffix
 from hks_jax.cli.subjects import NOISE, OPTIONS, Subject
 from hks_jax.io.components import is_one_of_six, siblings
-from hks_jax.io.labels import names_beside
+from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import is_nifti, sidecar_of
-from hks_jax.io.provenance import digest
 from hks_jax.io.tables import read_json, read_table, write_json, write_table
+from hks_jax.io.volume import digest
 from hks_jax.reading import existing
 
 BIDS_VERSION = "1.10.0"

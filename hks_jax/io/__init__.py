@@ -11,12 +11,12 @@ from hks_jax.io.mesh import read_mesh as read_mesh
 from hks_jax.io.mesh import read_mesh_arrays as read_mesh_arrays
 from hks_jax.io.pairs import load_pairs as load_pairs
 from hks_jax.io.pairs import save_pairs as save_pairs
-from hks_jax.io.positive import positive_tensors as positive_tensors
 from hks_jax.io.questions import questions as questions
 from hks_jax.io.read import read_tensors as read_tensors
 from hks_jax.io.repair import REPAIRS as REPAIRS
 from hks_jax.io.repair import find_background as find_background
 from hks_jax.io.repair import find_invalid as find_invalid
+from hks_jax.io.repair import positive_tensors as positive_tensors
 from hks_jax.io.repair import repair_tensors as repair_tensors
 from hks_jax.io.sampling import sample_tensors as sample_tensors
 from hks_jax.io.save import save as save

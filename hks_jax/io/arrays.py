@@ -1,16 +1,32 @@
 """Tensors in NumPy's own files, .npz and .npy."""
 
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.io.masks import as_mask
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.tensor_order import choices, to_voxel_axes, unpack
-from hks_jax.io.volume import TensorVolume
+from hks_jax.atomic import atomic_path
+from hks_jax.io.tensor_order import choices, invalid_by_order, to_voxel_axes, unpack
+from hks_jax.io.volume import TensorVolume, as_mask, describe_tensors
 from hks_jax.npz import load_npy, load_npz
+
+SUFFIXES = (".npz", ".npy")
+WRITTEN = (".npz",)
+IMAGE = ""
+OPTIONS = ("array", "spacing")
+
+
+def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
+    """Return the array of an npy, or ``mask`` of an npz; neither says where it lies."""
+    if os.fspath(path).lower().endswith(".npy"):
+        return load_npy(path), None
+    arrays = load_npz(path)
+    if "mask" not in arrays:
+        raise ValueError(f"{os.fspath(path)}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
+    return arrays["mask"], None
 
 
 def read_tensors(
@@ -56,6 +72,35 @@ def read_tensors(
         length_unit=_text(arrays, "length_unit") or "",
         unit=_text(arrays, "unit") or "",
     )
+
+
+def write(
+    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
+) -> None:
+    """Write scalars and the place that they have; see `hks_jax.io.save`."""
+    slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
+    write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})
+
+
+def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
+    """Write the arrays that `read_tensors` reads."""
+    record = describe_tensors(volume, "matrix", "voxel", provenance)
+    units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
+    content = {"tensors": volume.tensors, **place_of(volume), "frame": "voxel", **units, "provenance": record}
+    write_npz(path, content)
+
+
+def write_npz(path: Path, content: Mapping[str, Any]) -> None:
+    """Write arrays by name, compressed, whole or not at all."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(stream, **content)
+
+
+def place_of(volume: TensorVolume) -> dict[str, Any]:
+    """Return the arrays that say where the voxels are, and which of them are inside."""
+    optional = {"mask": volume.mask, "affine": volume.affine}
+    given = {key: value for key, value in optional.items() if value is not None}
+    return {"spacing": volume.spacing, "origin": volume.origin, **given}
 
 
 def _matrices(name: str, values: np.ndarray, order: str | None) -> tuple[Float[np.ndarray, "..."], str]:

@@ -11,6 +11,7 @@ import numpy as np
 from hks_jax.io import nifti
 from hks_jax.io.tensor_order import ORDERS
 from hks_jax.io.volume import TensorVolume
+from hks_jax.optional import optional
 
 NAMES = ORDERS["nifti"]
 _NAME = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
@@ -83,7 +84,7 @@ def read_tensors(
         if not np.allclose(nifti.affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected the same voxels")
     values = np.stack([nifti.voxels(files[name], image) for name, image in zip(NAMES, images, strict=True)], axis=-1)
-    joined = nifti.nibabel().Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
+    joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
     joined.header["xyzt_units"] = first.header["xyzt_units"]
     joined.header.set_intent(nifti.SYMMETRIC_MATRIX, (3,))
     return nifti.tensors_of(files["xx"], joined, None, frame)

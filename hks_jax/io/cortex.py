@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.io.mesh_formats import Loaded
-from hks_jax.io.nifti import nibabel
+from hks_jax.optional import optional
 from hks_jax.reading import reading
 
 _TRIANGLES = b"\xff\xff\xfe"
@@ -38,7 +38,7 @@ _SCANNER = (1, 2)
 
 def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
     """Load a surface of FreeSurfer's: coordinates in mm as they are in the file, or those of the scanner."""
-    library = nibabel()
+    library = optional("nibabel")
     with reading(path, "a readable surface of FreeSurfer's"):
         content = path.read_bytes()
         # The magic number and a remark end with the second line; then the numbers of vertices and triangles.
@@ -74,7 +74,7 @@ def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray | Non
 
 def load_gifti(path: Path, in_space: bool = False) -> Loaded:
     """Load a surface from GIFTI: coordinates as they are in the file, or those of the scanner."""
-    library = nibabel()
+    library = optional("nibabel")
     with reading(path, "a readable GIFTI surface"):
         content = gzip.decompress(path.read_bytes()) if path.suffix.lower() == ".gz" else path.read_bytes()
         # nibabel counts up to them.

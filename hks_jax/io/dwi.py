@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_number
 from hks_jax.io import nifti
-from hks_jax.io.masks import as_mask, read_mask
-from hks_jax.io.provenance import digest
+from hks_jax.io.masks import read_mask
 from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
-from hks_jax.io.volume import TensorVolume
+from hks_jax.io.volume import TensorVolume, as_mask, digest
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 _LENGTH = 0.05
@@ -91,7 +91,7 @@ def fit_dwi(
             have no length, or another than 1; a mask of another shape; too few images, also to estimate noise from
             residuals; residuals that are zero; no signal.
     """
-    dti, gradients, segmentation = _dipy()
+    dti, gradients, segmentation = map(optional, ("dipy.reconst.dti", "dipy.core.gradients", "dipy.segment.mask"))
     image = nifti.load(path)
     affine, _ = nifti.affine_in_mm(os.fspath(path), image)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
@@ -218,15 +218,10 @@ def _of_length_one(
         )
     rounded = weighted & (np.abs(lengths - 1) > 1e-3)
     unit = np.where(weighted[:, None], directions / np.where(weighted, lengths, 1.0)[:, None], 0.0)
-    notes = (
-        [
-            f"{int(rounded.sum())} directions divided by their lengths, {lengths[rounded].min():.4g} to "
-            f"{lengths[rounded].max():.4g}"
-        ]
-        if rounded.any()
-        else []
-    )
-    return unit, notes
+    if not rounded.any():
+        return unit, []
+    low, high = lengths[rounded].min(), lengths[rounded].max()
+    return unit, [f"{int(rounded.sum())} directions divided by their lengths, {low:.4g} to {high:.4g}"]
 
 
 def _inside(
@@ -259,16 +254,6 @@ def _inside(
     if lost := int((inside & ~usable).sum()):
         notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: their signal is NaN or infinite")
     return usable, notes
-
-
-def _dipy() -> tuple[ModuleType, ModuleType, ModuleType]:
-    try:
-        from dipy.core import gradients
-        from dipy.reconst import dti
-        from dipy.segment import mask as segmentation
-    except ImportError as error:
-        raise ImportError('fitting tensors needs DIPY, which is not installed: pip install "hks-jax[dti]"') from error
-    return dti, gradients, segmentation
 
 
 def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:

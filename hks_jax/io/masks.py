@@ -1,15 +1,17 @@
-"""Masks: which voxels belong to the domain."""
+"""Masks and label maps: which voxels belong to the domain, and to which region each of them does."""
 
 import os
-from typing import Any
+import re
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Integer
 from scipy import ndimage
 
-from hks_jax.checks import require_real
-from hks_jax.io import mrtrix, nifti, nrrd
-from hks_jax.npz import load_npy, load_npz
+from hks_jax.io import nifti
+from hks_jax.io.formats import IMAGES, format_of
+from hks_jax.io.volume import as_mask
+from hks_jax.reading import existing, reading
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -25,48 +27,10 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         ImportError: NIfTI without nibabel, NRRD without pynrrd.
     """
     name = os.fspath(path)
-    if nifti.is_nifti(path):
-        image = nifti.load(path)
-        values = nifti.voxels(path, image)
-        while values.ndim > 3 and values.shape[-1] == 1:
-            values = values[..., 0]
-        if affine is not None:
-            _check_same_place(name, nifti.affine_beside(name, image, affine), affine, values.shape)
-    elif mrtrix.is_mrtrix(path):
-        mask = mrtrix.load(path)
-        values = mask.values[..., 0] if mask.values.ndim == 4 and mask.values.shape[-1] == 1 else mask.values
-        if affine is not None:
-            _check_same_place(name, mask.affine, affine, values.shape)
-    elif name.endswith(".npz"):
-        arrays = load_npz(path)
-        if "mask" not in arrays:
-            raise ValueError(f"{name}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
-        values = arrays["mask"]
-    elif nrrd.is_nrrd(path):
-        values, place = nrrd.read_image(path, affine)
-        if affine is not None and place is not None:
-            _check_same_place(name, place, affine, values.shape)
-    elif name.endswith(".npy"):
-        values = load_npy(path)
-    else:
-        expected = ".nii, .nii.gz, .mif, .mif.gz, .nrrd, .nhdr, .npz or .npy"
-        raise ValueError(f"{name}: unknown kind of file; expected {expected}{of_mrtrix(name)}")
+    values, place = _image(path, affine, IMAGES)
+    if affine is not None and place is not None:
+        _check_same_place(name, place, affine, values.shape)
     return as_mask(name, values)
-
-
-def of_mrtrix(name: str) -> str:
-    """Return the advice for images of MRtrix in two files, which are not read; the empty text for others."""
-    stem, _, suffix = name.rpartition(".")
-    return "" if suffix.lower() != "mih" else f". MRtrix makes one file of it: mrconvert {name} {stem}.mif"
-
-
-def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
-    """Return zeros and ones as booleans; raise ValueError for anything else."""
-    array = np.asarray(values)
-    require_real(name, array)
-    if array.dtype != bool and not np.isin(array, (0, 1)).all():
-        raise ValueError(f"{name}: got mask values other than 0 and 1; threshold it first, for example mask > 0.5")
-    return array.astype(bool)
 
 
 def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndarray, "*shape"]:
@@ -97,3 +61,113 @@ def _check_same_place(name: str, mask_affine: np.ndarray, affine: np.ndarray, sh
             f"{name}: the mask's affine places it up to {shift:.3g} away from the tensors'; expected the same place. "
             "Resample the mask to the tensors' voxels"
         )
+
+
+NEAR = 0.1
+"""By how many voxels two images may lie apart and still be on the same voxels."""
+
+
+def read_labels(
+    path: str | os.PathLike[str],
+    shape: tuple[int, ...],
+    affine: np.ndarray | None = None,
+    slice_axis: int | None = None,
+) -> Integer[np.ndarray, "*shape"]:
+    """Read whole numbers, 0 for none, at the voxels of an image: NIfTI, or ``.npy`` of the image's shape.
+
+    NIfTI has its place in space. Where the image has one, the two must have the same voxels; a slice takes its own from
+    a label map of the volume.
+
+    Args:
+        path: the file.
+        shape: that of the image.
+        affine: voxel indices of the image to world coordinates, (4, 4); for a slice, those of a volume one voxel thick.
+        slice_axis: for a slice, the axis that it cuts.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: an unknown kind of file, numbers with a fraction, or labels on other voxels.
+        ImportError: NIfTI without nibabel.
+    """
+    name = os.fspath(path)
+    values, place = _image(path, affine, (*nifti.SUFFIXES, ".npy"))
+    if affine is not None and place is not None and values.ndim == 3:
+        values = _at_voxels(name, values, place, affine, shape, slice_axis)
+    if values.shape != shape:
+        raise ValueError(f"{name}: got labels of shape {values.shape}; expected the shape of the image, {shape}")
+    if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
+        raise ValueError(f"{name}: got numbers that are not whole; expected labels. Resample by the nearest neighbour")
+    return np.asarray(values).astype(np.int32)
+
+
+def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
+    """Read names of labels: a table with the columns ``index`` and ``name`` (BIDS), or lines of a number and a name.
+
+    Of a line without such a table, the name is what follows the number: up to the next tab if there is one before it,
+    and without the four numbers of a colour that FreeSurfer's tables end in.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no text in UTF-8; no line begins with a number.
+    """
+    file = existing(path)
+    with reading(file, "a text in UTF-8"):
+        lines = [line.strip("\r\n") for line in file.read_text(encoding="utf-8-sig").splitlines()]
+    names = {}
+    header = lines[0].split("\t") if lines else []
+    if {"index", "name"} <= set(header):
+        at = header.index("index"), header.index("name")
+        for line in lines[1:]:
+            cells = line.split("\t")
+            if len(cells) > max(at) and cells[at[0]].strip().lstrip("-").isdecimal():
+                names[int(cells[at[0]])] = cells[at[1]].strip()
+    else:
+        for line in lines:
+            number, *words = line.split(None, 1)[:2] or [""]
+            if number.lstrip("-").isdecimal() and words:
+                names[int(number)] = re.sub(r"(\s+\d+){4}$", "", words[0].split("\t")[0].strip())
+    if not names:
+        raise ValueError(f"{file}: no line has a number and a name; expected lines such as '17 left hippocampus'")
+    return names
+
+
+def names_beside(path: str | os.PathLike[str]) -> str | None:
+    """Return the table of names beside a label map, in BIDS ``…_dseg.tsv`` for ``…_dseg.nii.gz``, if it is there."""
+    table = Path(os.fspath(path).removesuffix(".gz")).with_suffix(".tsv")
+    return str(table) if table.is_file() else None
+
+
+def _image(
+    path: str | os.PathLike[str], affine: np.ndarray | None, suffixes: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the voxel values, without a fourth axis of one entry, and the affine where the file has one."""
+    values, place = format_of(path, suffixes).read_image(path, affine)
+    while values.ndim > 3 and values.shape[-1] == 1:
+        values = values[..., 0]
+    return values, place
+
+
+def _at_voxels(
+    name: str, values: np.ndarray, place: np.ndarray, affine: np.ndarray, shape: tuple[int, ...], slice_axis: int | None
+) -> np.ndarray:
+    """Return the labels at the image's voxels; raise ValueError where the two are not on the same voxels."""
+    to_labels = np.linalg.solve(place, affine)
+    size = list(shape)
+    if len(size) == 2:
+        size.insert(2 if slice_axis is None else slice_axis, 1)
+    corners = np.stack(np.meshgrid(*[(0, n - 1) for n in size], [1], indexing="ij"), -1).reshape(-1, 4)
+    first = np.rint(to_labels[:3, 3]).astype(int)
+    apart = np.abs((corners @ to_labels.T)[:, :3] - corners[:, :3] - first).max()
+    box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
+    inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
+    if apart > NEAR or not inside:
+        if values.shape != tuple(size) and np.allclose(place, affine):
+            raise ValueError(
+                f"{name}: its affine is the image's, and its shape {values.shape} is not, which is {tuple(size)}; "
+                "expected labels of the image's voxels. One of them was cropped or resampled without its affine"
+            )
+        raise ValueError(
+            f"{name}: its affine places the labels on other voxels than the image's; expected the image's own. "
+            "Resample them to the image, by the nearest neighbour"
+        )
+    return values[box].reshape(shape)

@@ -15,8 +15,9 @@ from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.io import cortex
 from hks_jax.io.mesh_cleaning import cleaned, require_joined
-from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, meshio, polygonal, through_meshio
+from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
 from hks_jax.io.vtk_image import holds_dataset
+from hks_jax.optional import optional
 from hks_jax.reading import existing
 
 READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", ".gii.gz")
@@ -111,7 +112,7 @@ def write(
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
         raise ValueError(f"path: got {name!r}; {what} are written as {', '.join(allowed)} or .npz")
-    library = meshio()
+    library = optional("meshio")
     cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # what PLY has room for
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})
     with atomic_path(name + ".json") as beside, atomic_path(name) as temporary:
@@ -127,13 +128,13 @@ def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> 
     if name.endswith((".gii", ".gii.gz")):
         loaded = cortex.load_gifti(file, in_space)
     elif name.endswith(".vtp") or (name.endswith(".vtk") and holds_dataset(file, "POLYDATA")):
-        loaded = polygonal(str(file))
+        loaded = polygonal(file)
     elif name.endswith(".obj"):
         loaded = load_obj(file)
     elif name.endswith(".off"):
         loaded = load_off(file)
     elif name.endswith(READ):
-        loaded = through_meshio(str(file))
+        loaded = through_meshio(file)
     elif cortex.is_freesurfer(file):
         loaded = cortex.load_freesurfer(file, in_space)
     else:

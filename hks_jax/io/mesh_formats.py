@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Float, Int
 
 from hks_jax.io.mesh_checks import MeshChecks
 from hks_jax.io.vtk_checks import check_legacy, check_xml
-from hks_jax.io.vtk_image import require_vtk
+from hks_jax.optional import optional
 from hks_jax.reading import reading
 
 
@@ -25,30 +24,15 @@ class Loaded(NamedTuple):
 _OF_SURFACES, _OF_BOUNDARIES = {"triangle", "quad"}, {"triangle", "quad", "line", "vertex"}
 
 
-def meshio() -> ModuleType:
-    """Import meshio.
-
-    Raises:
-        ImportError: it is not installed; says how to get it.
-    """
-    try:
-        import meshio
-    except ImportError as error:
-        raise ImportError(
-            'reading and writing meshes needs meshio, which is not installed: pip install "hks-jax[mesh]"'
-        ) from error
-    return meshio
-
-
-def through_meshio(name: str) -> Loaded:
+def through_meshio(path: Path) -> Loaded:
     """Load triangles or tetrahedra through meshio."""
-    suffix = Path(name).suffix.lower()
-    library = meshio()
+    suffix = path.suffix.lower()
+    library = optional("meshio")
     # Overflow is of a text's letters, which it takes for a number of triangles first.
-    with reading(name, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
+    with reading(path, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
         # The format's own reader: meshio.read ends the process where it cannot read a file.
-        checks = MeshChecks(Path(name))
-        read = getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(name)
+        checks = MeshChecks(path)
+        read = getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(path))
         checks.compare(read)
         points = np.asarray(read.points, np.float64)
         tetrahedra = [_corners(block.data, 4) for block in read.cells if block.type == "tetra"]
@@ -60,32 +44,32 @@ def through_meshio(name: str) -> Loaded:
     others = {block.type for block in read.cells} - _OF_BOUNDARIES - {"tetra"}
     if others:
         raise ValueError(
-            f"{name}: has {', '.join(sorted(others))} cells; expected triangles (or quadrilaterals), or tetrahedra"
+            f"{path}: has {', '.join(sorted(others))} cells; expected triangles (or quadrilaterals), or tetrahedra"
         )
     blocks = tetrahedra or triangles
     if not blocks:
-        raise ValueError(f"{name}: has no triangles and no tetrahedra; expected a mesh in two or three dimensions")
+        raise ValueError(f"{path}: has no triangles and no tetrahedra; expected a mesh in two or three dimensions")
     return Loaded(points, np.concatenate(blocks).astype(np.int64), arrays)
 
 
-def polygonal(name: str) -> Loaded:
+def polygonal(path: Path) -> Loaded:
     """Load polygonal data through VTK, its polygons cut into triangles."""
-    require_vtk()
+    optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkTriangleFilter
     from vtkmodules.vtkIOLegacy import vtkPolyDataReader
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
-    legacy = name.lower().endswith(".vtk")
+    legacy = path.suffix.lower() == ".vtk"
     errors: list[str] = []
-    with reading(name, "readable polygonal data"):
+    with reading(path, "readable polygonal data"):
         if legacy:
-            check_legacy(Path(name))
+            check_legacy(path)
         else:
-            check_xml(Path(name), "PolyData")
+            check_xml(path, "PolyData")
         reader = vtkPolyDataReader() if legacy else vtkXMLPolyDataReader()
         reader.AddObserver("ErrorEvent", lambda source, event: errors.append(event))
-        reader.SetFileName(name)
+        reader.SetFileName(str(path))
         reader.Update()
         whole = reader.GetOutput()
         if errors:
@@ -105,7 +89,7 @@ def polygonal(name: str) -> Loaded:
     triangles.Update()
     surface = triangles.GetOutput()
     if not surface.GetNumberOfPolys():
-        raise ValueError(f"{name}: VTK finds no triangles in it; expected polygonal data, whole")
+        raise ValueError(f"{path}: VTK finds no triangles in it; expected polygonal data, whole")
     points = np.asarray(vtk_to_numpy(surface.GetPoints().GetData()), np.float64)
     faces = np.asarray(vtk_to_numpy(surface.GetPolys().GetConnectivityArray()), np.int64)
     data = whole.GetPointData()

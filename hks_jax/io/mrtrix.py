@@ -12,12 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.tensor_order import FRAMES, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import FRAMES, invalid_by_order, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".mif", ".mif.gz")
+WRITTEN: tuple[str, ...] = ()
+IMAGE = ".nii.gz"
+OPTIONS = ()
 _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
@@ -27,11 +29,6 @@ class Image(NamedTuple):
 
     values: np.ndarray
     affine: Float[np.ndarray, "4 4"]
-
-
-def is_mrtrix(path: str | os.PathLike[str]) -> bool:
-    """Tell by the name whether a file is one of MRtrix's images."""
-    return os.fspath(path).lower().endswith(SUFFIXES)
 
 
 def load(path: str | os.PathLike[str]) -> Image:
@@ -64,6 +61,11 @@ def load(path: str | os.PathLike[str]) -> Image:
         if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
             raise ValueError("transform and vox place the voxels nowhere")
     return Image(values, affine)
+
+
+def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Image:
+    """Return the voxel values of an image, and its affine."""
+    return load(path)
 
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:

@@ -4,22 +4,27 @@ import gzip
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from hks_jax.atomic import atomic_path
 from hks_jax.checks import require_real
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.provenance import own_record
 from hks_jax.io.questions import OPEN_FRAME
-from hks_jax.io.tensor_order import FRAMES, choices, pack, to_voxel_axes, unpack
-from hks_jax.io.units import scaled_beside
-from hks_jax.io.volume import TensorVolume
+from hks_jax.io.repair import require_symmetric
+from hks_jax.io.tables import write_json
+from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
+from hks_jax.io.units import by_axis, scaled_beside
+from hks_jax.io.volume import TensorVolume, describe_tensors, images_of, own_record
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
+WRITTEN = (".nii.gz", ".nii")
+IMAGE = ".nii.gz"
+OPTIONS = ()
 SYMMETRIC_MATRIX = 1005
 """NIfTI's intent code for symmetric matrices."""
 COMMENT = 6
@@ -35,22 +40,6 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
-def nibabel() -> ModuleType:
-    """Import nibabel.
-
-    Raises:
-        ImportError: it is not installed; says how to get it.
-    """
-    try:
-        import nibabel
-    except ImportError as error:
-        raise ImportError(
-            "reading and writing NIfTI, GIFTI and FreeSurfer's files needs nibabel, which is not installed: "
-            'pip install "hks-jax[dti]"'
-        ) from error
-    return nibabel
-
-
 def load(path: str | os.PathLike[str]) -> Any:
     """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared.
 
@@ -58,7 +47,7 @@ def load(path: str | os.PathLike[str]) -> Any:
         FileNotFoundError: no such file.
         ValueError: not a NIfTI image, or a damaged one.
     """
-    nib, file = nibabel(), existing(path)
+    nib, file = optional("nibabel"), existing(path)
     with reading(file, "a readable NIfTI image"):
         if file.name.lower().endswith(".gz"):
             with gzip.open(file) as stream:
@@ -114,16 +103,24 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
-def affine_beside(name: str, image: Any, affine: np.ndarray) -> np.ndarray:
-    """Return an image's affine in mm, as `affine` is, that of the image which it belongs to (see `scaled_beside`)."""
-    own, unit = affine_in_mm(name, image)
-    return own if unit else scaled_beside(own, affine)
+def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the voxel values of an image, and its affine in mm.
+
+    Without a unit of its own it has that of the image whose affine is `beside` (see `scaled_beside`).
+    """
+    image = load(path)
+    own, unit = affine_in_mm(os.fspath(path), image)
+    return voxels(path, image), own if unit or beside is None else scaled_beside(own, beside)
 
 
 def sidecar_of(path: str | os.PathLike[str]) -> Path | None:
     """Return the BIDS sidecar beside an image, if it is there."""
-    sidecar = Path(os.fspath(path).removesuffix(".gz").removesuffix(".nii") + ".json")
+    sidecar = _sidecar(path)
     return sidecar if sidecar.is_file() else None
+
+
+def _sidecar(path: str | os.PathLike[str]) -> Path:
+    return Path(os.fspath(path).removesuffix(".gz")).with_suffix(".json")
 
 
 def _encoding(path: str) -> dict[str, Any]:
@@ -204,10 +201,10 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
         notes.append("the affine's axes are not orthogonal: the shear is ignored")
     stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
     if length_unit not in ("", "mm"):
-        notes.append(f"lengths in {length_unit}, as the file declares: voxels of {_sizes(stored)} are in mm here")
+        notes.append(f"lengths in {length_unit}, as the file declares: voxels of {by_axis(stored)} are in mm here")
     header = np.asarray(image.header.get_zooms()[:3], np.float64)
     if np.abs(header / stored - 1).max() > 1e-3:
-        notes.append(f"voxel sizes {_sizes(stored)} are those of the affine; the header's own are {_sizes(header)}")
+        notes.append(f"voxel sizes {by_axis(stored)} are those of the affine; the header's own are {by_axis(header)}")
     if open_frame and np.linalg.det(affine[:3, :3]) > 0:
         notes.append(OPEN_FRAME)
     notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
@@ -247,10 +244,39 @@ def placement_notes(image: Any) -> list[str]:
     ]
 
 
-def _sizes(values: np.ndarray) -> str:
-    return " × ".join(f"{v:.5g}" for v in values)
+def write(
+    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
+) -> None:
+    """Write scalars with times along the fourth axis, a slice one voxel thick; see `hks_jax.io.save`."""
+    others = sorted(extra.keys() - {"times"})
+    if others:
+        raise ValueError(f"extra: got {', '.join(others)}; NIfTI has no place for more arrays. Write an .npz too")
+    if "times" in extra:
+        sources = [Path(volume.source).name] if volume.source else []
+        write_json(_sidecar(path), {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources})
+    if array.dtype not in (np.float32, np.float64):
+        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
+    image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
+    image.header["intent_name"] = name[:15].encode()
+    _write(path, image, record)
 
 
-def symmetric_matrix(volume: TensorVolume) -> np.ndarray:
-    """Return the tensors as NIfTI has them, (nx, ny, nz, 1, 6), zero outside the mask."""
-    return np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
+def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
+    """Write a symmetric-matrix image; see `hks_jax.io.save_tensors`."""
+    if volume.dimension != 3:
+        raise ValueError(
+            "volume: NIfTI has no 2×2 tensors; write the volume that the slice is of, or an .npz, .nrrd or .vti"
+        )
+    require_symmetric(volume)
+    components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
+    image = optional("nibabel").Nifti1Image(components, volume.volume_affine)
+    image.header.set_intent(SYMMETRIC_MATRIX, (3,))
+    _write(path, image, describe_tensors(volume, "nifti", "voxel", provenance))
+
+
+def _write(path: Path, image: Any, record: str) -> None:
+    nib = optional("nibabel")
+    image.header.set_xyzt_units("mm")
+    image.header.extensions.append(nib.nifti1.Nifti1Extension("comment", record.encode()))
+    with atomic_path(path) as temporary:
+        nib.save(image, temporary)

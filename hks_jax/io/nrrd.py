@@ -4,7 +4,6 @@ import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,14 +11,17 @@ from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import check_data, check_header
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.provenance import own_record
-from hks_jax.io.tensor_order import choices, nearest_rotation, pack, to_voxel_axes, unpack
+from hks_jax.io.repair import require_symmetric
+from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.units import millimetres, scaled_beside
-from hks_jax.io.volume import TensorVolume
+from hks_jax.io.volume import TensorVolume, describe_tensors, images_of, own_record
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nrrd", ".nhdr")
+WRITTEN = (".nrrd",)
+IMAGE = ".nrrd"
+OPTIONS = ("confidence",)
 
 TO_RAS = {
     "right-anterior-superior": (1.0, 1.0, 1.0),
@@ -78,26 +80,6 @@ class Placement(NamedTuple):
         return affine
 
 
-def is_nrrd(path: str | os.PathLike[str]) -> bool:
-    """Tell by the name whether a file is NRRD."""
-    return os.fspath(path).lower().endswith(SUFFIXES)
-
-
-def pynrrd() -> ModuleType:
-    """Import pynrrd.
-
-    Raises:
-        ImportError: it is not installed; says how to get it.
-    """
-    try:
-        import nrrd
-    except ImportError as error:
-        raise ImportError(
-            'reading and writing NRRD needs pynrrd, which is not installed: pip install "hks-jax[nrrd]"'
-        ) from error
-    return nrrd
-
-
 def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the array, first axis fastest in the file, in native floating point or as it is; and the header.
 
@@ -105,7 +87,7 @@ def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
         FileNotFoundError: no such file.
         ValueError: not an NRRD file, or a damaged one.
     """
-    nrrd, file = pynrrd(), existing(path)
+    nrrd, file = optional("nrrd"), existing(path)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not
         header = dict(nrrd.read_header(stream))
@@ -192,14 +174,35 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
 
 
 def write(
-    path: str | os.PathLike[str],
+    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
+) -> None:
+    """Write scalars with times along the last axis; see `hks_jax.io.save`."""
+    if volume.affine is not None:
+        array = images_of(array, volume)
+    elif array.ndim > volume.dimension:
+        array = np.moveaxis(array, 0, -1)
+    _write(path, array, volume, record, more=extra)
+
+
+def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
+    """Write tensors as masked symmetric matrices, the mask as confidence, the voxel axes as measurement frame."""
+    require_symmetric(volume)
+    confidence = volume.inside[..., None].astype(volume.tensors.dtype)
+    components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
+    record = describe_tensors(volume, "nrrd", "measurement", provenance)
+    kind = f"{volume.dimension}D-masked-symmetric-matrix"
+    _write(path, np.moveaxis(components, -1, 0), volume, record, kind=kind)
+
+
+def _write(
+    path: Path,
     array: np.ndarray,
     volume: TensorVolume,
     record: str,
     *,
     kind: str | None = None,
     more: Mapping[str, Any] | None = None,
-) -> Path:
+) -> None:
     """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
 
     Args:
@@ -210,9 +213,7 @@ def write(
         kind: of the components' axis; None: scalars.
         more: arrays for the header, as text.
     """
-    if not os.fspath(path).lower().endswith(".nrrd"):
-        raise ValueError(f"path: got {os.fspath(path)!r}; NRRD is written as one file, .nrrd")
-    nrrd = pynrrd()
+    nrrd = optional("nrrd")
     placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
     if placed:
         d, linear, origin = 3, volume.volume_affine[:3, :3], volume.volume_affine[:3, 3]
@@ -235,15 +236,6 @@ def write(
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     with atomic_path(path) as temporary:
         nrrd.write(str(temporary), array, {**header, "provenance": record}, index_order="F")
-    return Path(path)
-
-
-def write_tensors(path: str | os.PathLike[str], volume: TensorVolume, record: str) -> Path:
-    """Write tensors as masked symmetric matrices, the mask as confidence, the voxel axes as measurement frame."""
-    confidence = volume.inside[..., None].astype(volume.tensors.dtype)
-    components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
-    kind = f"{volume.dimension}D-masked-symmetric-matrix"
-    return write(path, np.moveaxis(components, -1, 0), volume, record, kind=kind)
 
 
 def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -> tuple[int, str | None]:

@@ -23,16 +23,14 @@ _FIELDS = frozenset(
 
 SPACES = frozenset(
     name + time
-    for name in (
-        "right-anterior-superior",
-        "left-anterior-superior",
-        "left-posterior-superior",
-        "scanner-xyz",
-        "3d-right-handed",
-        "3d-left-handed",
+    for names, time in (
+        ("right-anterior-superior left-anterior-superior left-posterior-superior", "-time"),
+        ("scanner-xyz 3d-right-handed 3d-left-handed", "-time"),
+        ("ras las lps", "t"),
     )
-    for time in ("", "-time")
-) | {"ras", "las", "lps", "rast", "last", "lpst"}
+    for name in names.split()
+    for time in ("", time)
+)
 """All spaces that the format has, in lower case."""
 
 _PER_AXIS = ("sizes", "spacings", "thicknesses", "kinds", "space directions")

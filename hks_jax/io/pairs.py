@@ -51,8 +51,8 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
         raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in .npz")
     arrays = {name: np.asarray(getattr(pairs, name)) for name in ARRAYS if getattr(pairs, name) is not None}
     content: dict[str, Any] = {**arrays, "solver_name": pairs.solver_name, **(extra or {})}
-    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, **content)
+    with atomic_path(path) as temporary:
+        np.savez(temporary, **content)
     return Path(path)
 
 

@@ -9,16 +9,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.checks import require_number
-from hks_jax.io import arrays, components, mrtrix, nifti, nrrd, vtk_image
-from hks_jax.io.masks import as_mask, of_mrtrix, read_mask
-from hks_jax.io.provenance import digest
+from hks_jax.io import components, nifti
+from hks_jax.io.formats import format_of
+from hks_jax.io.masks import read_mask
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
-from hks_jax.io.volume import TensorVolume
-
-SUFFIXES = (*nifti.SUFFIXES, *mrtrix.SUFFIXES, *nrrd.SUFFIXES, *vtk_image.SUFFIXES, ".npz", ".npy")
-"""What tensors are read from."""
+from hks_jax.io.volume import TensorVolume, as_mask, digest
 
 
 def read_tensors(
@@ -91,26 +88,15 @@ def read_tensors(
             raise ValueError("array, spacing: they are for NumPy's and VTK's files; leave them out for six images")
         volume = components.read_tensors(list(path), order, frame)
         return _finished(volume, mask, repair, unit)
-    name = os.fspath(path)
-    numpys = name.lower().endswith((".npz", ".npy"))
-    if array is not None and not (numpys or vtk_image.is_vtk_image(name)):
+    name, reader = os.fspath(path), format_of(path)
+    if array is not None and "array" not in reader.OPTIONS:
         raise ValueError(f"array: got {array!r}; only npz and VTK files have arrays by name")
-    if spacing is not None and not numpys:
+    if spacing is not None and "spacing" not in reader.OPTIONS:
         raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
-    if nifti.is_nifti(path) and components.is_one_of_six(path):
+    if reader is nifti and components.is_one_of_six(path):
         return _finished(components.read_tensors(components.siblings(path), order, frame), mask, repair, unit)
-    if nifti.is_nifti(path):
-        volume = nifti.read_tensors(name, order, frame)
-    elif mrtrix.is_mrtrix(path):
-        volume = mrtrix.read_tensors(name, order, frame)
-    elif nrrd.is_nrrd(path):
-        volume = nrrd.read_tensors(name, order, frame, confidence)
-    elif vtk_image.is_vtk_image(path):
-        volume = vtk_image.read_tensors(name, order, frame, array)
-    elif numpys:
-        volume = arrays.read_tensors(name, order, frame, array, spacing)
-    else:
-        raise ValueError(f"{name}: unknown kind of file; expected {', '.join(SUFFIXES)}{of_mrtrix(name)}")
+    given = {"array": array, "spacing": spacing, "confidence": confidence}
+    volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.OPTIONS})
     if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
         volume = replace(volume, digest=digest(name))
     return _finished(volume, mask, repair, unit)

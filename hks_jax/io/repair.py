@@ -1,4 +1,4 @@
-"""Tensors that are not positive definite: how many, where, and what may be done about them, if asked."""
+"""Tensors that are not positive definite: how many, where, and what is done about them, if asked."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,19 @@ from scipy import ndimage
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_number
 from hks_jax.domain import spd
-from hks_jax.domain.tensor_checks import MANY, least_eigenvalue, refuse, unsymmetric
+from hks_jax.domain.tensor_checks import (
+    MANY,
+    NUMBERS,
+    PositiveMap,
+    check_mapped,
+    check_number,
+    check_shift,
+    checked_map,
+    least_eigenvalue,
+    refuse,
+    require_finite_symmetric,
+    unsymmetric,
+)
 from hks_jax.io.volume import TensorVolume
 
 Repair = Literal["clip", "mask", "nearest"]
@@ -222,3 +234,44 @@ def _report(volume: TensorVolume, bad: np.ndarray, method: str, floor: float | N
         "box": [where.min(0).tolist(), where.max(0).tolist()] if len(where) else None,
         "first": where[:LISTED].tolist(),
     }
+
+
+def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
+    """Return the volume with all of its tensors S mapped to positive definite ones, for tensors such as stress.
+
+    ``"exp"`` takes exp(S/number), ``"shift"`` takes S + number·I: the maps of `hks_jax.TensorField.from_indefinite`.
+    The result is a metric itself: go on with ``metric="tensor"``.
+
+    Returns:
+        The volume; its ``repair`` holds the map, its number, and how many tensors of how many were not positive
+        definite before. A note says the same in a sentence.
+
+    Raises:
+        ValueError: an unknown map; NaN, infinite or unsymmetric tensors; a scale or shift that is too small.
+    """
+    how = checked_map(how)
+    check_number("tensors", how, number)
+    volume = without_background(volume)
+    inside, before = volume.inside, int(find_invalid(volume).sum())
+    require_finite_symmetric("tensors", volume.tensors, inside, "voxel")
+    check_shift("tensors", volume.tensors[inside], how, number)
+    values, vectors = np.linalg.eigh(volume.tensors[inside].astype(np.float64))
+    with np.errstate(over="ignore"):  # told below
+        values = np.exp(values / number) if how == "exp" else values + number
+        mapped = ((vectors * values[:, None, :]) @ np.swapaxes(vectors, -1, -2)).astype(volume.tensors.dtype)
+    check_mapped(volume.tensors[inside], mapped, how, number)
+    tensors = volume.tensors.copy()
+    tensors[inside] = 0.5 * (mapped + np.swapaxes(mapped, -1, -2))
+    formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
+    note = f"{formula} of all tensors S, {before} of {int(inside.sum())} of which are not positive definite"
+    report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
+    return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))
+
+
+def require_symmetric(volume: TensorVolume) -> None:
+    """Raise ValueError where a format that keeps one half of each tensor would lose the other."""
+    if unsymmetric := int(find_unsymmetric(volume).sum()):
+        raise ValueError(
+            f"volume: {unsymmetric} tensors are unsymmetric, and this format keeps one half of them only. Write their "
+            "symmetric part (T + Tᵀ)/2, or an .npz or .vti"
+        )

@@ -1,6 +1,5 @@
 """Writing results and tensors, whole or not at all, with where they came from."""
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,16 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.io import mesh, nifti, nrrd, vtk_image
-from hks_jax.io.provenance import describe, describe_tensors
-from hks_jax.io.repair import find_unsymmetric
-from hks_jax.io.volume import TensorVolume
-
-SUFFIXES = (".npz", ".nii.gz", ".nii", ".nrrd", ".vti")
-"""What results on a grid can be written as."""
+from hks_jax.io import mesh
+from hks_jax.io.arrays import write_npz
+from hks_jax.io.formats import WRITTEN, format_of
+from hks_jax.io.volume import TensorVolume, describe
+from hks_jax.io.vtk_image import by_time
 
 
 def save(
@@ -67,36 +63,21 @@ def save(
         ValueError: an unknown suffix, or values of another shape.
         ImportError: an optional library is missing; says what to install.
     """
-    array = np.asarray(values)
+    file, array = Path(path), np.asarray(values)
     shape = (len(volume.vertices),) if isinstance(volume, SimplicialMesh) else volume.shape
     n = array.ndim - len(shape)
     if n not in (0, 1) or array.shape[n:] != shape:
         raise ValueError(f"values: got shape {array.shape}; expected {shape}, or n_times before it")
     extra = dict(extra or {})
-    if isinstance(volume, SimplicialMesh):
-        record = describe(None, provenance)
-        if os.fspath(path).endswith(".npz"):
-            cells = {WORDS[volume.triangulation.dimension].argument: volume.triangulation.cells}
-            place = {"vertices": np.asarray(volume.vertices), **cells}
-            return _write_npz(path, {name: array, **place, **extra, "provenance": record})
-        return mesh.write(path, _by_time(name, array, n, extra), volume, record)
-    record = describe(volume, provenance)
-    if vtk_image.is_vtk_image(path):
-        return vtk_image.write(path, _by_time(name, array, n, extra), volume, record, extra)
-    if nifti.is_nifti(path) or nrrd.is_nrrd(path):
-        others = sorted(extra.keys() - {"times"})
-        if nifti.is_nifti(path) and others:
-            raise ValueError(f"extra: got {', '.join(others)}; NIfTI has no place for more arrays. Write an .npz too")
-        if volume.dimension == 2 and (nifti.is_nifti(path) or volume.affine is not None):
-            array = np.expand_dims(array, n + volume.thin_axis)
-        array = np.moveaxis(array, 0, -1) if n else array
-        if nrrd.is_nrrd(path):
-            return nrrd.write(path, array, volume, record, more=extra)
-        if "times" in extra:
-            _write_times(path, np.ravel(extra["times"]), name, volume)
-        return _write_nifti(path, array, volume, record, name=name)
-    slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
-    return _write_npz(path, {**_place(volume), name: array, **slice_axis, **extra, "provenance": record})
+    if not isinstance(volume, SimplicialMesh):
+        format_of(file, WRITTEN).write(file, array, volume, name, extra, describe(volume, provenance))
+    elif file.name.lower().endswith(".npz"):
+        cells = {WORDS[volume.triangulation.dimension].argument: volume.triangulation.cells}
+        place = {"vertices": np.asarray(volume.vertices), **cells}
+        write_npz(file, {name: array, **place, **extra, "provenance": describe(None, provenance)})
+    else:
+        mesh.write(file, by_time(name, array, n, extra), volume, describe(None, provenance))
+    return file
 
 
 def save_tensors(
@@ -120,86 +101,6 @@ def save_tensors(
         ValueError: an unknown suffix; NIfTI for a slice; unsymmetric tensors in NIfTI or NRRD.
         ImportError: an optional library is missing; says what to install.
     """
-    unsymmetric = int(find_unsymmetric(volume).sum())
-    if unsymmetric and (nrrd.is_nrrd(path) or nifti.is_nifti(path)):
-        raise ValueError(
-            f"volume: {unsymmetric} tensors are unsymmetric, and this format keeps one half of them only. Write their "
-            "symmetric part (T + Tᵀ)/2, or an .npz or .vti"
-        )
-    if nrrd.is_nrrd(path):
-        return nrrd.write_tensors(path, volume, describe_tensors(volume, "nrrd", "measurement", provenance))
-    if vtk_image.is_vtk_image(path):
-        return vtk_image.write_tensors(path, volume, describe_tensors(volume, "matrix", "world", provenance))
-    if not nifti.is_nifti(path):
-        record = describe_tensors(volume, "matrix", "voxel", provenance)
-        units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
-        return _write_npz(
-            path, {"tensors": volume.tensors, **_place(volume), "frame": "voxel", **units, "provenance": record}
-        )
-    if volume.dimension != 3:
-        raise ValueError(
-            "volume: NIfTI has no 2×2 tensors; write the volume that the slice is of, or an .npz, .nrrd or .vti"
-        )
-    record = describe_tensors(volume, "nifti", "voxel", provenance)
-    return _write_nifti(path, nifti.symmetric_matrix(volume), volume, record, symmetric=True)
-
-
-def _by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return one array per time, by names that say which."""
-    if n == 0:
-        return {name: array}
-    times = np.ravel(extra.get("times", ()))
-    labels = [f"{name}_{i}" + (f"_t{times[i]:.6g}" if len(times) == len(array) else "") for i in range(len(array))]
-    return dict(zip(labels, array, strict=True))
-
-
-def _place(volume: TensorVolume) -> dict[str, Any]:
-    optional = {"mask": volume.mask, "affine": volume.affine}
-    given = {key: value for key, value in optional.items() if value is not None}
-    return {"spacing": volume.spacing, "origin": volume.origin, **given}
-
-
-def _write_nifti(
-    path: str | os.PathLike[str],
-    array: np.ndarray,
-    volume: TensorVolume,
-    record: str,
-    *,
-    name: str = "",
-    symmetric: bool = False,
-) -> Path:
-    nib = nifti.nibabel()
-    if array.dtype not in (np.float32, np.float64):
-        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
-    image = nib.Nifti1Image(array, volume.volume_affine)
-    image.header.set_xyzt_units("mm")
-    image.header.extensions.append(nib.nifti1.Nifti1Extension("comment", record.encode()))
-    if symmetric:
-        image.header.set_intent(nifti.SYMMETRIC_MATRIX, (3,))
-    else:
-        image.header["intent_name"] = name[:15].encode()
-    with atomic_path(path) as temporary:
-        nib.save(image, temporary)
-    return Path(path)
-
-
-def _write_times(path: str | os.PathLike[str], times: np.ndarray, name: str, volume: TensorVolume) -> None:
-    """Write the times of an image's fourth axis beside it, as JSON."""
     file = Path(path)
-    suffix = next(s for s in sorted(nifti.SUFFIXES, key=len, reverse=True) if file.name.lower().endswith(s))
-    sidecar = file.with_name(file.name[: -len(suffix)] + ".json")
-    content = {
-        "Quantity": name,
-        "Times": times.tolist(),
-        "Sources": [Path(volume.source).name] if volume.source else [],
-    }
-    with atomic_path(sidecar) as temporary:
-        Path(temporary).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
-def _write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
-    if not os.fspath(path).endswith(".npz"):
-        raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in {', '.join(SUFFIXES)}")
-    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(stream, **arrays)
-    return Path(path)
+    format_of(file, WRITTEN).write_tensors(file, volume, provenance)
+    return file

@@ -1,6 +1,7 @@
 """Units: of lengths as headers declare them, and of diffusivities, which hardly any header does."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -58,6 +59,11 @@ def millimetres(where: str, text: str) -> float | None:
     return scale
 
 
+def by_axis(values: Iterable[float]) -> str:
+    """Write a number for each axis, as in ``2 × 2 × 2.5``."""
+    return " × ".join(f"{value:.5g}" for value in values)
+
+
 def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Return the affine of an image that declares no unit of length, in mm as `affine`, beside which it belongs.
 
@@ -94,7 +100,7 @@ def length_question(volume: TensorVolume) -> str:
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""
     return (
-        f"Wrong unit of length? Voxels of {' × '.join(f'{h:.5g}' for h in volume.spacing)} mm are none that scans "
+        f"Wrong unit of length? Voxels of {by_axis(volume.spacing)} mm are none that scans "
         f"have, {low:g} to {high:g} mm, and t goes with the square. Correct the unit in the header (NIfTI: xyzt_units; "
         "NRRD: space units), or the voxel sizes"
     )

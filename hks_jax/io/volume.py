@@ -1,5 +1,8 @@
-"""A field of diffusion tensors as it came from a file: NumPy arrays and where they lie in space."""
+"""A field of diffusion tensors as it came from a file: NumPy arrays, where they lie in space, where they came from."""
 
+import hashlib
+import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -7,10 +10,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hks_jax import __version__
 from hks_jax.checks import require_real
 from hks_jax.describe import describe_array
 from hks_jax.domain.grid import Grid
-from hks_jax.io.order_check import InvalidByOrder
+from hks_jax.io.tensor_order import InvalidByOrder
 
 AXES = "xyz"
 
@@ -177,3 +181,59 @@ class TensorVolume:
     def thin_axis(self) -> int:
         """For a slice, the axis along which it is one voxel thick as a volume: z unless it was cut otherwise."""
         return 2 if self.slice_axis is None else self.slice_axis
+
+
+def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
+    """Return scalars (*shape,) or (n_times, *shape) as image files have them: slices one voxel thick, times last."""
+    n = array.ndim - volume.dimension
+    if volume.dimension == 2:
+        array = np.expand_dims(array, n + volume.thin_axis)
+    return np.moveaxis(array, 0, -1) if n else array
+
+
+def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
+    """Return zeros and ones as booleans; raise ValueError for anything else."""
+    array = np.asarray(values)
+    require_real(name, array)
+    if array.dtype != bool and not np.isin(array, (0, 1)).all():
+        raise ValueError(f"{name}: got mask values other than 0 and 1; threshold it first, for example mask > 0.5")
+    return array.astype(bool)
+
+
+def digest(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file's bytes, in hexadecimal."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str:
+    """Return one line of JSON: the version, the tensors' file and what was decided in reading it, and `more`."""
+    record: dict[str, Any] = {"software": f"hks-jax {__version__}"}
+    if volume is not None:
+        record |= {"source": volume.source, "sha256": volume.digest, "order": volume.order, "frame": volume.frame}
+        record |= {"notes": list(volume.notes)}
+    return json.dumps({**record, **(more or {})}, default=_plain)  # in ASCII, which NRRD's header needs
+
+
+def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:
+    """Return the same of tensors that are written: their order, frame, axes and units are those in the new file.
+
+    What the file had that they came from is ``source_order`` and ``source_frame``.
+    """
+    stored = {"order": order, "frame": frame, "source_order": volume.order, "source_frame": volume.frame}
+    stored |= {"axes": volume.volume_affine[:3, :3].tolist(), "length_unit": volume.length_unit, "unit": volume.unit}
+    return describe(volume, {**stored, **(more or {})})
+
+
+def own_record(text: str | bytes) -> dict[str, Any]:
+    """Return what `describe_tensors` wrote; empty where the text is anything else."""
+    try:
+        record = json.loads(text.rstrip(b"\0") if isinstance(text, bytes) else text)
+    except ValueError:
+        return {}
+    ours = isinstance(record, dict) and str(record.get("software", "")).startswith("hks-jax ")
+    return record if ours and "source_frame" in record else {}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

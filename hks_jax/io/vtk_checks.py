@@ -12,28 +12,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-_BYTES = {
-    name: size
-    for names, size in (
-        ("Int8 UInt8", 1),
-        ("Int16 UInt16", 2),
-        ("Int32 UInt32 Float32", 4),
-        ("Int64 UInt64 Float64", 8),
-    )
-    for name in names.split()
-}
+_BYTES = {f"{kind}{bits}": bits // 8 for kind in ("Int", "UInt") for bits in (8, 16, 32, 64)}
+_BYTES |= {"Float32": 4, "Float64": 8}
 _DECOMPRESSORS: dict[str, Callable[[bytes], bytes] | None] = {
     "vtkZLibDataCompressor": zlib.decompress,
     "vtkLZMADataCompressor": lzma.decompress,
     "vtkLZ4DataCompressor": None,  # VTK's own; here only its sizes are known
 }
-_CELLS = {
-    "Cells": "NumberOfCells",
-    "Verts": "NumberOfVerts",
-    "Lines": "NumberOfLines",
-    "Strips": "NumberOfStrips",
-    "Polys": "NumberOfPolys",
-}
+_CELLS = {name: f"NumberOf{name}" for name in ("Cells", "Verts", "Lines", "Strips", "Polys")}
 _PLACE = {"Origin": 3, "Spacing": 3, "Direction": 9}
 
 _TYPES = rb"(?:bit|(?:unsigned_)?(?:char|short|int|long)|vtkidtype|vtktypeu?int\d+|float|double|string)\b"

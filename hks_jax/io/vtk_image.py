@@ -12,18 +12,16 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.order_check import invalid_by_order
-from hks_jax.io.tensor_order import choices, nearest_rotation, to_voxel_axes, unpack
-from hks_jax.io.volume import TensorVolume
+from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, to_voxel_axes, unpack
+from hks_jax.io.volume import TensorVolume, as_mask, describe_tensors
 from hks_jax.io.vtk_checks import check_legacy, check_xml
+from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".vti", ".vtk")
-
-
-def is_vtk_image(path: str | os.PathLike[str]) -> bool:
-    """Tell by the name whether a file may be VTK image data; a .vtk file may hold a mesh instead."""
-    return os.fspath(path).lower().endswith(SUFFIXES)
+WRITTEN = (".vti",)
+IMAGE = ".vti"
+OPTIONS = ("array",)
 
 
 def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
@@ -33,16 +31,6 @@ def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
     return head.startswith(b"# vtk DataFile") and kind.encode() in head.upper()
 
 
-def require_vtk() -> None:
-    """Raise ImportError, and say what to install, where VTK is missing."""
-    try:
-        import vtkmodules.vtkIOXML  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            'reading and writing VTK images needs VTK, which is not installed: pip install "hks-jax[vtk]"'
-        ) from error
-
-
 def load(path: str | os.PathLike[str]) -> Any:
     """Return the vtkImageData of a file.
 
@@ -50,7 +38,7 @@ def load(path: str | os.PathLike[str]) -> Any:
         FileNotFoundError: no such file.
         ValueError: not image data, or a damaged file.
     """
-    require_vtk()
+    optional("vtkmodules.vtkIOXML")
     from vtkmodules.vtkIOLegacy import vtkStructuredPointsReader
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
@@ -139,19 +127,45 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
 
 
 def write(
-    path: str | os.PathLike[str],
+    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
+) -> None:
+    """Write scalars as arrays of points, one per time; see `hks_jax.io.save`."""
+    _write(path, by_time(name, array, array.ndim - volume.dimension, extra), volume, record, extra)
+
+
+def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
+    """Write tensors, along the axes of space; those of a slice with zeros out of its plane."""
+    tensors = volume.tensors
+    if volume.dimension == 2:
+        keep = [a for a in range(3) if a != volume.thin_axis]
+        tensors = np.zeros((*volume.shape, 3, 3), tensors.dtype)
+        tensors[..., np.ix_(keep, keep)[0], np.ix_(keep, keep)[1]] = volume.tensors
+    rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
+    record = describe_tensors(volume, "matrix", "world", provenance)
+    _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record)
+
+
+def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return one array per time, where `n` is 1, by names that say which."""
+    if n == 0:
+        return {name: array}
+    times = np.ravel(extra.get("times", ()))
+    labels = [f"{name}_{i}" + (f"_t{times[i]:.6g}" if len(times) == len(array) else "") for i in range(len(array))]
+    return dict(zip(labels, array, strict=True))
+
+
+def _write(
+    path: Path,
     arrays: Mapping[str, np.ndarray],
     volume: TensorVolume,
     record: str,
     more: Mapping[str, Any] | None = None,
-) -> Path:
+) -> None:
     """Write point arrays over the voxels of a volume, the mask, and `more` and the provenance as field data.
 
     Arrays are (*shape,) or (*shape, 3, 3), the latter as tensors along the axes of space.
     """
-    if not os.fspath(path).lower().endswith(".vti"):
-        raise ValueError(f"path: got {os.fspath(path)!r}; VTK images are written as .vti")
-    require_vtk()
+    optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkCommonDataModel import vtkImageData
@@ -189,18 +203,6 @@ def write(
         writer.SetInputData(image)
         if not writer.Write():
             raise OSError(f"{path}: VTK could not write it")
-    return Path(path)
-
-
-def write_tensors(path: str | os.PathLike[str], volume: TensorVolume, record: str) -> Path:
-    """Write tensors, along the axes of space; those of a slice with zeros out of its plane."""
-    tensors = volume.tensors
-    if volume.dimension == 2:
-        keep = [a for a in range(3) if a != volume.thin_axis]
-        tensors = np.zeros((*volume.shape, 3, 3), tensors.dtype)
-        tensors[..., np.ix_(keep, keep)[0], np.ix_(keep, keep)[1]] = volume.tensors
-    rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
-    return write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record)
 
 
 def _check_length(name: str, array: Any) -> None:
@@ -251,8 +253,6 @@ def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def _mask(attributes: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "nx ny nz"] | None:
     from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    from hks_jax.io.masks import as_mask
 
     array = _arrays(attributes).get("mask")
     return None if array is None else as_mask("mask", np.ascontiguousarray(_on_grid(vtk_to_numpy(array), shape)))

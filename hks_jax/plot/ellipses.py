@@ -1,14 +1,16 @@
-"""Ellipses of a tensor field."""
+"""Ellipses of a tensor field, and crosses of symmetric tensors of either sign, such as derivatives."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.lines import Line2D
 
+from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import colour_bar, frame, require_plane, side_in_inches
+from hks_jax.plot.figure import colour_bar, frame, legend_below, require_plane, side_in_inches
 
 
 def ellipses(
@@ -54,8 +56,7 @@ def ellipses(
         raise ValueError(f'sizes: got {sizes!r}; expected "common" or "fit"')
     if not 0 < fill <= 1:
         raise ValueError(f"fill: got {fill}; expected a number in (0, 1]; ellipses overlap beyond 1")
-    steps = node_steps(grid.shape, grid.spacing, every, ax)
-    pick = tuple(centred(n, s) for n, s in zip(grid.shape, steps, strict=True))
+    steps, pick = nodes_drawn(grid, every, ax)
     inside = grid.inside[pick]
     if not inside.any():
         raise ValueError(f"every: got {every}; no node drawn lies inside the mask. Use a smaller step")
@@ -104,22 +105,78 @@ def ellipses(
     return collection
 
 
-def centred(n: int, step: int) -> slice:
-    """Return every step-th of n nodes: as many as there is room for, in the middle."""
-    count = max(1, n // step)
-    first = (n - count * step) // 2 + step // 2
-    return slice(first, first + (count - 1) * step + 1, step)
+def nodes_drawn(grid: Grid, every: int | Sequence[int] | None, ax: Axes) -> tuple[tuple[int, ...], tuple[slice, ...]]:
+    """Return the step along each axis, and which nodes are drawn: as many as there is room for, in the middle.
 
-
-def node_steps(
-    shape: tuple[int, ...], spacing: tuple[float, ...], every: int | Sequence[int] | None, ax: Axes
-) -> tuple[int, ...]:
-    """Return the step along each axis: as given, or for some 10 nodes an inch of the longer side, 24 at most."""
+    Steps are as given, or for some 10 nodes an inch of the longer side, 24 at most.
+    """
     if every is None:
-        width, height = (n * h for n, h in zip(shape, spacing, strict=True))
+        width, height = (n * h for n, h in zip(grid.shape, grid.spacing, strict=True))
         cell = max(width, height) / min(24, max(4, 10.5 * side_in_inches(ax, (width, height))))
-        return tuple(max(1, round(cell / h)) for h in spacing)
-    steps = np.broadcast_to(np.asarray(every), (len(shape),))
-    if not np.issubdtype(steps.dtype, np.integer) or steps.min() < 1:
-        raise ValueError(f"every: got {every}; expected positive integers, one or {len(shape)}")
-    return tuple(int(s) for s in steps)
+        steps = tuple(max(1, round(cell / h)) for h in grid.spacing)
+    else:
+        given = np.broadcast_to(np.asarray(every), (grid.dimension,))
+        if not np.issubdtype(given.dtype, np.integer) or given.min() < 1:
+            raise ValueError(f"every: got {every}; expected positive integers, one or {grid.dimension}")
+        steps = tuple(given.tolist())
+    counts = [max(1, n // step) for n, step in zip(grid.shape, steps, strict=True)]
+    firsts = [(n - m * s) // 2 + s // 2 for n, m, s in zip(grid.shape, counts, steps, strict=True)]
+    return steps, tuple(slice(a, a + (m - 1) * s + 1, s) for a, m, s in zip(firsts, counts, steps, strict=True))
+
+
+def sensitivity(
+    ax: Axes,
+    grid: Grid,
+    gradient: Any,
+    every: int | Sequence[int] | None = None,
+    *,
+    power: float = 0.5,
+    colors: tuple[str, str] = ("#b2182b", "#2166ac"),
+    fill: float = 0.95,
+    legend: bool = True,
+    **kwargs: Any,
+) -> LineCollection:
+    """Draw the derivative of a number with respect to the tensors: which one, in which direction, drives it.
+
+    At each node a cross of two bars along the eigenvectors of the gradient, of lengths |μ|^power for its eigenvalues μ:
+    in the first colour where the number grows with the metric's length in that direction, in the second where it falls.
+
+    Args:
+        ax: the axes to draw on.
+        grid: the 2D grid.
+        gradient: (*shape, 2, 2) symmetric, as `jax.grad` returns it; nodes outside the mask are left out.
+        every: draw every such node (one number or one per axis); None: about 24 along the longer side. The gradient
+            is of the drawn nodes, not of the area around them.
+        power: below 1 shows small derivatives beside large ones.
+        colors: for positive and negative eigenvalues.
+        fill: the part of its cell that the longest bar may fill.
+        legend: whether to say what the colours mean.
+        **kwargs: passed to `matplotlib.collections.LineCollection`.
+
+    Raises:
+        ValueError: a 3D grid, a gradient of another shape, or NaN inside the mask.
+    """
+    require_plane("grid", grid)
+    array = np.asarray(gradient, dtype=np.float64)
+    if array.shape != (*grid.shape, 2, 2):
+        raise ValueError(f"gradient: got shape {array.shape}; expected {(*grid.shape, 2, 2)}, as jax.grad returns it")
+    steps, pick = nodes_drawn(grid, every, ax)
+    inside = grid.inside[pick]
+    matrices, centres = array[pick][inside], grid.nodes[pick][inside]
+    if not np.isfinite(matrices).all():
+        bad = int((~np.isfinite(matrices)).any(axis=(1, 2)).sum())
+        raise ValueError(f"gradient: {bad} of {len(matrices)} tensors drawn are NaN or infinite; expected finite ones")
+    eigenvalues, vectors = np.linalg.eigh((matrices + np.swapaxes(matrices, 1, 2)) / 2)
+    lengths = np.abs(eigenvalues) ** power
+    cell = min(s * h for s, h in zip(steps, grid.spacing, strict=True))
+    lengths *= 0.5 * fill * cell / max(lengths.max(initial=0.0), np.finfo(float).tiny)
+    ends = np.einsum("nai,ni->nia", vectors, lengths)
+    bars = np.stack([centres[:, None] - ends, centres[:, None] + ends], axis=2).reshape(-1, 2, 2)
+    chosen = np.where(eigenvalues.ravel() > 0, colors[0], colors[1])
+    collection = LineCollection(list(bars), **{"colors": list(chosen), "linewidths": 1.2, **kwargs})
+    frame(ax, grid)
+    ax.add_collection(collection, autolim=False)
+    if legend:
+        handles = [Line2D([], [], color=c, label=text) for c, text in zip(colors, ("grows", "falls"), strict=True)]
+        legend_below(ax, handles)
+    return collection

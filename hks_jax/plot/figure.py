@@ -2,7 +2,6 @@
 
 import math
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, Locator, MaxNLocator, ScalarFormatter
 from matplotlib.transforms import ScaledTranslation
 
+from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
 
 SMALL = "small"
@@ -44,18 +44,8 @@ def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) 
             f"path: got {str(target)!r}; expected a name that ends in a format matplotlib can write "
             f"({', '.join(sorted(formats))})"
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    try:
+    with atomic_path(target) as temporary:
         fig.savefig(temporary, dpi=dpi, format=suffix)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp's files are private; pictures are like any other file
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
     return target
 
 
@@ -72,6 +62,14 @@ def cell_extent(grid: Grid) -> tuple[float, float, float, float]:
     """Return (x_min, x_max, y_min, y_max) of the nodes' cells: half a spacing beyond the outermost nodes."""
     (x0, x1, y0, y1), (hx, hy) = grid.extent, grid.spacing
     return x0 - hx / 2, x1 + hx / 2, y0 - hy / 2, y1 + hy / 2
+
+
+def panel_size(grid: Grid, side: float, steepest: float = 4.0) -> tuple[float, float]:
+    """Return an image's width and height: `side`, or less width where it is high, their ratio at most `steepest`."""
+    x0, x1, y0, y1 = cell_extent(grid)
+    aspect = min(max((y1 - y0) / (x1 - x0), 1 / steepest), steepest)
+    width = side / max(1.0, aspect**0.5)
+    return width, width * aspect
 
 
 def frame(ax: Axes, grid: Grid) -> None:

@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.ellipses import ellipses
-from hks_jax.plot.figure import SMALL, cell_extent, new_figure, number_text, require_plane
+from hks_jax.plot.figure import SMALL, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.images import scalar_image
 from hks_jax.plot.orientation import Orientation
 
@@ -75,11 +75,9 @@ def fit_panels(
     drawn = np.abs(difference[rows][:, grid.inside])
     limit = max(float(np.max(drawn[np.isfinite(drawn)], initial=0.0)), LEAST_DIFFERENCE)
 
-    x0, x1, y0, y1 = cell_extent(grid)
-    aspect = min(max((y1 - y0) / (x1 - x0), 0.25), 4.0)
-    width = 2.5 / max(1.0, aspect**0.5)
+    width, height = panel_size(grid, 2.5)
     # The lowest row is no lower than a curve needs.
-    heights = [width * aspect] * len(rows) + [max(width * aspect, 1.8)]
+    heights = [height] * len(rows) + [max(height, 1.8)]
     figure = new_figure(3 * (width + 0.9) + 0.4, sum(heights) + 0.3 * len(heights) + 0.6 + 0.3 * bool(title))
     # Apart, because the last row's labels would else widen the columns above.
     halves = figure.add_gridspec(2, 1, height_ratios=[sum(heights[:-1]), heights[-1]])

@@ -14,7 +14,16 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import cell_extent, colour_bar, frame, new_figure, number_text, require_plane, save_figure
+from hks_jax.plot.figure import (
+    cell_extent,
+    colour_bar,
+    frame,
+    new_figure,
+    number_text,
+    panel_size,
+    require_plane,
+    save_figure,
+)
 from hks_jax.plot.orientation import Orientation
 
 FADED = 2.0
@@ -72,13 +81,12 @@ def scalar_image(
         array = orientation.array(array)
         opacity = None if opacity is None else orientation.array(opacity)
         grid = orientation.grid(grid)
-    colours = colours_of(array.compressed(), quantiles, least_range, centre)
-    low, high = colours.low if vmin is None else vmin, colours.high if vmax is None else vmax
+    low, high, own = colours_of(array.compressed(), quantiles, least_range, centre, (vmin, vmax))
     image = ax.imshow(
         array.T,
         origin="lower",
         extent=cell_extent(grid),
-        cmap=cmap or colours.cmap,
+        cmap=cmap or own,
         vmin=low,
         vmax=high,
         **{"interpolation": "nearest", **kwargs},
@@ -143,11 +151,12 @@ def hks_panels(
     images = [masked("values", v, grid) for v in np.asarray(values)]
     everything = np.concatenate([image.compressed() for image in images])
     if shared_range:
-        low, high, own = colours_of(everything, quantiles, least_range, centre)
-        vmin, vmax, cmap = low if vmin is None else vmin, high if vmax is None else vmax, cmap or own
+        vmin, vmax, own = colours_of(everything, quantiles, least_range, centre, (vmin, vmax))
+        cmap = cmap or own
 
     rows, columns = _layout(t.size)
-    fig = _panel_figure(grid if orientation is None else orientation.grid(grid), rows, columns, bool(suptitle))
+    width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
+    fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
     panels = fig.subplots(rows, columns, squeeze=False)
     for index, ax in enumerate(panels.flat):
         if index >= t.size:
@@ -167,13 +176,13 @@ def hks_panels(
 
 
 def panel_titles(
-    values: Any, times: Any, grid: Grid, titles: Sequence[str] | None, unit: str
+    values: Any, times: Any, grid: Grid, titles: Sequence[str] | None, unit: str, name: str = "values"
 ) -> tuple[Float[np.ndarray, " n_times"], Sequence[str]]:
     """Return the times and a title for each; raise ValueError if they, the values and the grid do not agree."""
     t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if np.shape(values) != (t.size, *grid.shape) or t.ndim != 1 or t.size == 0:
         raise ValueError(
-            f"values: got shape {np.shape(values)} and times of shape {t.shape}; expected "
+            f"{name}: got shape {np.shape(values)} and times of shape {t.shape}; expected "
             f"(n_times, *grid.shape) = {(t.size, *grid.shape)} and at least one time"
         )
     if titles is None:
@@ -211,9 +220,13 @@ class Colours(NamedTuple):
 
 
 def colours_of(
-    values: np.ndarray, quantiles: tuple[float, float], least_range: float = 1e-6, centre: float | None = None
+    values: np.ndarray,
+    quantiles: tuple[float, float],
+    least_range: float = 1e-6,
+    centre: float | None = None,
+    limits: tuple[float | None, float | None] = (None, None),
 ) -> Colours:
-    """Return the colours of values; see `scalar_image`."""
+    """Return the colours of values; see `scalar_image`, whose vmin and vmax are the limits."""
     low, high = (float(q) for q in np.quantile(values, quantiles))
     cmap = "viridis"
     if centre is not None:
@@ -223,7 +236,8 @@ def colours_of(
         if reach or low == high:
             low, high, cmap = centre - reach, centre + reach, "RdBu_r"
     lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
-    return Colours(low - max(lacking, 0) / 2, high + max(lacking, 0) / 2, cmap)
+    low, high = low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
+    return Colours(low if limits[0] is None else limits[0], high if limits[1] is None else limits[1], cmap)
 
 
 def _layout(n: int) -> tuple[int, int]:
@@ -232,11 +246,3 @@ def _layout(n: int) -> tuple[int, int]:
         return 1, n
     columns = min(range(3, 6), key=lambda c: (-n % c, math.ceil(n / c)))
     return math.ceil(n / columns), columns
-
-
-def _panel_figure(grid: Grid, rows: int, columns: int, has_title: bool) -> Figure:
-    x0, x1, y0, y1 = cell_extent(grid)
-    aspect = min(max((y1 - y0) / (x1 - x0), 0.2), 5.0)
-    width = 2.6 / max(1.0, aspect**0.5)
-    height = width * aspect
-    return new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * has_title)

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import SMALL, cell_extent, new_figure, number_text, require_plane
-from hks_jax.plot.images import scalar_image
+from hks_jax.plot.figure import SMALL, new_figure, panel_size, require_plane
+from hks_jax.plot.images import panel_titles, scalar_image
 
 
 def time_rows(
@@ -43,24 +43,14 @@ def time_rows(
         ValueError: no rows or times; values that are not one image per time; another `shared`.
     """
     require_plane("grid", grid)
-    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if shared not in ("none", "row"):
         raise ValueError(f'shared: got {shared!r}; expected "none" or "row"')
-    if not rows or t.ndim != 1 or t.size == 0:
-        raise ValueError(
-            f"rows, times: got {len(rows)} rows and times of shape {t.shape}; expected one or more of each"
-        )
+    if not rows:
+        raise ValueError("rows: got none; expected one scalar or more")
     for name, values in rows.items():
-        if np.shape(values) != (t.size, *grid.shape):
-            raise ValueError(
-                f"rows: got {name!r} of shape {np.shape(values)}; expected (n_times, *grid.shape) = "
-                f"{(t.size, *grid.shape)}"
-            )
-    x0, x1, y0, y1 = cell_extent(grid)
-    aspect = min(max((y1 - y0) / (x1 - x0), 0.25), 4.0)
-    width = 1.9 / max(1.0, aspect**0.5)
-    size = (t.size * (width + 0.65) + 0.6, len(rows) * (width * aspect + 0.2) + 0.5 + 0.3 * bool(suptitle))
-    figure = new_figure(*size)
+        t, titles = panel_titles(values, times, grid, None, unit, f"rows: {name}")
+    width, height = panel_size(grid, 1.9)
+    figure = new_figure(t.size * (width + 0.65) + 0.6, len(rows) * (height + 0.2) + 0.5 + 0.3 * bool(suptitle))
     panels = figure.subplots(len(rows), t.size, squeeze=False)
     for line, (name, values) in zip(panels, rows.items(), strict=True):
         images = np.asarray(values, dtype=np.float64)
@@ -73,8 +63,8 @@ def time_rows(
             scalar_image(ax, image, grid, cmap=colours, vmin=low, vmax=high, quantiles=quantiles)
             ax.set(xticks=[], yticks=[])
         line[0].set_ylabel(name, fontsize=SMALL)
-    for ax, value in zip(panels[0], t, strict=True):
-        ax.set_title(f"$t$ = {number_text(value)}{' ' * bool(unit)}{unit}", fontsize="medium")
+    for ax, title in zip(panels[0], titles, strict=True):
+        ax.set_title(title, fontsize="medium")
     if suptitle:
         figure.suptitle(suptitle)
     return figure

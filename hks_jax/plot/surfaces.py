@@ -1,18 +1,26 @@
-"""Triangulated surfaces in space, and the boundaries of solids, coloured by a scalar."""
+"""Surfaces in space: those of meshes, coloured by a scalar, and those of equal value in a volume."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Real
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.optional import optional
+from hks_jax.plot.images import colours_of, masked
+from hks_jax.plot.volumes import require_volume
 
 
 def surface(
@@ -77,3 +85,124 @@ def surface(
     ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # of the former its corners show
     ax.set_axis_off()
     return mappable
+
+
+def isosurfaces(
+    ax: Axes,
+    values: Real[ArrayLike, "nx ny nz"],
+    grid: Grid,
+    *,
+    levels: int | Sequence[float] = 4,
+    cmap: str | Colormap = "viridis",
+    vmin: float | None = None,
+    vmax: float | None = None,
+    quantiles: tuple[float, float] = (0.0, 1.0),
+    opacity: float = 0.4,
+    view: tuple[float, float, float] = (1.0, -1.6, 0.9),
+    zoom: float = 1.0,
+    outline: bool = True,
+    resolution: float = 200.0,
+) -> ScalarMappable:
+    """Render surfaces of equal value on axes, seen from afar, and return what a colour bar needs.
+
+    The rendering is an image in the axes, of the size that they have now. It needs PyVista
+    (``pip install "hks-jax[pyvista]"``) and, without a display, EGL or OSMesa.
+
+    Args:
+        ax: two-dimensional axes; their frame and ticks are taken off.
+        values: (*shape,), NaN where there is nothing to draw. Surfaces end at elements with such a node.
+        grid: the 3D grid of the values.
+        levels: the values of the surfaces, or how many, evenly between the first and the last colour's.
+        cmap: colour map.
+        vmin: value of the first colour; None: from `quantiles`.
+        vmax: value of the last colour; None: from `quantiles`.
+        quantiles: the values' quantiles that take the first and the last colour where vmin and vmax do not say.
+        opacity: of each surface, from 0 to 1.
+        view: the direction from the volume to the viewer; z is up.
+        zoom: the size of the volume in its axes.
+        outline: whether to draw the grid's box, the rim of the mask if there is one, and the directions of the axes.
+        resolution: pixels per inch.
+
+    Raises:
+        ImportError: PyVista is not installed.
+        ValueError: a grid that is not 3D, values that are not of its shape or nowhere finite, no level, an opacity
+            that is not between 0 and 1, a view along z or from nowhere.
+    """
+    require_volume(grid)
+    array = masked("values", values, grid)
+    low, high, _ = colours_of(array.compressed(), quantiles, limits=(vmin, vmax))
+    heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
+    if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
+        raise ValueError(f"levels: got {levels}; expected a number from 1, or finite values")
+    if not 0 < opacity <= 1:
+        raise ValueError(f"opacity: got {opacity}; expected more than 0 and at most 1")
+    if not np.isfinite(view).all() or np.hypot(view[0], view[1]) == 0:
+        raise ValueError(f"view: got {view}; expected a direction that is not along z")
+    pyvista = optional("pyvista")
+    with _quiet_about_displays():
+        plotter = pyvista.Plotter(off_screen=True, window_size=_pixels(ax, resolution))
+        try:
+            domain = _domain(pyvista, array, grid)
+            surfaces = domain.contour(heights, scalars="values")
+            if surfaces.n_points:
+                style = {"ambient": 0.3, "specular": 0.2, "smooth_shading": True, "show_scalar_bar": False}
+                plotter.add_mesh(surfaces, scalars="values", cmap=cmap, clim=(low, high), opacity=opacity, **style)
+            if outline:
+                plotter.add_mesh(domain.outline(), color="#808080", line_width=2)
+                if array.mask.any():
+                    plotter.add_mesh(_rim(pyvista, domain), color="#999999", opacity=0.12, smooth_shading=True)
+                plotter.add_axes(color="black", line_width=3)
+            plotter.enable_parallel_projection()
+            plotter.view_vector(view, viewup=(0, 0, 1))
+            plotter.reset_camera(bounds=domain.bounds)
+            plotter.camera.zoom(1.1 * zoom)
+            plotter.enable_depth_peeling(8)
+            plotter.enable_anti_aliasing("ssaa")
+            picture = plotter.screenshot(return_img=True)
+        finally:
+            plotter.close()
+    ax.imshow(picture)
+    ax.set_axis_off()
+    mappable = ScalarMappable(Normalize(low, high), cmap)
+    mappable.set_array(array.compressed())
+    return mappable
+
+
+def _domain(pyvista: ModuleType, array: np.ma.MaskedArray, grid: Grid) -> Any:
+    """Return the elements all of whose nodes have a value, with the values at their points."""
+    image = pyvista.ImageData(dimensions=grid.shape, spacing=grid.spacing, origin=grid.origin)
+    image.point_data["values"] = array.filled(0.0).ravel(order="F")  # VTK's first axis runs fastest
+    known = ~np.ma.getmaskarray(array)
+    inside = np.ones([n - 1 for n in grid.shape], dtype=bool)
+    for corner in np.ndindex(2, 2, 2):
+        inside &= known[tuple(slice(c, c + n) for c, n in zip(corner, inside.shape, strict=True))]
+    return image.extract_cells(np.flatnonzero(inside.ravel(order="F")))
+
+
+def _rim(pyvista: ModuleType, domain: Any) -> Any:
+    """Return the surface of the domain."""
+    from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
+
+    surface = vtkGeometryFilter()
+    surface.SetInputData(domain)
+    surface.Update()
+    return pyvista.wrap(surface.GetOutput())
+
+
+def _pixels(ax: Axes, resolution: float) -> tuple[int, int]:
+    """Return the axes' size in pixels."""
+    width, height = ax.get_figure().get_size_inches() * ax.get_position().size  # type: ignore[union-attr]
+    return max(round(resolution * width), 64), max(round(resolution * height), 64)
+
+
+@contextmanager
+def _quiet_about_displays() -> Iterator[None]:
+    """Keep VTK from writing that there is no display: it then takes EGL or OSMesa, which need none."""
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    cutoff = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    try:
+        yield
+    finally:
+        vtkLogger.SetStderrVerbosity(cutoff)
