@@ -67,7 +67,8 @@ def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
     """Return what a function makes of NumPy's arrays in place of JAX's, as JAX's arrays."""
     known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
     with np.errstate(all="ignore"):
-        return jax.tree.map(jnp.asarray, function(*known))
+        # `asarray` leaves them NumPy's where JAX differentiates.
+        return jax.device_put(jax.tree.map(np.asarray, function(*known)))
 
 
 def known_and_few(args: Any) -> bool:

@@ -30,7 +30,7 @@ field, out = hj.TensorField(hj.Grid({SHAPE}, 0.1), given["tensors"]), {{}}
 for boundary, solver in CASES:
     pairs = hj.eigenpairs(field, K, boundary, solver)
     name = f"{{boundary}} {{solver}} "
-    assert {{leaf.dtype.name for leaf in jax.tree.leaves(pairs)}} == {{"float32", "bool", "int32"}}
+    assert {{leaf.dtype.name for leaf in jax.tree.leaves(pairs)}} <= {{"float32", "bool", "int32"}}
     times = jnp.array([3.0, 9.0])
     # What is computed from pairs does not depend on how they were found.
     others = []

@@ -36,7 +36,8 @@ class Dense(Eigensolver[SymmetricPencil]):
         dtype = pencil.stiffness.dtype
         stiffness, mass = (matrix.toarray() for matrix in matrices(*data))
         values, vectors = _on_host(stiffness, mass, k)
-        return jnp.asarray(values, dtype), jnp.asarray(vectors, dtype), jnp.asarray(jnp.inf, dtype)
+        # `asarray` would leave them NumPy's where JAX differentiates.
+        return jax.device_put((values.astype(dtype), vectors.astype(dtype), np.asarray(np.inf, dtype)))
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return all the pairs beyond k: they cost nothing, and leave no complement to solve on."""
