@@ -624,7 +624,7 @@ def test_a_bar_and_the_time_left_on_a_terminal(monkeypatch):
             return True
 
     monkeypatch.setattr("hks_jax.cli.progress.TICK", 0.01)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((60, 24)))
+    monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((60, 24)))
     progress = Progress()
     progress.stream = Terminal()
     with progress.stage("eigenpairs", "9 of 99"):
