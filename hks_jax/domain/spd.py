@@ -173,7 +173,7 @@ def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
 
 @jax.custom_jvp
 def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    values, vectors = _eigh(tensors)
+    values, vectors = eigh(tensors)
     return _log_of_pairs(values, vectors)
 
 
@@ -181,14 +181,15 @@ def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d
 # eigenvalues meet; the derivatives of the eigenvectors are not.
 @_log_by_eigenvalues.defjvp
 def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    values, vectors = _eigh(primals[0])
+    values, vectors = eigh(primals[0])
     a, b = values[..., :, None], values[..., None, :]
     differences = 2 / (a + b) * _atanhc((a - b) / (a + b))
     inner = _matmul(_matmul(jnp.swapaxes(vectors, -1, -2), tangents[0]), vectors)
     return _log_of_pairs(values, vectors), _compose(vectors, differences * inner)
 
 
-def _eigh(tensors: Float[Array, "... d d"]) -> tuple[Float[Array, "... d"], Float[Array, "... d d"]]:
+def eigh(tensors: Float[Array, "... d d"]) -> tuple[Float[Array, "... d"], Float[Array, "... d d"]]:
+    """Return the eigenvalues of symmetric matrices, ascending, and orthonormal eigenvectors in columns."""
     return jnp.vectorize(partial(differentiable_eigh, None), signature="(d,d)->(d),(d,d)")(tensors)
 
 

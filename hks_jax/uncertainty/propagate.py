@@ -209,7 +209,7 @@ def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
     bad = valid & ~jnp.isfinite(spd.positive_or_nan(noisy)).all(axis=(-2, -1))
 
     def raised(noisy: Array) -> Array:
-        values, vectors = jnp.linalg.eigh(noisy)
+        values, vectors = spd.eigh(noisy)
         floor = _FLOOR * jnp.trace(measured, axis1=-2, axis2=-1)[..., None] / measured.shape[-1]
         higher = jnp.einsum("...ia,...a,...ja->...ij", vectors, jnp.maximum(values, floor), vectors)
         return jnp.where(bad[..., None, None], higher, noisy)
