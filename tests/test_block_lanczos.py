@@ -289,6 +289,7 @@ def test_mirrored_domain(rng):
     assert mirrored.complete_below > mirrored.eigenvalues[-1]
 
 
+@pytest.mark.slow
 def test_gradient_equals_the_dense_one(rng):
     grid = hj.Grid((24, 22), 0.1)
     tensors = jnp.asarray(random_spd(rng, grid.shape))

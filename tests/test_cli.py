@@ -841,6 +841,7 @@ def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
     assert float(lines[2].split("\t")[-1]) == pytest.approx(np.sqrt(np.mean(mean**2)), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_rim_of_a_mask_is_no_signal(tmp_path):
     x, y = np.indices((28, 28)) - 13.5
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (28, 28, 2, 2)), mask=np.hypot(x, y) < 13)

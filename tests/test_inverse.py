@@ -377,6 +377,7 @@ def test_deviation_bounds_that_of_the_exact_posterior():
     assert (few.deviation < 0.5).all()
 
 
+@pytest.mark.slow
 def test_error_bars_of_a_fit_are_those_of_its_posterior():
     """The covariance is (JᵀΣ⁻¹J + R)⁻¹, with the penalties' and the white prior's R."""
     grid = hj.Grid((7, 6), 0.2)

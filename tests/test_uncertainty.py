@@ -82,6 +82,7 @@ def test_the_derivative_by_the_noise_says_which_measurement_matters(rng):
     np.testing.assert_allclose(symmetric, parts[..., :, None] * parts[..., None, :], rtol=1e-8, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_maps_agree_with_the_dense_jacobian(rng):
     grid = hj.Grid((5, 4))
     D = random_spd(rng, grid.shape, 0.2)
