@@ -1,6 +1,6 @@
 """The first answer: what a new process takes from its start to the first signature, imports and compilation included.
 
-    python benchmarks/first_call.py [--cases plane-64 …] [-o FILE]
+    python benchmarks/first_answer.py [--cases plane-64 …] [-o FILE]
 
 Every first call runs in a process of its own: once without a cache of programs, and once with the cache that the run
 before it filled. The calls that follow in the same process are the same again, one on a grid of another spacing, one
@@ -244,7 +244,7 @@ def main() -> None:
                     row["cached_s"] = again["first_s"]
                 rows.append(row)
                 print({name: round(x, 2) if isinstance(x, float) else x for name, x in row.items()})
-    write(args.output or RESULTS / "first_call.json", rows)
+    write(args.output or RESULTS / "first_answer.json", rows)
 
 
 if __name__ == "__main__":
