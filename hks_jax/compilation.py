@@ -72,13 +72,15 @@ def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def known_and_few(args: Any) -> bool:
-    """Return whether values are concrete, few, and on a CPU of this process alone: then NumPy may compute.
+    """Return whether values are concrete, few, and on one CPU of this process alone: then NumPy may compute.
 
-    It depends on shapes alone, so that a computation has the same rounding each time.
+    It depends on shapes and devices alone, so that a computation has the same rounding each time.
     """
-    size = sum(np.size(leaf) for leaf in jax.tree.leaves(args))
-    here = jax.default_backend() == "cpu" and jax.process_count() == 1
-    return size <= _FEW and here and not is_traced((args, jnp.zeros(())))
+    if is_traced((args, jnp.zeros(()))) or jax.default_backend() != "cpu" or jax.process_count() > 1:
+        return False
+    leaves = jax.tree.leaves(args)
+    shared = any(isinstance(leaf, jax.Array) and len(leaf.devices()) > 1 for leaf in leaves)
+    return not shared and sum(np.size(leaf) for leaf in leaves) <= _FEW
 
 
 @cache
