@@ -164,7 +164,7 @@ def by_lapy(case: str) -> dict[str, float]:
 
 
 def child(case: str, way: str, folder: Path) -> None:
-    """Run one way of one case and print what it took."""
+    """Run one library on one case, and print its timings."""
     if way.startswith("hks_jax"):
         found = ours(case, way.endswith("gradient"))
     else:

@@ -72,15 +72,18 @@ def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def known_and_few(args: Any) -> bool:
-    """Return whether values are concrete, few, and on one CPU of this process alone: then NumPy may compute.
+    """Return whether values are `known_here` and few: then NumPy computes.
 
     It depends on shapes and devices alone, so that a computation has the same rounding each time.
     """
+    return known_here(args) and sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= _FEW
+
+
+def known_here(args: Any) -> bool:
+    """Return whether values are concrete, and on one CPU of this process alone."""
     if is_traced((args, jnp.zeros(()))) or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return False
-    leaves = jax.tree.leaves(args)
-    shared = any(isinstance(leaf, jax.Array) and len(leaf.devices()) > 1 for leaf in leaves)
-    return not shared and sum(np.size(leaf) for leaf in leaves) <= _FEW
+    return all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(args) if isinstance(leaf, jax.Array))
 
 
 @cache

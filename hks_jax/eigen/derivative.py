@@ -123,20 +123,10 @@ def _computed(
     return values, vectors, bound
 
 
-def _cut(
-    values: Float[Array, " p"], vectors: Float[Array, "p n_dof"], k: int
-) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]:
+@numpy_where_known(static_argnums=2)
+def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
     """Return the first k pairs, and the eigenvalue after them."""
-    if known_and_few((values, vectors)):
-        return by_numpy(partial(_first, k=k), values, vectors)
-    return _first_by_jax(values, vectors, k)
-
-
-def _first(values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    return values[:k], vectors[:k], values[k] if len(values) > k else np.asarray(np.inf, values.dtype)
-
-
-_first_by_jax = jax.jit(_first, static_argnames="k")
+    return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
 
 
 # Apart from the tangents, so that many products with one Jacobian share it.

@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from hks_jax.atomic import atomic_path
-from hks_jax.inverse import checkpoint as files
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.inverse.unknowns import Values
 from hks_jax.npz import load_npz
@@ -130,5 +129,5 @@ class Log:
         if self.progress is not None:
             self.progress(self.history[-1])
         if self.path is not None:
-            now = files.Checkpoint(values, self.history, self.start, self.stage, step_size, self.best, self.losses)
-            files.save(self.path, self.mark, now)
+            now = Checkpoint(values, self.history, self.start, self.stage, step_size, self.best, self.losses)
+            save(self.path, self.mark, now)

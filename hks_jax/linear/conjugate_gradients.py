@@ -108,10 +108,6 @@ def conjugate_gradients(
     """
     xp, n = rhs.__array_namespace__(), len(rhs)
 
-    # In exact arithmetic rᵢᵀPrⱼ = 0. Rounding loses that as soon as an eigenvector at the end of the spectrum is known,
-    # and conjugate gradients then look for it again and again: where eigenvalues fall off over eight decades, that
-    # doubles the number of steps. Where products are dear and n is small it is cheaper to restore it (Paige 1971; Simon
-    # 1984).
     def restarted(both: tuple[Array, Array]) -> tuple[Array, Array]:
         assert clean is not None
         x = clean(both[0])
@@ -139,17 +135,19 @@ def conjugate_gradients(
         x, r, again = state.x + wide * p, state.r - wide * image, begin
         kept = state.kept
         if kept is not None:
-            # When all places are taken the last one is used again: what is lost first was known first.
+            # In exact arithmetic rᵢᵀPrⱼ = 0. Rounding loses that as soon as an eigenvector at the end of the spectrum
+            # is known, and conjugate gradients then look for it again and again: where eigenvalues fall off over eight
+            # decades, that doubles the number of steps. Where products are dear and n is small it is cheaper to
+            # restore it (Paige 1971; Simon 1984). When all places are taken the last one is used again: what is lost
+            # first was known first.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
             r = r - times(kept[0].T, products_with_columns(kept[1], r))
         if clean is not None:
             again = xp.any(state.going & ~regular) & ~state.fresh & (state.starts < _RESTARTS)
             x, r = when(again, restarted, (x, r))
-        rhs, starts = (
-            xp.where(begin, image, state.rhs) if orthogonal else state.rhs,
-            state.starts + xp.where(again, 1, 0),
-        )
+        rhs = xp.where(begin, image, state.rhs) if orthogonal else state.rhs
+        starts = state.starts + xp.where(again, 1, 0)
         return state._replace(x=x, r=r, rhs=rhs, fresh=again, starts=starts, steps=state.steps + 1, kept=kept), regular
 
     def step(before: _Iteration) -> _Iteration:
