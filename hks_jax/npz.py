@@ -1,14 +1,17 @@
-"""NumPy's own files, read whole and without pickles."""
+"""NumPy's own files, read whole and without pickles, and written whole."""
 
 import io
 import math
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
 
+from hks_jax.atomic import atomic_path
 from hks_jax.reading import existing, reading
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -30,6 +33,13 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             content = archive.read(name)  # to the end, which is where the checksum is compared
             arrays[name.removesuffix(".npy")] = _array(io.BytesIO(content), len(content))
     return arrays
+
+
+def write_npz(path: str | os.PathLike[str], content: Mapping[str, Any], compressed: bool = True) -> None:
+    """Write arrays by name, whole or not at all."""
+    save = np.savez_compressed if compressed else np.savez
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        save(stream, **content)
 
 
 def _check_number(file: Path, archive: zipfile.ZipFile) -> None:

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from hks_jax.atomic import atomic_path
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.inverse.unknowns import Values
-from hks_jax.npz import load_npz
+from hks_jax.npz import load_npz, write_npz
 
 
 class Checkpoint(NamedTuple):
@@ -49,8 +48,8 @@ def fingerprint(*parts: Any) -> str:
 def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> None:
     """Write a checkpoint."""
     rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], np.float64)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, mark=mark, **(checkpoint._asdict() | {"history": rows, "losses": np.array(checkpoint.losses)}))
+    content = checkpoint._asdict() | {"mark": mark, "history": rows, "losses": np.array(checkpoint.losses)}
+    write_npz(path, content, compressed=False)
 
 
 def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.atomic import atomic_path
 from hks_jax.io.tensor_order import choices, invalid_by_order, to_voxel_axes, unpack
 from hks_jax.io.volume import TensorVolume, as_mask, describe_tensors
-from hks_jax.npz import load_npy, load_npz
+from hks_jax.npz import load_npy, load_npz, write_npz
 
 SUFFIXES = (".npz", ".npy")
 WRITTEN = (".npz",)
@@ -88,12 +87,6 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
     units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
     content = {"tensors": volume.tensors, **place_of(volume), "frame": "voxel", **units, "provenance": record}
     write_npz(path, content)
-
-
-def write_npz(path: Path, content: Mapping[str, Any]) -> None:
-    """Write arrays by name, compressed, whole or not at all."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(stream, **content)
 
 
 def place_of(volume: TensorVolume) -> dict[str, Any]:

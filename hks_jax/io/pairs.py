@@ -8,10 +8,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.atomic import atomic_path
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.npz import load_npz
+from hks_jax.npz import load_npz, write_npz
 
 ARRAYS = (
     "eigenvalues",
@@ -51,8 +50,7 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
         raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in .npz")
     arrays = {name: np.asarray(getattr(pairs, name)) for name in ARRAYS if getattr(pairs, name) is not None}
     content: dict[str, Any] = {**arrays, "solver_name": pairs.solver_name, **(extra or {})}
-    with atomic_path(path) as temporary:
-        np.savez(temporary, **content)
+    write_npz(path, content, compressed=False)
     return Path(path)
 
 

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import mesh
-from hks_jax.io.arrays import write_npz
 from hks_jax.io.formats import WRITTEN, format_of
 from hks_jax.io.volume import TensorVolume, describe
 from hks_jax.io.vtk_image import by_time
+from hks_jax.npz import write_npz
 
 
 def save(

@@ -15,10 +15,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.atomic import atomic_path
 from hks_jax.checks import real_array, require_count, require_number
 from hks_jax.domain import spd
-from hks_jax.npz import load_npz
+from hks_jax.npz import load_npz, write_npz
 from hks_jax.traced import is_traced
 from hks_jax.uncertainty.noise import TensorNoise
 from hks_jax.uncertainty.result import Uncertainty
@@ -270,8 +269,8 @@ def _in_pairs(
         if progress is not None:
             progress(f"{2 * index + 2} of {2 * pairs} noisy maps")
         if checkpoint is not None:
-            with atomic_path(checkpoint) as temporary, open(temporary, "wb") as file:
-                np.savez(file, *map(np.asarray, jax.tree.leaves(moments)), mark=mark)
+            arrays = {f"arr_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(moments))}
+            write_npz(checkpoint, {**arrays, "mark": mark}, compressed=False)
     return moments
 
 
