@@ -218,7 +218,7 @@ def _count_clipped(volume: TensorVolume) -> int:
 
 def image_suffix(path: Path) -> str:
     """Return the suffix of images in the format of a file; of NumPy's files none."""
-    return str(format_of(path).IMAGE)
+    return format_of(path).image
 
 
 def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:

@@ -44,17 +44,11 @@ class Unknowns(eqx.Module):
 
 
 class Nodal(Unknowns):
-    """A few numbers at each node of the domain.
+    """A few numbers at each node of the domain."""
 
-    Attributes:
-        parametrisation: what they mean.
-        init: the initial field, which stays as it is outside the domain.
-        nodes: the flat indices of the domain's nodes.
-    """
-
-    parametrisation: Parametrisation
-    init: TensorField
-    nodes: StaticArray = eqx.field(static=True)
+    parametrisation: Parametrisation  # what they mean
+    init: TensorField  # the initial field, which stays as it is outside the domain
+    nodes: StaticArray = eqx.field(static=True)  # the flat indices of the domain's nodes
 
     @property
     def smooth(self) -> bool:
@@ -93,17 +87,12 @@ class Nodal(Unknowns):
 
 
 class Free(Unknowns):
-    """The parameters of a function of the user's.
+    """The parameters of a function of the user's."""
 
-    Attributes:
-        function: maps them to a field, or to tensors on the grid of the initial field.
-        parameters: where to start, any pytree of floating point arrays.
-        init: the initial field, for its grid and interpolation.
-    """
-
+    # maps them to a field, or to tensors on the grid of the initial field
     function: Callable[[Any], Any] = eqx.field(static=True)
-    parameters: Any
-    init: TensorField
+    parameters: Any  # where to start, any pytree of floating point arrays
+    init: TensorField  # the initial field, for its grid and interpolation
 
     @property
     def smooth(self) -> bool:

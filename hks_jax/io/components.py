@@ -56,11 +56,8 @@ def read_tensors(
 ) -> TensorVolume:
     """Read tensors from six NIfTI images, whose names say which component each has, in any sequence.
 
-    Args:
-        paths: the six files.
-        order: must be None; for the error.
-        frame: the axes of the components; None: what the BIDS sidecar beside an image says (``Reference`` of
-            ``OrientationEncoding``), or those of the voxels.
+    The axes of the components are those asked for, or those that the BIDS sidecar beside an image says
+    (``Reference`` of ``OrientationEncoding``), or the voxels'. An order is refused.
 
     Raises:
         FileNotFoundError: no such file.

@@ -141,7 +141,9 @@ def _image(
     path: str | os.PathLike[str], affine: np.ndarray | None, suffixes: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the voxel values, without a fourth axis of one entry, and the affine where the file has one."""
-    values, place = format_of(path, suffixes).read_image(path, affine)
+    read = format_of(path, suffixes).read_image
+    assert read is not None
+    values, place = read(path, affine)
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     return values, place

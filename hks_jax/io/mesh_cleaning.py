@@ -44,7 +44,10 @@ def require_joined(loaded: Loaded) -> str:
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:
         return ""
-    pieces, joined = (_pieces(cells, len(first)) for cells in (loaded.cells, first[loaded.cells]))
+    pieces, joined = (
+        len(np.unique(Triangulation(cells, len(first)).labels[0][cells]))
+        for cells in (loaded.cells, first[loaded.cells])
+    )
     what = f"{doubled} of {len(first)} vertices lie where another one lies"
     if joined < pieces:
         raise ValueError(
@@ -85,10 +88,6 @@ def cleaned(loaded: Loaded) -> tuple[Loaded, str]:
     say(int((finite & (first == np.arange(len(first)))).sum()) - len(used), f"vertices without a {words.one} removed")
     arrays = {name: values[used] for name, values in loaded.arrays.items()}
     return Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays), "; ".join(done)
-
-
-def _pieces(cells: Int[np.ndarray, "n corners"], n_vertices: int) -> int:
-    return len(np.unique(Triangulation(cells, n_vertices).labels[0][cells]))
 
 
 def _without_thin(

@@ -89,14 +89,14 @@ def read_tensors(
         volume = components.read_tensors(list(path), order, frame)
         return _finished(volume, mask, repair, unit)
     name, reader = os.fspath(path), format_of(path)
-    if array is not None and "array" not in reader.OPTIONS:
+    if array is not None and "array" not in reader.options:
         raise ValueError(f"array: got {array!r}; only npz and VTK files have arrays by name")
-    if spacing is not None and "spacing" not in reader.OPTIONS:
+    if spacing is not None and "spacing" not in reader.options:
         raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
-    if reader is nifti and components.is_one_of_six(path):
+    if reader is nifti.FORMAT and components.is_one_of_six(path):
         return _finished(components.read_tensors(components.siblings(path), order, frame), mask, repair, unit)
     given = {"array": array, "spacing": spacing, "confidence": confidence}
-    volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.OPTIONS})
+    volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
     if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
         volume = replace(volume, digest=digest(name))
     return _finished(volume, mask, repair, unit)

@@ -41,14 +41,10 @@ _NONE = ("", "???", "none", "unknown", "n/a")
 
 
 def millimetres(where: str, text: str) -> float | None:
-    """Return how many mm a header's unit of length is, None where it names none.
-
-    Args:
-        where: the file and the field, for the error.
-        text: such as ``"mm"``, ``"microns"``, ``"µm"``, ``"meters"``.
+    """Return how many mm a header's unit of length is, such as "microns" or "µm"; None where it names none.
 
     Raises:
-        ValueError: a unit that is not known.
+        ValueError: a unit that is not known; names the place, `where`.
     """
     word = text.strip().lower()
     if word in _NONE:

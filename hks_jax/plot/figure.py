@@ -84,12 +84,7 @@ def frame(ax: Axes, grid: Grid) -> None:
 
 
 def side_in_inches(ax: Axes, extent: tuple[float, float]) -> float:
-    """Return how long the longer side of something will be, in equal aspect on the axes as they are before layout.
-
-    Args:
-        ax: the axes.
-        extent: width and height of what is drawn, in coordinates.
-    """
+    """Return how long the longer side of an extent will be, in equal aspect on the axes as they are before layout."""
     scale = min(room / size for room, size in zip(_inches(ax), extent, strict=True))
     return scale * max(extent)
 

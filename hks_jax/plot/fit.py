@@ -82,7 +82,7 @@ def fit_panels(
     # Apart, because the last row's labels would else widen the columns above.
     halves = figure.add_gridspec(2, 1, height_ratios=[sum(heights[:-1]), heights[-1]])
     panels, last = halves[0].subgridspec(len(rows), 3), halves[1].subgridspec(1, 2, width_ratios=(1, 1.7))
-    symbol = "e" if fit.problem.observation.signature == "wks" else "t"
+    symbol = fit.problem.observation.signature.symbol or "t"
     for row, index in enumerate(rows):
         first, second, third = (figure.add_subplot(panels[row, column]) for column in range(3))
         both = np.stack([wanted[index], fitted[index]])[:, grid.inside]
