@@ -8,26 +8,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from hks_jax.paper.figure1 import figure1
-from hks_jax.paper.figure2 import figure2
-from hks_jax.paper.figure3 import figure3
-from hks_jax.paper.figure4 import figure4
-from hks_jax.paper.figure5 import figure5
-from hks_jax.paper.figure6 import figure6
-from hks_jax.paper.table1 import table1
-from hks_jax.paper.triangles import triangles
+from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, table1, triangles
 
 Echo = Callable[[str], None]
 
 ITEMS: dict[str, Callable[[Path, bool, Echo], list[Path]]] = {
-    "table1": table1,
-    "figure1": figure1,
-    "figure2": figure2,
-    "figure3": figure3,
-    "figure4": figure4,
-    "figure5": figure5,
-    "figure6": figure6,
-    "triangles": triangles,
+    "table1": table1.table1,
+    "figure1": figure1.figure1,
+    "figure2": figure2.figure2,
+    "figure3": figure3.figure3,
+    "figure4": figure4.figure4,
+    "figure5": figure5.figure5,
+    "figure6": figure6.figure6,
+    "triangles": triangles.triangles,
 }
 
 
