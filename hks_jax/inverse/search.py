@@ -33,7 +33,7 @@ def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: fl
     grid = unknowns.init.grid
     if smoothness is None:
         extent = max(h * (n - 1) for h, n in zip(grid.spacing, grid.shape, strict=True))
-        smoothness = 0.1 * extent if unknowns.smooth or noise is not None else 0.0
+        smoothness = 0.1 * extent if unknowns.parametrisation.smooth or noise is not None else 0.0
     return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype)
 
 

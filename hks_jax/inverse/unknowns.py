@@ -21,11 +21,6 @@ Values = Float[Array, "..."]
 class Unknowns(eqx.Module):
     """What a fit varies."""
 
-    @property
-    @abstractmethod
-    def smooth(self) -> bool:
-        """Whether steps should be smooth over the nodes."""
-
     @abstractmethod
     def start(self) -> Values:
         """Return the values at the initial field."""
@@ -49,11 +44,6 @@ class Nodal(Unknowns):
     parametrisation: Parametrisation  # what they mean
     init: TensorField  # the initial field, which stays as it is outside the domain
     nodes: StaticArray = eqx.field(static=True)  # the flat indices of the domain's nodes
-
-    @property
-    def smooth(self) -> bool:
-        """Whether the parametrisation asks for it."""
-        return self.parametrisation.smooth
 
     @property
     def _base(self) -> Float[Array, "n d d"]:
@@ -94,22 +84,13 @@ class Free(Unknowns):
     parameters: Any  # where to start, any pytree of floating point arrays
     init: TensorField  # the initial field, for its grid and interpolation
 
-    @property
-    def smooth(self) -> bool:
-        """Whether steps should be smooth: there are no nodes."""
-        return False
-
     def start(self) -> Values:
         """Return the initial parameters, flat."""
         return ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[0]
 
-    def unravel(self, values: Values) -> Any:
-        """Return the parameters as the function takes them."""
-        return ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values)
-
     def field(self, values: Values) -> TensorField:
         """Return the field with these parameters."""
-        tensors = self.function(self.unravel(values))
+        tensors = self.function(ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values))
         if isinstance(tensors, TensorField):
             return tensors
         return TensorField(self.init.grid, tensors, self.init.interpolation)

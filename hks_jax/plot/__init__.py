@@ -8,14 +8,14 @@ from hks_jax.plot.convolution import lic_texture as lic_texture
 from hks_jax.plot.convolution import line_integral_convolution as line_integral_convolution
 from hks_jax.plot.curves import hks_curves as hks_curves
 from hks_jax.plot.curves import spectrum as spectrum
-from hks_jax.plot.degenerate import degenerate_points as degenerate_points
-from hks_jax.plot.ellipses import ellipses as ellipses
-from hks_jax.plot.ellipses import sensitivity as sensitivity
 from hks_jax.plot.explore import explore as explore
 from hks_jax.plot.figure import new_figure as new_figure
 from hks_jax.plot.figure import number_text as number_text
 from hks_jax.plot.figure import save_figure as save_figure
 from hks_jax.plot.fit import fit_panels as fit_panels
+from hks_jax.plot.glyphs import degenerate_points as degenerate_points
+from hks_jax.plot.glyphs import ellipses as ellipses
+from hks_jax.plot.glyphs import sensitivity as sensitivity
 from hks_jax.plot.images import hks_panels as hks_panels
 from hks_jax.plot.images import scalar_image as scalar_image
 from hks_jax.plot.orientation import Orientation as Orientation
