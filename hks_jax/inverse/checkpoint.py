@@ -43,11 +43,7 @@ def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> Non
 
 
 def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
-    """Read a checkpoint.
-
-    Raises:
-        ValueError: it is of another fit, damaged, or no checkpoint.
-    """
+    """Read a checkpoint."""
     try:
         data = load_npz(path)
     except (OSError, ValueError) as error:

@@ -90,12 +90,7 @@ def observe(
     space: FunctionSpace,
     dtype: Any,
 ) -> Observation:
-    """Check what is given and return the observation; see `hks_jax.fit_metric` for the arguments.
-
-    Raises:
-        ValueError: an unknown signature or loss; a target, times or weights of the wrong shape; values that are NaN or,
-            for a loss that needs it, not positive, at observed entries; nothing observed.
-    """
+    """Check what is given and return the observation; see `hks_jax.fit_metric` for the arguments."""
     if not callable(signature) and signature not in SIGNATURES:
         names = ", ".join(map(repr, SIGNATURES))
         raise ValueError(f"signature: got {signature!r}; expected {names}, or a function of eigenpairs")
@@ -160,11 +155,7 @@ def stages_of(
 
 
 def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[np.ndarray, float]:
-    """Return the weights that a stated deviation of the target makes, and the deviation of a residual in their mean.
-
-    Raises:
-        ValueError: deviations of another shape, or not positive where the target is known; a loss that is a function.
-    """
+    """Return the weights that a stated deviation of the target makes, and the deviation of a residual in their mean."""
     if callable(loss):
         raise ValueError("deviation: it cannot be taken through a loss that is a function; give weights and noise")
     require_real("deviation", deviation)

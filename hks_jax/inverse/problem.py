@@ -94,11 +94,7 @@ def require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
 
 
 def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
-    """Return how many eigenpairs resolve the smallest time to `TAIL`: all, if that many are needed.
-
-    Raises:
-        ValueError: the grid does not resolve that time.
-    """
+    """Return how many eigenpairs resolve the smallest time to `TAIL`: all, if that many are needed."""
     smallest, n_dof, d = float(np.min(np.asarray(times))), unknowns_of(pencil), pencil.space.dimension
 
     def count(tail: float) -> int:

@@ -30,11 +30,7 @@ class Unknowns(eqx.Module):
         """Return the field that the values stand for."""
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the values' slopes along the grid's edges, axis by axis; zero where an end is outside the domain.
-
-        Raises:
-            ValueError: the values do not belong to nodes.
-        """
+        """Return the values' slopes along the grid's edges, axis by axis; zero where an end is outside the domain."""
         raise ValueError("regularisers: parameters of a function have no neighbours; use Prior or LogDeterminant")
 
 

@@ -24,12 +24,7 @@ def component_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def siblings(path: str | os.PathLike[str]) -> list[str]:
-    """Return the six files of which one is given: their names differ in the component alone.
-
-    Raises:
-        ValueError: the name has no component.
-        FileNotFoundError: some of them are missing.
-    """
+    """Return the six files of which one is given: their names differ in the component alone."""
     folder, name = os.path.split(os.fspath(path))
     matches = list(_NAME.finditer(name))
     if not matches:

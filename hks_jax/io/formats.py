@@ -16,11 +16,7 @@ IMAGES: tuple[str, ...] = sum((each.names for each in FORMATS if each.read_image
 
 
 def format_of(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFIXES) -> Format:
-    """Return the format of files of this name.
-
-    Raises:
-        ValueError: a name that ends in none of the suffixes.
-    """
+    """Return the format of files of this name."""
     name = os.fspath(path)
     if not name.lower().endswith(suffixes):
         stem, _, suffix = name.rpartition(".")

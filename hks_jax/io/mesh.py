@@ -169,11 +169,7 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
 
 
 def _require_joined(loaded: Loaded) -> str:
-    """Return a warning if vertices lie at the same place, as at seams; the empty text if none do.
-
-    Raises:
-        ValueError: the mesh falls into more pieces than it would if they were one.
-    """
+    """Return a warning if vertices lie at the same place, as at seams; the empty text if none do."""
     first = _same_places(loaded.vertices)
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:

@@ -32,9 +32,6 @@ class MeshChecks:
 
     Args:
         path: the file.
-
-    Raises:
-        ValueError: more points or cells than the file has bits.
     """
 
     def __init__(self, path: Path) -> None:

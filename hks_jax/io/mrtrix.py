@@ -28,12 +28,7 @@ class Image(NamedTuple):
 
 
 def load(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Image:
-    """Read an image, whatever lies beside it. A compressed one is read to its end, where its checksum is compared.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not MRtrix's format, or a damaged file; complex numbers.
-    """
+    """Read an image, whatever lies beside it. A compressed one is read to its end, where its checksum is compared."""
     file = existing(path)
     with reading(file, "a readable image of MRtrix (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()

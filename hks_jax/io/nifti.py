@@ -38,12 +38,7 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
 
 
 def load(path: str | os.PathLike[str]) -> Any:
-    """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a NIfTI image, or a damaged one.
-    """
+    """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared."""
     nib, file = optional("nibabel"), existing(path)
     with reading(file, "a readable NIfTI image"):
         if file.name.lower().endswith(".gz"):
@@ -65,11 +60,7 @@ def load(path: str | os.PathLike[str]) -> Any:
 
 
 def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
-    """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64.
-
-    Raises:
-        ValueError: a damaged file; values that are not real numbers.
-    """
+    """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64."""
     with reading(path, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
     require_real(os.fspath(path), data)
@@ -80,11 +71,7 @@ def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
 
 
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
-    """Return the affine with lengths in mm, and the unit that the file declares; the empty text if none.
-
-    Raises:
-        ValueError: a code for a unit that NIfTI does not have.
-    """
+    """Return the affine with lengths in mm, and the unit that the file declares; the empty text if none."""
     code = int(image.header["xyzt_units"]) & 7
     if code not in _LENGTHS:
         raise ValueError(f"{name}: its unit of space has the code {code}; expected one of NIfTI's, 0 to 3")

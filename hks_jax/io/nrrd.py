@@ -69,12 +69,7 @@ class Placement(NamedTuple):
 
 
 def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the array, first axis fastest in the file, in native floating point or as it is; and the header.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an NRRD file, or a damaged one.
-    """
+    """Return the array, first axis fastest in the file, in native floating point or as it is; and the header."""
     nrrd, file = optional("nrrd"), existing(path)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not

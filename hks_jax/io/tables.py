@@ -60,10 +60,6 @@ def read_table(path: str | os.PathLike[str]) -> list[dict[str, str]]:
     """Return the rows of a table with a header, tab-separated, or separated by commas if its name ends in ``.csv``.
 
     Cells that are empty or ``n/a`` are left out, and rows of nothing else.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a table in UTF-8, columns without a name or of the same name, or rows longer than the header.
     """
     file = existing(path)
     separator = "," if file.name.lower().endswith(".csv") else "\t"

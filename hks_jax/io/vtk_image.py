@@ -35,13 +35,7 @@ def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
 
 
 def load(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays that `vtk_child` finds in a file, in a process of its own.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: VTK cannot read it, or does not survive it.
-        ImportError: VTK is not installed.
-    """
+    """Return the arrays that `vtk_child` finds in a file, in a process of its own."""
     size = existing(path).stat().st_size
     with tempfile.TemporaryDirectory() as folder:
         arrays = Path(folder) / "arrays.npz"
