@@ -161,12 +161,7 @@ def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[
     require_real("deviation", deviation)
     values = np.asarray(target, np.float64)
     given = _checked_weights(weights, values.shape)
-    try:
-        size = np.broadcast_to(np.asarray(deviation, np.float64), values.shape)
-    except ValueError:
-        raise ValueError(
-            f"deviation: got shape {np.shape(deviation)}; expected one that broadcasts to the target's {values.shape}"
-        ) from None
+    size = _broadcast("deviation", deviation, values.shape)
     used = (given > 0) & np.isfinite(values)
     if (bad := used & ~(np.isfinite(size) & (size > 0))).any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
@@ -180,17 +175,20 @@ def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[
 
 
 def _checked_weights(weights: Any, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.ones(shape) if weights is None else np.asarray(weights, np.float64)
-    try:
-        array = np.broadcast_to(array, shape)
-    except ValueError:
-        raise ValueError(
-            f"weights: got shape {array.shape}; expected one that broadcasts to the target's {shape}, such as "
-            "(*grid.shape) for nodes or (n_times, 1, 1) for times"
-        ) from None
+    array = np.ones(shape) if weights is None else _broadcast("weights", weights, shape)
     if not (np.isfinite(array) & (array >= 0)).all():
         raise ValueError("weights: got negative, infinite or NaN ones; expected numbers ≥ 0 (0: not observed)")
     return array
+
+
+def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        return np.broadcast_to(np.asarray(values, np.float64), shape)
+    except ValueError:
+        raise ValueError(
+            f"{name}: got shape {np.shape(values)}; expected one that broadcasts to the target's {shape}, such as "
+            "(*grid.shape) for nodes or (n_times, 1, 1) for times"
+        ) from None
 
 
 def _check_values(values: np.ndarray, used: np.ndarray, positive: bool) -> None:

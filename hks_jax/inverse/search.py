@@ -45,7 +45,7 @@ def choose_optimiser(
     inner_product: InnerProduct,
     step_size: float = 1.0,
 ) -> Optimiser:
-    """Return the solver that a name of `OPTIMISERS` stands for; a step size below 1 begins with as much more damping."""
+    """Return the solver that one of `OPTIMISERS` stands for; a step size below 1 begins with as much more damping."""
     if given == "gauss-newton":
         # Against noise small steps: the misfit must not fall far below what the noise explains.
         damping, growth = (1e-4, 10.0) if noise is None else (1e-2, 3.0)

@@ -258,12 +258,4 @@ def _write(path: Path, image: Any, record: str) -> None:
         nib.save(image, temporary)
 
 
-FORMAT = Format(
-    SUFFIXES,
-    read_tensors,
-    read_image=read_image,
-    written=(".nii.gz", ".nii"),
-    write=write,
-    write_tensors=write_tensors,
-    image=".nii.gz",
-)
+FORMAT = Format(SUFFIXES, read_tensors, (), read_image, (".nii.gz", ".nii"), write, write_tensors, image=".nii.gz")

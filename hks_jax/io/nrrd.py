@@ -324,6 +324,5 @@ def _to_voxel_axes(
     return to_voxel_axes(tensors, frame, affine), frame
 
 
-FORMAT = Format(
-    (".nrrd", ".nhdr"), read_tensors, ("confidence",), read_image, (".nrrd",), write, write_tensors, image=".nrrd"
-)
+_NAMES = (".nrrd", ".nhdr")
+FORMAT = Format(_NAMES, read_tensors, ("confidence",), read_image, (".nrrd",), write, write_tensors, image=".nrrd")

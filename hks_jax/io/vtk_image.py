@@ -214,13 +214,14 @@ def _check_range(name: str, content: bytes, array: str, values: np.ndarray) -> N
     """Raise ValueError unless an array's rows have lengths in the range that its file gives, where it gives one."""
     tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
     told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
+    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # which do not count
+        return
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(values, axis=-1)
-    ends = [lengths.min(), lengths.max()]
-    if len(told) == 2 and not np.isnan(ends).any() and not np.allclose(ends, told, rtol=1e-4):
+    if not any(np.allclose([each.min(), each.max()], told, rtol=1e-4) for each in (lengths, values)):
         raise ValueError(
-            f"{name}: not readable VTK image data, or damaged: array {array!r} has rows of lengths {ends[0]:.4g} to "
-            f"{ends[1]:.4g}, and its file says {told[0]:.4g} to {told[1]:.4g}"
+            f"{name}: not readable VTK image data, or damaged: array {array!r} has rows of lengths {lengths.min():.4g} "
+            f"to {lengths.max():.4g}, and its file says {told[0]:.4g} to {told[1]:.4g}"
         )
 
 
@@ -272,12 +273,4 @@ def _as_plane(volume: TensorVolume) -> TensorVolume:
     return volume
 
 
-FORMAT = Format(
-    (".vti", ".vtk"),
-    read_tensors,
-    options=("array",),
-    written=(".vti",),
-    write=write,
-    write_tensors=write_tensors,
-    image=".vti",
-)
+FORMAT = Format((".vti", ".vtk"), read_tensors, ("array",), None, (".vti",), write, write_tensors, image=".vti")

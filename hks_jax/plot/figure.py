@@ -49,6 +49,15 @@ def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) 
     return target
 
 
+def finished(fig: Figure, suptitle: str, path: str | os.PathLike[str] | None = None) -> Figure:
+    """Return the figure with its title, saved if there is a path."""
+    if suptitle:
+        fig.suptitle(suptitle)
+    if path is not None:
+        save_figure(fig, path)
+    return fig
+
+
 def require_plane(name: str, grid: Grid) -> None:
     """Raise ValueError unless the grid is two-dimensional."""
     if grid.dimension != 2:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import SMALL, new_figure, number_text, panel_size, require_plane
+from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.glyphs import ellipses
 from hks_jax.plot.images import scalar_image
 from hks_jax.plot.orientation import Orientation
@@ -105,9 +105,7 @@ def fit_panels(
         orientation.letter(ax)
     ax.set_title("fitted metric, unit circles", fontsize="medium")
     _draw_loss(figure.add_subplot(last[1]), fit)
-    if title:
-        figure.suptitle(title)
-    return figure
+    return finished(figure, title or "")
 
 
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:

@@ -17,12 +17,12 @@ from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import (
     cell_extent,
     colour_bar,
+    finished,
     frame,
     new_figure,
     number_text,
     panel_size,
     require_plane,
-    save_figure,
 )
 from hks_jax.plot.orientation import Orientation
 
@@ -157,11 +157,7 @@ def hks_panels(
         scalar_image(ax, images[index], grid, orientation=orientation, z=faded, **kwargs)
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
-    if suptitle:
-        fig.suptitle(suptitle)
-    if path is not None:
-        save_figure(fig, path)
-    return fig
+    return finished(fig, suptitle, path)
 
 
 def panel_titles(

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import SMALL, colour_bar_in, new_figure, save_figure
+from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
 from hks_jax.plot.images import beyond, colours_of, masked, panel_titles, scalar_image
 from hks_jax.plot.orientation import Orientation
 
@@ -187,11 +187,7 @@ def volume_panels(
             _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
             extend = beyond(volumes[index], low, high)
             colour_bar_in(panels[3, column], image, label, orientation="horizontal", extend=extend)
-    if suptitle:
-        fig.suptitle(suptitle)
-    if path is not None:
-        save_figure(fig, path)
-    return fig
+    return finished(fig, suptitle, path)
 
 
 def _label_slices(
