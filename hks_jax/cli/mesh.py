@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.cli.job import Result, use_dtype
+from hks_jax.cli.job import use_dtype
+from hks_jax.cli.options import READING, options_in, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read
+from hks_jax.cli.result import Result
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.surface_mesh import SurfaceMesh
@@ -23,30 +25,7 @@ from hks_jax.io.tensor_order import unpack
 from hks_jax.io.volume import digest
 from hks_jax.plot import new_figure, number_text, save_figure, surface
 
-_OF_GRIDS = {
-    "slice": None,
-    "through": None,
-    "view": "neurological",
-    "save_pairs": False,
-    "components": "raise",
-    "method": "spectral",
-}
-"""Options that mean nothing on a mesh, and what they are unless given."""
-_OF_VOLUMES = {
-    "mask": None,
-    "background": None,
-    "erode": 0,
-    "repair": None,
-    "frame": None,
-    "unit": None,
-    "spacing": None,
-    "bval": None,
-    "bvec": None,
-    "bvec_frame": None,
-    "b_max": None,
-}
-"""Those that are about the volume in which a mesh lies."""
-_OF_TENSORS = {"metric": None, "order": None, "interpolation": "linear"}
+_OF_TENSORS = ("metric", "order", "interpolation")
 """Options that are about the tensors at a mesh's vertices."""
 
 
@@ -54,18 +33,18 @@ def check_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that are for grids alone, and for tensors of which the metric is open."""
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; tensors come from a volume, or from the mesh's own vertices")
-    for name, default in (_OF_GRIDS if args.tensors else _OF_GRIDS | _OF_VOLUMES).items():
-        if getattr(args, name) != default:
-            raise ValueError(f"--{name.replace('_', '-')}: it is for tensors on a grid; leave it out for a mesh")
+    of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
+    if not args.tensors:  # they are about the volume in which the mesh lies
+        options = options_in(READING)
+        of_grids += [option.name for option in options if option.name not in (*_OF_TENSORS, "array")]
+    refuse(args, of_grids, "it is for tensors on a grid; leave it out for a mesh")
     if args.boundary not in (None, *MESH_BOUNDARIES):
         raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes one of {', '.join(MESH_BOUNDARIES)}")
     if not (args.array or args.tensors):
-        for name, default in _OF_TENSORS.items():
-            if getattr(args, name) != default:
-                raise ValueError(
-                    f"--{name}: a mesh has the metric of space unless --array names tensors at its vertices, or "
-                    "--tensors a volume of them; pass both, or neither"
-                )
+        why = (
+            "a mesh has the metric of space unless --array names tensors at its vertices, or --tensors a volume of them"
+        )
+        refuse(args, _OF_TENSORS, f"{why}; pass both, or neither")
     elif args.metric is None:
         raise ValueError("--metric: choose what the tensors at the vertices stand for: inverse, tensor or adjugate")
 
@@ -128,12 +107,12 @@ def mesh_suffix(path: Path, mesh: SimplicialMesh) -> str:
 
 def draw(result: Result, path: Path) -> None:
     """Draw the signature on the surface, or on the solid's boundary, once for each time with its own colours."""
-    mesh, n = result.volume, len(result.times)
+    mesh, times = result.place, result.times
     assert isinstance(mesh, SurfaceMesh | TetMesh)
-    columns = min(n, 4)
-    rows = math.ceil(n / columns)
+    columns = min(len(times), 4)
+    rows = math.ceil(len(times) / columns)
     figure = new_figure(3.4 * columns, 3.0 * rows)
-    for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
+    for i, (time, values) in enumerate(zip(times, result.values, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
         mappable = surface(ax, mesh, values)
         ax.set_title(f"t = {number_text(float(time))}", fontsize="medium")

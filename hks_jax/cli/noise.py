@@ -3,7 +3,8 @@
 import argparse
 import warnings
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.accuracy import AccuracyWarning
-from hks_jax.cli.arguments import Times
-from hks_jax.cli.inputs import read_volume, second_scan
-from hks_jax.cli.job import Bars, Result, Settings, automatic_times
+from hks_jax.cli.job import Settings, automatic_times
+from hks_jax.cli.options import Times
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import read_volume
+from hks_jax.cli.result import Result
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.driver import eigenpairs
@@ -22,7 +24,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.io.volume import TensorVolume
 from hks_jax.signatures.boundary import boundary_influence
 from hks_jax.signatures.hks import hks
-from hks_jax.uncertainty import TensorNoise, uncertainty
+from hks_jax.uncertainty import TensorNoise, Uncertainty, uncertainty
 
 _CANDIDATES = 4
 """How many times as many times are looked at as automatic ones are asked for."""
@@ -34,6 +36,35 @@ _LEAST = 0.1
 """The share of the nodes that an interior has at least: fewer do not tell how a map varies."""
 _CLEAR = 2.0
 """The signal to noise that the report names the first time of."""
+
+
+class Bars(NamedTuple):
+    """Error bars of a signature, the noise (n_draws, n_times, *shape) of which they are made, and the interior.
+
+    The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
+    few such nodes; else it is all of the domain.
+    """
+
+    uncertainty: Uncertainty
+    maps: np.ndarray
+    interior: np.ndarray
+
+
+def require_spectral(args: argparse.Namespace) -> None:
+    """Raise ValueError where error bars are asked for of a method that has none."""
+    if args.noise is not None and args.method != "spectral":
+        raise ValueError(f"--noise: with --method {args.method} there are no error bars; leave one of them out")
+
+
+def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
+    """Return the arguments that read the second scan that ``--noise`` names; None where it names a number or a word."""
+    if args.noise in (None, "residuals", "roughness"):
+        return None
+    try:
+        float(args.noise)
+    except ValueError:
+        return argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
+    return None
 
 
 def noise_of(args: argparse.Namespace, volume: TensorVolume, grid: Grid, progress: Progress) -> TensorNoise:
@@ -64,7 +95,8 @@ def error_bars(
     grid = noise.grid
     assert grid is not None
     assert settings.metric is not None
-    boundary = settings.boundary or "neumann"
+    assert settings.boundary is not None
+    boundary = settings.boundary
 
     def signature(D: Any) -> Any:
         field = TensorField.from_diffusion(grid, D, settings.metric, interpolation=settings.interpolation)
@@ -117,18 +149,19 @@ def with_error_bars(result: Result, found: Bars, source: str) -> Result:
         "claimed": np.asarray(bars.trusted).tolist(),
         f"exceeds_{_CLEAR:g}_from_t": float(result.times[clear[0]]) if clear.size else None,
     }
-    return replace(result, bars=found, report={**result.report, "noise": report})
+    arrays = {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": found.maps}
+    return replace(result, arrays={**result.arrays, **arrays}, report={**result.report, "noise": report})
 
 
 def z_of(result: Result) -> Float[np.ndarray, "n_times *shape"] | None:
     """Return how many standard deviations the signature is from that of flat space, or from its median."""
-    if result.bars is None:
+    if "deviation" not in result.arrays:
         return None
-    values, normalisation = result.values, result.report["settings"]["normalisation"]
+    values, normalisation = result.values, result.settings["normalisation"]
     ones = (-1, *[1] * (values.ndim - 1))
     if normalisation in ("raw", "flat"):
         power = 0 if normalisation == "flat" else -(values.ndim - 1) / 2
         reference = ((4 * np.pi * result.times) ** power).reshape(ones)
     else:
         reference = np.nanmedian(values.reshape(len(values), -1), axis=1).reshape(ones)
-    return (values - reference) / np.asarray(result.bars.uncertainty.deviation)
+    return (values - reference) / result.arrays["deviation"]

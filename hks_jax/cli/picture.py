@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from hks_jax.cli.job import Result
 from hks_jax.cli.noise import z_of
+from hks_jax.cli.result import Result
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io.volume import TensorVolume
@@ -56,11 +56,7 @@ def draw(
         view: what is on the left, see `placed`.
     """
     values, inside, volume = result.values, np.isfinite(result.values[0]), result.volume
-    assert isinstance(volume, TensorVolume)
-    if titles is None:
-        # Fitted tensors are in mm²/s, and their grids in mm.
-        seconds = volume.order == "fit" and result.report["settings"]["metric"] == "inverse"
-        titles = [f"$t$ = {number_text(t)}{' s' * seconds}" for t in result.times]
+    titles = titles or [f"$t$ = {number_text(t)} {result.unit}".rstrip() for t in result.times]
     if first is not None:
         titles, values = [first[0], *titles], np.concatenate([first[1][None], values])
     grid, box = cropped(volume, inside)
@@ -104,7 +100,6 @@ def draw_volume(
         view: what is on the left, see `placed`.
     """
     inside, volume = np.isfinite(result.values[0]), result.volume
-    assert isinstance(volume, TensorVolume)
     node = None if through is None else _nearest(inside, through)
     grid, box = cropped(volume, inside)
     deep, span = _coloured(result, inside)
@@ -118,7 +113,7 @@ def draw_volume(
         limits=[each[:2] for each in colours],
         cmap=[each.cmap for each in colours],
         length_unit="mm" if volume.affine is not None else "",
-        label=LABELS[result.report["settings"]["normalisation"]],
+        label=LABELS[result.settings["normalisation"]],
         orientation=placed(volume, box, view),
         z=None if z is None else z[:, *box],
         path=path,
@@ -127,14 +122,14 @@ def draw_volume(
 
 def _centre(result: Result) -> float | None:
     """Return the value of the middle colour, if there is one that means something."""
-    return 1.0 if result.report["settings"]["normalisation"] == "flat" else None
+    return 1.0 if result.settings["normalisation"] == "flat" else None
 
 
 def _coloured(
     result: Result, inside: Bool[np.ndarray, "*shape"]
 ) -> tuple[Bool[np.ndarray, "*shape"], tuple[float, float]]:
     """Return which nodes' values the colours span, and from which quantile to which."""
-    rim = normalise_boundary(result.report["settings"]["boundary"], inside.ndim)[-1]
+    rim = normalise_boundary(result.settings["boundary"], inside.ndim)[-1]
     if "mean" not in rim:
         return away_from_rim(inside), SPAN
     # The rim is like all else, but for its corners; and in a volume but for the mask's thin parts, which are many.
@@ -162,15 +157,12 @@ def placed(volume: TensorVolume, box: Sequence[slice], view: View) -> Orientatio
         box: the box, a slice along each axis.
         view: whether left is on the left (``"neurological"``) or on the right (``"radiological"``).
     """
+    if volume.affine is None:
+        return None
     thin = volume.thin_axis if volume.dimension == 2 else None
-    return None if volume.affine is None else orientation_of(volume.affine, thin, box, view)
-
-
-def orientation_of(affine: Float[np.ndarray, "4 4"], thin: int | None, box: Sequence[slice], view: View) -> Orientation:
-    """Return how a box lies in space that is cut out of a volume, or of the slice of it across the axis `thin`."""
     first = np.zeros(4)
     first[[a for a in range(3) if a != thin]] = [part.start for part in box]
-    affine = affine.copy()
+    affine = volume.affine.copy()
     affine[:, 3] += affine @ first
     return Orientation.of(affine, thin, view=view)
 

@@ -3,18 +3,17 @@
 import argparse
 import json
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import recorded_boundary
-from hks_jax.cli.inputs import add_eigenpair_arguments, add_tensor_options
 from hks_jax.cli.job import Settings, field_of
-from hks_jax.cli.outputs import plain
+from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import defaults
+from hks_jax.cli.result import plain, recorded_boundary
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.assembly import assemble
@@ -26,8 +25,8 @@ from hks_jax.npz import load_npz
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that belong to the pairs."""
-_OPTIONS = {**defaults(add_tensor_options, lambda parser: add_eigenpair_arguments(parser, "")), "save_pairs": False}
-"""Options that were settled when the pairs were computed, and what they are unless given."""
+_ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit", "repair")
+"""What of a volume is kept as text beside its arrays, with its notes."""
 
 
 def is_saved_pairs(path: Path) -> bool:
@@ -42,16 +41,9 @@ def check_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that come too late."""
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one of eigenpairs")
-    for name, default in _OPTIONS.items():
-        if getattr(args, name) != default:
-            option = "-k" if name == "k" else f"--{name.replace('_', '-')}"
-            raise ValueError(
-                f"{option}: {args.file} holds eigenpairs, of which all but the signature is settled; leave it out"
-            )
-
-
-_ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit")
-"""What of a volume is kept as text beside its arrays."""
+    settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
+    why = f"{args.file} holds eigenpairs, of which all but the signature is settled; leave it out"
+    refuse(args, (*settled, "save_pairs"), why)
 
 
 def write_pairs(
@@ -60,7 +52,7 @@ def write_pairs(
     pairs: Eigenpairs,
     settings: Settings,
     image: str,
-    warnings: list[str],
+    warnings: Sequence[str],
     fingerprint: str = "",
 ) -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with what was settled in computing them.
@@ -75,7 +67,7 @@ def write_pairs(
         fingerprint: of a study's subject, what the pairs were computed from.
     """
     record = {name: getattr(volume, name) for name in (*_ABOUT, "notes")}
-    record |= {"repair": dict(volume.repair), "image": image, "warnings": warnings, "fingerprint": fingerprint}
+    record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: value for name, value in asdict(settings).items() if name in _SETTLED}
     save_pairs(path, pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
 
@@ -104,16 +96,15 @@ def read_pairs(
         tuple(arrays["origin"].tolist()),
         arrays.get("mask"),
         arrays.get("affine"),
-        **{name: record[name] for name in (*_ABOUT, "repair") if name in record},
         notes=tuple(record["notes"]),
+        **{name: record[name] for name in _ABOUT if name in record},
     )
     boundary = recorded_boundary(record["settings"])
-    settings = replace(settings, **{**record["settings"], "boundary": boundary})
-    assert settings.metric is not None
     assert boundary is not None
+    settings = replace(settings, **{**record["settings"], "boundary": boundary})
     for warning in record["warnings"]:
         progress.warn(warning)
     with progress.stage("assembly"):
-        field = field_of(volume, volume.grid("all"), settings.metric, settings.dtype, settings.interpolation)
+        field = field_of(volume, volume.grid("all"), settings)
         pairs = pairs_of(str(path), arrays, assemble(field, boundary))
     return volume, field, pairs, settings, record["image"]

@@ -13,12 +13,12 @@ from typing import Any
 
 from hks_jax import __version__
 from hks_jax.atomic import atomic_folder, atomic_path
-from hks_jax.cli.arguments import Times
-from hks_jax.cli.inputs import second_scan
-from hks_jax.cli.job import Result, Settings
-from hks_jax.cli.outputs import plain, save_result
+from hks_jax.cli.job import Settings
+from hks_jax.cli.noise import second_scan
+from hks_jax.cli.options import COLUMNS, Times
 from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.subjects import NOISE, OPTIONS, Subject
+from hks_jax.cli.result import Result, plain
+from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.components import is_one_of_six, siblings
 from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import is_nifti, sidecar_of
@@ -68,7 +68,7 @@ class Study:
         Raises:
             FileNotFoundError: a file is missing.
         """
-        args = _arguments(subject)
+        args = subject.args
         reading = reading_options(args)
         files = {role: [digest(existing(path)) for path in paths] for role, paths in _inputs(args).items()}
         return _digest({"settings": asdict(self.settings), "unit": self.time_unit, "reading": reading, "files": files})
@@ -80,7 +80,7 @@ class Study:
             FileNotFoundError: a file is missing.
         """
         alike = replace(self.settings, times=Times((), 0), normalisation="raw", method="spectral")
-        args = argparse.Namespace(**{**vars(_arguments(subject)), "noise": None})
+        args = argparse.Namespace(**{**vars(subject.args), "noise": None})
         return replace(self, settings=alike, time_unit="").fingerprint(replace(subject, arguments=args))
 
     def regions_fingerprint(self, subject: Subject, fingerprint: str) -> str:
@@ -89,7 +89,7 @@ class Study:
         Raises:
             FileNotFoundError: a file is missing.
         """
-        args = _arguments(subject)
+        args = subject.args
         names = names_beside(args.atlas) if args.names is None else args.names
         files = [None if path is None else digest(existing(path)) for path in (args.atlas, names)]
         return _digest({"signature": fingerprint, "files": files})
@@ -113,37 +113,32 @@ class Study:
         result: Result,
         warnings: list[str],
         draw: Callable[[Path], Any],
-        scaled: Sequence[float] | None,
     ) -> None:
         """Write a subject's signature, its picture and, last, the sidecar that says it is done.
 
         Nothing in the files depends on when or where they were computed.
         """
         self.forget(subject)
-        args, settings = _arguments(subject), plain(result.report["settings"])
-        origin = {"settings": settings, "times": result.times}
-        more = {} if scaled is None else {"scaled_times": scaled}
+        args, report, scaled = subject.args, result.report, result.arrays.get("scaled_times")
         target = self.path(subject, MAP)
         with atomic_folder(target.parent) as temporary:
-            save_result(temporary / target.name, result, image_suffix(args.file), origin, more)
+            result.save(temporary / target.name, image_suffix(args.file))
         with atomic_path(self.picture(subject)) as picture:
             draw(picture)
-        report = result.report
         write_json(
             self.path(subject, f"{MAP}.json"),
             plain(
                 {
                     "Description": "Heat kernel signature of the field of diffusion tensors; times along the last axis",
-                    "Model": {"Description": "Diffusion tensor", "Parameters": settings},
+                    "Model": {"Description": "Diffusion tensor", "Parameters": report["settings"]},
                     "Times": result.times.tolist(),
-                    "TimesByFirstEigenvalue": None if scaled is None else list(scaled),
+                    "TimesByFirstEigenvalue": None if scaled is None else scaled.tolist(),
                     "TimesDescription": times_text(self.time_unit),
                     "Sources": [os.path.basename(path) for paths in _inputs(args).values() for path in paths],
                     "Input": {**report["input"], "source": os.path.basename(str(report["input"]["source"]))},
                     "Eigenpairs": report["eigenpairs"],
                     "Truncation": report["times"],
-                    **({"Method": report["method"]} if "method" in report else {}),
-                    **({"Noise": report["noise"]} if "noise" in report else {}),
+                    **{name.capitalize(): report[name] for name in ("method", "noise") if name in report},
                     "Warnings": warnings,
                     "GeneratedBy": GENERATED_BY,
                     "Fingerprint": fingerprint,
@@ -254,9 +249,9 @@ def reading_options(args: argparse.Namespace) -> dict[str, Any]:
 
     A second scan is one of the files, and said to be one alone: its path may change.
     """
-    reading = {option: getattr(args, option.replace("-", "_")) for option in OPTIONS}
+    reading = {option: getattr(args, option.replace("-", "_")) for option in COLUMNS}
     if args.noise is None:
-        return {option: value for option, value in reading.items() if option not in NOISE}
+        return {option: value for option, value in reading.items() if option not in ("noise", "draws")}
     return {**reading, "noise": args.noise if second_scan(args) is None else "file"}
 
 
@@ -287,12 +282,6 @@ def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
     inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
     second = second_scan(args)
     return inputs if second is None else {**inputs, "noise": [*_inputs(second)["file"], *_inputs(second)["sidecar"]]}
-
-
-def _arguments(subject: Subject) -> argparse.Namespace:
-    if subject.arguments is None:
-        raise ValueError(subject.problem)
-    return subject.arguments
 
 
 def _is_done(sidecar: Path, fingerprint: str, file: Path) -> bool:

@@ -1,47 +1,14 @@
-"""``hks-jax batch SUBJECTS.tsv -o DIR``: the signatures of many subjects, and the tables of their regions."""
+"""Compute the signatures of many subjects, and tables of their regions.
 
-import argparse
-import io
-import json
-import math
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-
-from hks_jax.cli.arguments import MEAN, Times, parse_times, recorded_boundary
-from hks_jax.cli.hks import add_noise_arguments, add_signature_arguments, settings_of
-from hks_jax.cli.inputs import (
-    add_eigenpair_arguments,
-    add_json_argument,
-    add_tensor_options,
-    add_view_argument,
-    read_volume,
-    require_metric,
-    require_spectral,
-    second_scan,
-)
-from hks_jax.cli.stats import add_atlas_arguments
-from hks_jax.cli.study_progress import StudyProgress
-from hks_jax.cli.subjects import FILES, OPTIONS, Subject, read_subjects
-from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.io.tables import read_json
-from hks_jax.io.units import LIVING_TISSUE
-
-if TYPE_CHECKING:
-    from hks_jax.cli.study import Study
-
-DESCRIPTION = f"""\
 Compute the signatures of many subjects, at the same times for all, and tables of their regions. SUBJECTS is a table
 (.tsv, or .csv) with a row for each subject and the columns
 
   participant_id   sub-01 or 01
   session_id       ses-1 or 1, optional
   file             tensors, or diffusion-weighted images; of six images of components, one
-  {", ".join(FILES)}
+  {files}
                    more files of the subject, optional; paths begin where the table is
-  {", ".join(OPTIONS)}
+  {columns}
                    options that differ between subjects, optional; a noise that is a file begins where the table is
 
 and any others, such as age and group, which are kept in participants.tsv. What an option says holds for all subjects
@@ -55,71 +22,72 @@ which unit they are: subjects in different units cannot be compared.
 
 A subject that fails does not stop the others. The same command, given again, computes only what is not there yet, or
 was of other files.
-"""
 
-EPILOG = """\
 examples:
   hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --times 20 40 80 160 --only sub-07 sub-08
 """
 
+import argparse
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand's parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        "batch",
-        help="compute the signatures of many subjects, and tables of their regions",
-        usage="%(prog)s SUBJECTS -o DIR [options]",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add = parser.add_argument
-    add("subjects", metavar="SUBJECTS", type=Path, help="the table of subjects")
-    add("-o", "--output", metavar="DIR", type=Path, required=True, help="the study's folder")
-    add_tensor_options(parser)
-    add_eigenpair_arguments(parser, "that of the study in DIR, else mean, for all subjects alike")
-    add_signature_arguments(parser)
-    add_noise_arguments(parser)
-    add_view_argument(parser)
-    add(
-        "--time-unit",
-        choices=("scanner", "lambda1"),
-        default="scanner",
-        help="of --times: scanner, the same t for all subjects, in seconds for D⁻¹ of mm²/s (default); or lambda1, the "
-        "same λ₁t, each subject's t being divided by its own first positive eigenvalue. Automatic times are log-spaced "
-        "over what suits all, and remain those of the study",
-    )
-    add_atlas_arguments(parser, required=False)
-    add(
-        "--save-pairs",
-        action="store_true",
-        help="keep each subject's eigenpairs: with other --times, --normalisation or --method nothing is solved again",
-    )
-    add("--replace", action="store_true", help="compute a study in DIR again that had other settings or times")
-    add("--only", nargs="+", metavar="SUBJECT", help="compute only these, such as sub-07 or sub-07_ses-2")
-    add_json_argument(parser)
-    parser.set_defaults(strict_unit=True)
-    return parser
+import numpy as np
+
+from hks_jax.cli.info import describe
+from hks_jax.cli.job import ComputationError, Settings
+from hks_jax.cli.noise import require_spectral, second_scan
+from hks_jax.cli.options import READING, SOLVING, Times, parse_times
+from hks_jax.cli.outputs import Done, show
+from hks_jax.cli.progress import Progress, StudyProgress
+from hks_jax.cli.reading import read_volume, require_metric
+from hks_jax.cli.result import recorded_boundary
+from hks_jax.cli.study.subjects import Subject, read_subjects
+from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.io import TensorVolume
+from hks_jax.io.tables import read_json
+from hks_jax.io.units import LIVING_TISSUE
+from hks_jax.signatures.suitable import LAST
+
+if TYPE_CHECKING:
+    from hks_jax.cli.study.folder import Study
+
+OPTIONS = f"""
+subjects SUBJECTS  the table of subjects
+-o,--output DIR!  the study's folder
+@metric {READING} {SOLVING} @signature @noise @view
+--time-unit scanner|lambda1 = scanner
+    of --times: scanner, the same t for all subjects, in seconds for D⁻¹ of mm²/s (default); or lambda1, the same λ₁t,
+    each subject's t being divided by its own first positive eigenvalue. Automatic times are log-spaced over what suits
+    all, and remain those of the study
+@atlas @names
+--save-pairs
+    keep each subject's eigenpairs: with other --times, --normalisation or --method nothing is solved again
+--replace  compute a study in DIR again that had other settings or times
+--only SUBJECT...  compute only these, such as sub-07 or sub-07_ses-2
+"""
 
 
-def run(args: argparse.Namespace) -> None:
-    """Run the subcommand.
+def run(args: argparse.Namespace, _: Progress) -> None:
+    """Run the command.
 
     Raises:
         FileNotFoundError: no such table.
         ValueError: a table or options that are wrong for all subjects.
         ComputationError: some subjects failed; the others are done.
     """
-    from hks_jax.cli.job import ComputationError
-    from hks_jax.cli.outputs import check_folder
-    from hks_jax.cli.study_tasks import run_all
+    from hks_jax.cli.study.tasks import run_all
 
     if second_scan(args) is not None:
         raise ValueError(
             f"--noise: {args.noise} is a scan of one subject; expected a number, residuals or roughness. Second scans "
             "belong into a column noise of the table"
         )
+    args.strict_unit = True
     times, settle = parse_times(args.times), args.boundary is None
     if settle:
         args.boundary = _settled_boundary(args)
@@ -132,7 +100,6 @@ def run(args: argparse.Namespace) -> None:
     with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
     if args.names is not None and not with_regions:
         raise ValueError("--names: it names labels; pass --atlas too, or a column atlas in the table")
-    check_folder(args.output)
     progress = StudyProgress(len(chosen), args.quiet)
     if settle:
         progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
@@ -146,10 +113,8 @@ def run(args: argparse.Namespace) -> None:
         problems |= _other_units(study, [subject for subject in subjects if subject.name not in problems])
         files = study.write_group(subjects, problems, with_regions)
     failed = [subject.name for subject in chosen if problems.get(subject.name)]
-    if args.json:
-        print(json.dumps({"failed": failed, "files": [str(file) for file in files]}, ensure_ascii=False))
-    elif not args.quiet:
-        print("\n".join(str(file) for file in files if file.suffix == ".tsv"))
+    tables = "\n".join(str(file) for file in files if file.suffix == ".tsv")
+    show(args, Done(files, {"failed": failed}, tables))
     if failed:
         raise ComputationError(
             f"{len(failed)} of {len(chosen)} subjects failed ({', '.join(failed[:5])}{', …' * (len(failed) > 5)}); "
@@ -162,7 +127,7 @@ def _other_units(study: "Study", done: list[Subject]) -> dict[str, str]:
 
     Files that declare no lengths in mm, such as NumPy's, can be compared with each other alone.
     """
-    from hks_jax.cli.study import MAP
+    from hks_jax.cli.study.folder import MAP
 
     if study.settings.metric == "tensor":  # which need not be diffusion
         return {}
@@ -184,7 +149,7 @@ def _settled_boundary(args: argparse.Namespace) -> BoundarySpec:
     Subjects are compared, and so have the same boundary, with or without a mask.
     """
     before = {} if args.replace else read_json(args.output / "study.json")
-    return recorded_boundary(before.get("settings", {})) or MEAN
+    return recorded_boundary(before.get("settings", {})) or "mean"
 
 
 def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> "Study":
@@ -193,9 +158,9 @@ def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progr
     Raises:
         ValueError: the folder is a study of other settings, which is not to be replaced.
     """
-    from hks_jax.cli.study import Study, reading_options
+    from hks_jax.cli.study.folder import Study, reading_options
 
-    settings = settings_of(args, times, args.metric or "tensor")
+    settings = Settings.of(args, times=times)
     study = Study(args.output, settings, args.time_unit, reading_options(args), args.save_pairs)
     before = read_json(args.output / "study.json")
     changed = _changes(before, study, _text(times))
@@ -230,8 +195,6 @@ def _suitable(
     args: argparse.Namespace, count: int, subjects: list[Subject], progress: StudyProgress
 ) -> tuple[float, ...]:
     """Read all subjects, and return times that suit them; those that cannot be read have no say."""
-    from hks_jax.cli.study_times import common_times, suitable_range
-
     if args.metric == "adjugate":
         raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
     ranges, silent = {}, StudyProgress(1, True)
@@ -239,9 +202,7 @@ def _suitable(
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
         try:
-            assert subject.arguments is not None, subject.problem
-            volume = read_volume(subject.arguments, silent)
-            ranges[subject.name] = suitable_range(volume, subject.arguments)
+            ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
         except Exception:  # said when its turn comes
             continue
     if not ranges:
@@ -249,6 +210,50 @@ def _suitable(
     times = common_times(ranges, count, args.time_unit)
     progress.end(f"times that suit all subjects ({len(ranges)}): {', '.join(f'{t:g}' for t in times)}")
     return times
+
+
+class Range(NamedTuple):
+    """The times that suit one subject: those that its voxels and its eigenpairs resolve, and its size ends."""
+
+    least: float
+    largest: float
+
+
+def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
+    """Return the range of times that suits a subject, from its metric and its size, before anything is computed.
+
+    Raises:
+        KeyError: the metric is the adjugate, or no tensor is valid.
+    """
+    suits: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"]
+    of = suits[args.metric or "tensor"]
+    by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
+    return Range(max(of["least_time"], by_pairs), of["largest_time"])
+
+
+def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
+    """Return n times, log-spaced over what suits all subjects, rounded to three digits.
+
+    Args:
+        ranges: one for each subject, by name.
+        n: how many.
+        unit: ``"scanner"``: from the largest of the least times to the least of the largest; ``"lambda1"``: the same of
+            λ₁t, whose largest is `LAST`.
+
+    Raises:
+        ValueError: no time suits all.
+    """
+    if unit == "lambda1":
+        ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}
+    late, flat = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
+    least, largest = ranges[late].least, ranges[flat].largest
+    if least >= largest:
+        raise ValueError(
+            f"--times: none suits all subjects: {late} resolves only t ≥ {least:.3g}, and {flat} is flat from "
+            f"t = {largest:.3g} on. Choose times, or more eigenpairs (-k); see what 'hks-jax info' says of {late}: "
+            "tensors with eigenvalues near zero take its pairs (--repair nearest:1e-4)"
+        )
+    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n)) if n > 1 else (float(f"{least:.3g}"),)
 
 
 def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:

@@ -14,18 +14,16 @@ import numpy as np
 
 from hks_jax.atomic import claim
 from hks_jax.cli import INPUT_ERRORS
-from hks_jax.cli.arguments import Times
-from hks_jax.cli.inputs import read_volume
 from hks_jax.cli.job import ComputationError, compute_pairs, signature_of
 from hks_jax.cli.noise import error_bars, noise_of, with_error_bars
+from hks_jax.cli.options import Times
+from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.picture import draw, draw_volume
-from hks_jax.cli.progress import duration
-from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.regions import region_table
-from hks_jax.cli.saved_pairs import are_of, read_pairs, write_pairs
-from hks_jax.cli.study import MAP, PAIRS, Study
-from hks_jax.cli.study_progress import StudyProgress
-from hks_jax.cli.subjects import Subject
+from hks_jax.cli.progress import StudyProgress, duration
+from hks_jax.cli.reading import image_suffix, read_volume
+from hks_jax.cli.stats import region_table
+from hks_jax.cli.study.folder import MAP, PAIRS, Study
+from hks_jax.cli.study.subjects import Subject
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.io import TensorVolume
@@ -106,9 +104,8 @@ class _Task(NamedTuple):
     def of(cls, study: Study, subject: Subject) -> "_Task":
         """Return what is to be done: what is not there, or was of other files or settings."""
         fingerprint = study.fingerprint(subject)
-        assert subject.arguments is not None
         missing, regions = not study.is_done(subject, fingerprint), ""
-        if subject.arguments.atlas is not None:
+        if subject.args.atlas is not None:
             regions = study.regions_fingerprint(subject, fingerprint)
             regions = "" if not missing and study.has_regions(subject, regions) else regions
         return cls(subject, fingerprint, missing, regions)
@@ -122,8 +119,7 @@ class _Task(NamedTuple):
 
     def run(self, study: Study, progress: StudyProgress) -> None:
         """Do it."""
-        args = self.subject.arguments
-        assert args is not None
+        args = self.subject.args
         if self.signature:
             _compute(study, self.subject, self.fingerprint, progress)
         if self.regions:
@@ -136,26 +132,25 @@ class _Task(NamedTuple):
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
     """Compute and write the signature of a subject."""
     study.forget(subject)
-    settings, scaled = study.settings, None
+    settings, args = study.settings, subject.args
     volume, field, pairs = _pairs(study, subject, progress)
     if study.time_unit == "lambda1":
-        scaled = settings.times.explicit
-        own = np.array(scaled) / float(positive_range(pairs)[0])
+        own = np.array(settings.times.explicit) / float(positive_range(pairs)[0])
         settings = replace(settings, times=Times(tuple(own.tolist()), 0))
-    args = subject.arguments
-    assert args is not None
-    bars = None
     if args.noise is not None:
         if args.noise == "residuals" and volume.covariance is None:  # pairs that were kept do not have it
             volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
         noise = noise_of(args, volume, field.grid, progress)
         bars, settings = error_bars(volume, noise, pairs, settings, args.draws, progress)
     result = signature_of(volume, field, pairs, settings, progress)
-    if bars is not None:
+    if args.noise is not None:
         result = with_error_bars(result, bars, os.path.basename(args.noise))
+    if study.time_unit == "lambda1":
+        scaled = {"scaled_times": np.array(study.settings.times.explicit)}
+        result = replace(result, arrays={**result.arrays, **scaled})
     drawn = partial(draw if volume.dimension == 2 else draw_volume, result, view=args.view)
     with progress.stage("writing"):
-        study.write_signature(subject, fingerprint, result, progress.warnings, drawn, scaled)
+        study.write_signature(subject, fingerprint, result, progress.warnings, drawn)
 
 
 def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[TensorVolume, TensorField, Eigenpairs]:
@@ -164,12 +159,10 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[Ten
     if are_of(kept, fingerprint):
         return read_pairs(kept, study.settings, progress)[:3]
     kept.unlink(missing_ok=True)
-    assert subject.arguments is not None
-    with progress.stage("reading"):
-        volume = read_volume(subject.arguments, progress)
+    volume = read_volume(subject.args, progress)
     field, pairs, _ = compute_pairs(volume, study.settings, progress)
     if study.save_pairs:
-        domain, image = volume.with_mask(field.grid.mask), image_suffix(subject.arguments.file)
+        domain, image = volume.with_mask(field.grid.mask), image_suffix(subject.args.file)
         with progress.stage("writing"):
             write_pairs(kept, domain, pairs, study.settings, image, progress.warnings, fingerprint)
     return volume, field, pairs

@@ -8,18 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
-from hks_jax.cli.hks import add_noise_arguments
-from hks_jax.cli.inputs import second_scan
-from hks_jax.cli.reading import add_file_argument, add_options, defaults
-from hks_jax.cli.stats import add_atlas_arguments
+from hks_jax.cli.noise import second_scan
+from hks_jax.cli.options import COLUMNS, FILES, READING, add_options
 from hks_jax.io.tables import read_table
-
-FILES = ("mask", "bval", "bvec", "atlas", "names")
-"""Columns that are paths, beside `file`; relative ones begin where the table is."""
-
-NOISE = ("noise", "draws")
-OPTIONS = (*(name.replace("_", "-") for name in defaults() if name not in FILES), *NOISE)
-"""Columns that stand for the option of the same name: those of reading tensors, and of their noise."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +32,13 @@ class Subject:
     covariates: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def args(self) -> argparse.Namespace:
+        """The arguments; raises ValueError where they are wrong."""
+        if self.arguments is None:
+            raise ValueError(self.problem)
+        return self.arguments
+
+    @property
     def name(self) -> str:
         """The beginning of the names of its files: ``sub-01`` or ``sub-01_ses-2``."""
         return "_".join(filter(None, (self.participant, self.session)))
@@ -56,15 +54,6 @@ class _RowParser(argparse.ArgumentParser):
         raise ValueError(message)
 
 
-def _row_parser() -> argparse.ArgumentParser:
-    parser = _RowParser(add_help=False)
-    add_file_argument(parser)
-    add_options(parser)
-    add_noise_arguments(parser)
-    add_atlas_arguments(parser, required=False)
-    return parser
-
-
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     """Read the table, and join each row with the arguments that hold for all subjects.
 
@@ -75,7 +64,8 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
         ValueError: no table, no columns `participant_id` and `file`, labels that BIDS does not allow, or a subject
             (and session) twice.
     """
-    rows, parser = read_table(path), _row_parser()
+    rows, parser = read_table(path), _RowParser(add_help=False)
+    add_options(parser, f"@file {READING} @noise @atlas @names")
     subjects: dict[str, Subject] = {}
     for number, row in enumerate(rows, 2):
         if "participant_id" not in row:
@@ -111,7 +101,7 @@ def _subject(
         option = column.lower().replace("_", "-")
         if option in FILES:
             words += [f"--{option}", str(folder / text)]
-        elif option in OPTIONS:
+        elif option in COLUMNS:
             words += [f"--{option}", *(text.replace(",", " ").split() if option == "spacing" else [text])]
         else:
             covariates[column] = text
@@ -121,6 +111,6 @@ def _subject(
         arguments = parser.parse_args(words, copy.copy(common))
         if second_scan(arguments) is not None:
             arguments.noise = str(folder / arguments.noise)
+        return Subject(participant, session, arguments, "", covariates)
     except ValueError as error:
         return Subject(participant, session, None, str(error), covariates)
-    return Subject(participant, session, arguments, "", covariates)
