@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.job import Settings, compute_pairs, signature_of
+from hks_jax.cli.job import Settings, compute_pairs
+from hks_jax.cli.noise import signature_of
 from hks_jax.cli.options import Times
 from hks_jax.cli.outputs import Done, write_outputs
 from hks_jax.cli.progress import Progress
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     times = lengths**2 / np.median(mean[volume.mask])
     chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
     settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
-    result = signature_of(volume, *compute_pairs(volume, settings, progress), progress)
+    result = signature_of(args, volume, *compute_pairs(volume, settings, progress), progress)
     titles = [
         rf"$t$ = {number_text(t)} s  ($\sqrt{{Dt}}$ ≈ {length:.2g} mm)"
         for t, length in zip(times, lengths, strict=True)

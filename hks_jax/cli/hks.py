@@ -20,13 +20,15 @@ examples:
 """
 
 import argparse
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from hks_jax import assemble
 from hks_jax.cli import pairs as saved_pairs
-from hks_jax.cli.job import Settings, compute_on_mesh, compute_pairs, signature_of
-from hks_jax.cli.noise import error_bars, noise_of, require_spectral, with_error_bars
+from hks_jax.cli.job import Settings, compute_pairs, result_of, solve
+from hks_jax.cli.noise import require_spectral, signature_of
 from hks_jax.cli.options import READING, SOLVING, parse_times, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
@@ -64,7 +66,12 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
     meshes.check_options(args)
     with progress.stage("reading", str(args.file)):
         mesh = meshes.read_domain(args, progress)
-    result = compute_on_mesh(mesh, meshes.describe_mesh(args.file, mesh), settings, progress)
+    boundary = settings.boundary or "neumann"
+    settings = replace(settings, boundary=boundary)
+    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
+        pencil = assemble(mesh, boundary)
+    pairs = solve(pencil, settings, progress)
+    result = result_of(mesh, meshes.describe_mesh(args.file, mesh), pairs, settings, progress)
     image = meshes.mesh_suffix(args.file, mesh)
     return write_outputs(args.output, result, progress, partial(meshes.draw, result), image)
 
@@ -77,7 +84,7 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
         saved_pairs.check_options(args)
     else:
         require_metric(args)
-    from hks_jax.cli.picture import draw, draw_volume
+    from hks_jax.cli.picture import draw
 
     if saved:
         volume, field, pairs, settings, image = saved_pairs.read_pairs(args.file, settings, progress)
@@ -93,14 +100,9 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
                 file.unlink(missing_ok=True)
             domain = volume.with_mask(field.grid.mask)
             saved_pairs.write_pairs(args.output / PAIRS, domain, pairs, settings, image, progress.warnings)
-    if args.noise is not None:
-        noise = noise_of(args, volume, field.grid, progress)
-        bars, settings = error_bars(volume, noise, pairs, settings, args.draws, progress)
-    result = signature_of(volume, field, pairs, settings, progress)
-    if args.noise is not None:
-        result = with_error_bars(result, bars, args.noise)
-    drawing = draw if volume.dimension == 2 else partial(draw_volume, through=args.through)
-    return write_outputs(args.output, result, progress, partial(drawing, result, view=args.view), image)
+    result = signature_of(args, volume, field, pairs, settings, progress)
+    drawing = partial(draw, result, view=args.view, through=args.through)
+    return write_outputs(args.output, result, progress, drawing, image)
 
 
 def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:

@@ -8,25 +8,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hks_jax import (
+    Eigenpairs,
+    Grid,
+    MirrorPencil,
+    Pencil,
+    TensorField,
+    assemble,
+    default_times,
+    eigenpairs,
+    hks,
+    hks_auto,
+    truncation,
+    truncation_map,
+)
 from hks_jax.cli.options import DEFAULT_TIMES, SOLVING, Times, as_options, defaults
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.result import Result
-from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.automatic import choose_solver
-from hks_jax.eigen.driver import eigenpairs
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
-from hks_jax.fem.pencil import AnyPencil
+from hks_jax.io import TensorVolume
 from hks_jax.io.units import median_mean_diffusivity
-from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.hks import HKSMethod, Normalisation, hks, hks_auto
+from hks_jax.signatures.hks import HKSMethod, Normalisation
 from hks_jax.signatures.suitable import SHOWN, default_k
-from hks_jax.signatures.times import default_times
-from hks_jax.signatures.truncation import truncation, truncation_map
 
 
 class ComputationError(RuntimeError):
@@ -66,40 +72,14 @@ def use_dtype(dtype: str) -> None:
         jax.config.update("jax_enable_x64", True)
 
 
-def signature_of(
-    volume: TensorVolume, field: TensorField, pairs: Eigenpairs, settings: Settings, progress: Progress
-) -> Result:
-    """Compute the signature of a volume or slice whose metric and eigenpairs are known.
-
-    Raises:
-        ValueError: settings that cannot be computed with.
-    """
-    mask = field.grid.mask
-    return _result(volume.with_mask(mask), describe_input(volume, mask), pairs, settings, progress)
-
-
-def compute_on_mesh(mesh: SimplicialMesh, described: dict[str, Any], settings: Settings, progress: Progress) -> Result:
-    """Compute the signature on a mesh, whose metric it has already; `described` is what the report says of it.
-
-    Raises:
-        ValueError: settings that cannot be computed with.
-        ComputationError: eigenpairs that did not converge.
-    """
-    boundary = settings.boundary or "neumann"
-    settings = replace(settings, boundary=boundary)
-    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
-        pencil = assemble(mesh, boundary)
-    return _result(mesh, described, _solve(pencil, settings, progress), settings, progress)
-
-
-def _result(
+def result_of(
     place: TensorVolume | SimplicialMesh,
     described: dict[str, Any],
     pairs: Eigenpairs,
     settings: Settings,
     progress: Progress,
 ) -> Result:
-    """Return the signature, and its report."""
+    """Compute the signature on a volume, whose mask is the domain, or a mesh, of which the report says `described`."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
         values, origin = _signature(pairs, times, settings)
@@ -113,11 +93,7 @@ def automatic_times(pairs: Eigenpairs, n: int) -> tuple[float, ...]:
 
 
 def field_of(volume: TensorVolume, grid: Grid, settings: Settings) -> TensorField:
-    """Return the metric of a volume or slice on its grid, in the precision asked for.
-
-    Raises:
-        ValueError: tensors that make no metric.
-    """
+    """Return the metric of a volume or slice on its grid, in the precision asked for."""
     use_dtype(settings.dtype)
     assert settings.metric is not None
     tensors = volume.tensors.astype(settings.dtype)
@@ -129,12 +105,7 @@ def field_of(volume: TensorVolume, grid: Grid, settings: Settings) -> TensorFiel
 def compute_pairs(
     volume: TensorVolume, settings: Settings, progress: Progress
 ) -> tuple[TensorField, Eigenpairs, Settings]:
-    """Compute the eigenpairs of a volume or slice; return its metric, them, and the settings with their boundary.
-
-    Raises:
-        ValueError: tensors, mask or settings that cannot be computed with.
-        ComputationError: eigenpairs that did not converge.
-    """
+    """Compute the eigenpairs of a volume or slice; return its metric, them, and the settings with their boundary."""
     grid, boundary = volume.grid(settings.components), settings.boundary
     if boundary is None:
         boundary, why = default_boundary(grid.inside)
@@ -144,10 +115,10 @@ def compute_pairs(
             progress.warn(message)
         field = field_of(volume, grid, settings)
         pencil = assemble(field, boundary)
-    return field, _solve(pencil, settings, progress), replace(settings, boundary=boundary)
+    return field, solve(pencil, settings, progress), replace(settings, boundary=boundary)
 
 
-def _solve(pencil: AnyPencil, settings: Settings, progress: Progress) -> Eigenpairs:
+def solve(pencil: Pencil | MirrorPencil, settings: Settings, progress: Progress) -> Eigenpairs:
     """Compute eigenpairs; raise ComputationError unless all of them converged."""
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None

@@ -4,27 +4,30 @@ import argparse
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.accuracy import AccuracyWarning
-from hks_jax.cli.job import Settings, automatic_times
+from hks_jax import (
+    AccuracyWarning,
+    Eigenpairs,
+    TensorField,
+    TensorNoise,
+    Uncertainty,
+    boundary_influence,
+    eigenpairs,
+    hks,
+    uncertainty,
+)
+from hks_jax.cli.job import Settings, automatic_times, describe_input, result_of
 from hks_jax.cli.options import Times
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.cli.result import Result
-from hks_jax.domain.grid import Grid
-from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.driver import eigenpairs
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.boundary import boundary_influence
-from hks_jax.signatures.hks import hks
-from hks_jax.uncertainty import TensorNoise, Uncertainty, uncertainty
+from hks_jax.io import TensorVolume
 
 _CANDIDATES = 4
 """How many times as many times are looked at as automatic ones are asked for."""
@@ -36,18 +39,6 @@ _LEAST = 0.1
 """The share of the nodes that an interior has at least: fewer do not tell how a map varies."""
 _CLEAR = 2.0
 """The signal to noise that the report names the first time of."""
-
-
-class Bars(NamedTuple):
-    """Error bars of a signature, the noise (n_draws, n_times, *shape) of which they are made, and the interior.
-
-    The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
-    few such nodes; else it is all of the domain.
-    """
-
-    uncertainty: Uncertainty
-    maps: np.ndarray
-    interior: np.ndarray
 
 
 def require_spectral(args: argparse.Namespace) -> None:
@@ -67,52 +58,84 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
     return None
 
 
-def noise_of(args: argparse.Namespace, volume: TensorVolume, grid: Grid, progress: Progress) -> TensorNoise:
-    """Return the noise that the arguments name.
+def signature_of(
+    args: argparse.Namespace,
+    volume: TensorVolume,
+    field: TensorField,
+    pairs: Eigenpairs,
+    settings: Settings,
+    progress: Progress,
+) -> Result:
+    """Compute the signature of a volume or slice whose metric and eigenpairs are known, with error bars if asked to."""
+    mask = field.grid.mask
+    place, described = volume.with_mask(mask), describe_input(volume, mask)
+    if getattr(args, "noise", None) is None:
+        return result_of(place, described, pairs, settings, progress)
+    bars, maps, interior, times = _error_bars(args, volume, field, pairs, settings, progress)
+    settings = replace(settings, times=Times(times, settings.times.automatic))
+    result = result_of(place, described, pairs, settings, progress)
+    ratio = np.asarray(bars.signal_to_noise_at(interior))
+    nodes = np.isfinite(np.asarray(bars.value[0])).sum()
+    clear = np.flatnonzero(ratio > _CLEAR)
+    report = {
+        "source": args.noise,
+        "draws": bars.draws,
+        "sampling_error": bars.sampling_error,
+        "indefinite": float(bars.indefinite),
+        "signal_to_noise": ratio.tolist(),
+        "signal_to_noise_with_rim": np.asarray(bars.signal_to_noise).tolist(),
+        "interior": (interior.reshape(len(ratio), -1).sum(axis=1) / nodes).tolist(),
+        "claimed": np.asarray(bars.trusted).tolist(),
+        f"exceeds_{_CLEAR:g}_from_t": float(times[clear[0]]) if clear.size else None,
+    }
+    arrays = {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": maps}
+    return replace(result, arrays=arrays, report={**result.report, "noise": report})
 
-    Raises:
-        FileNotFoundError: neither a number, nor a word that is known, nor a file.
-        ValueError: residuals of what was not fitted; a second scan that does not fit the first.
-    """
+
+def _noise(args: argparse.Namespace, volume: TensorVolume, field: TensorField, progress: Progress) -> TensorNoise:
+    """Return the noise that the arguments name."""
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: residuals are those of a fit to diffusion-weighted images (--bval, --bvec)")
-        return TensorNoise(volume.covariance, grid)
+        return TensorNoise(volume.covariance, field.grid)
     if args.noise == "roughness":
-        return TensorNoise.from_roughness(volume.tensors, grid)
+        return TensorNoise.from_roughness(volume.tensors, field.grid)
     second = second_scan(args)
     if second is not None:
-        return TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, grid)
-    return TensorNoise.relative(volume.tensors, float(args.noise), grid)
+        return TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, field.grid)
+    return TensorNoise.relative(volume.tensors, float(args.noise), field.grid)
 
 
-def error_bars(
-    volume: TensorVolume, noise: TensorNoise, pairs: Eigenpairs, settings: Settings, draws: int, progress: Progress
-) -> tuple[Bars, Settings]:
-    """Compute error bars; return them, and the settings with the times, which begin where there is signal."""
-    wanted = settings.times.automatic
+def _error_bars(
+    args: argparse.Namespace,
+    volume: TensorVolume,
+    field: TensorField,
+    pairs: Eigenpairs,
+    settings: Settings,
+    progress: Progress,
+) -> tuple[Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
+    """Return error bars, the noise (n_draws, n_times, *shape) of which they are made, the interior, and the times.
+
+    The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
+    few such nodes; else it is all of the domain. Automatic times begin where there is signal.
+    """
+    noise, wanted = _noise(args, volume, field, progress), settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
-    grid = noise.grid
-    assert grid is not None
-    assert settings.metric is not None
-    assert settings.boundary is not None
-    boundary = settings.boundary
+    maps: list[np.ndarray] = []
 
     def signature(D: Any) -> Any:
-        field = TensorField.from_diffusion(grid, D, settings.metric, interpolation=settings.interpolation)
-        return hks(eigenpairs(field, pairs.k, boundary, settings.solver), times, settings.normalisation)
+        assert settings.metric is not None
+        assert settings.boundary is not None
+        metric = TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
+        return hks(eigenpairs(metric, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
 
-    with progress.stage("error bars", f"{draws} noisy maps"), warnings.catch_warnings():
+    def keep(one: Any) -> None:
+        maps.append(np.asarray(one, np.float32))
+
+    with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # of times that are not chosen, too
-        tensors = volume.tensors.astype(settings.dtype)
-        maps: list[np.ndarray] = []
-
-        def keep(one: Any) -> None:
-            maps.append(np.asarray(one, np.float32))
-
-        bars = uncertainty(
-            signature, tensors, noise, method="resample", draws=draws, progress=progress.update, each=keep
-        )
+        tensors, more = volume.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
+        bars = uncertainty(signature, tensors, noise, method="resample", progress=progress.update, **more)
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:
             nodes = interior[0].sum()
@@ -126,31 +149,9 @@ def error_bars(
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
         chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)
         bars = jax.tree.map(lambda leaf: leaf[chosen] if jnp.ndim(leaf) else leaf, bars)
-        times = tuple(times[i] for i in chosen)
     for message in bars.messages():
         progress.warn(message)
-    return Bars(bars, np.stack(maps)[:, chosen], interior[chosen]), replace(settings, times=Times(times, wanted))
-
-
-def with_error_bars(result: Result, found: Bars, source: str) -> Result:
-    """Return a result with error bars, and with what the report says of them."""
-    bars = found.uncertainty
-    ratio = np.asarray(bars.signal_to_noise_at(found.interior))
-    nodes = np.isfinite(np.asarray(bars.value[0])).sum()
-    clear = np.flatnonzero(ratio > _CLEAR)
-    report = {
-        "source": source,
-        "draws": bars.draws,
-        "sampling_error": bars.sampling_error,
-        "indefinite": float(bars.indefinite),
-        "signal_to_noise": ratio.tolist(),
-        "signal_to_noise_with_rim": np.asarray(bars.signal_to_noise).tolist(),
-        "interior": (found.interior.reshape(len(ratio), -1).sum(axis=1) / nodes).tolist(),
-        "claimed": np.asarray(bars.trusted).tolist(),
-        f"exceeds_{_CLEAR:g}_from_t": float(result.times[clear[0]]) if clear.size else None,
-    }
-    arrays = {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": found.maps}
-    return replace(result, arrays={**result.arrays, **arrays}, report={**result.report, "noise": report})
+    return bars, np.stack(maps)[:, chosen], interior[chosen], tuple(times[i] for i in chosen)
 
 
 def z_of(result: Result) -> Float[np.ndarray, "n_times *shape"] | None:

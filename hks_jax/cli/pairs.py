@@ -25,8 +25,8 @@ from hks_jax.npz import load_npz
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that belong to the pairs."""
-_ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit", "repair")
-"""What of a volume is kept as text beside its arrays, with its notes."""
+_ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit", "notes", "repair")
+"""What of a volume is kept as text beside its arrays."""
 
 
 def is_saved_pairs(path: Path) -> bool:
@@ -66,7 +66,7 @@ def write_pairs(
         warnings: what was said of the tensors and of the pairs, to be said again.
         fingerprint: of a study's subject, what the pairs were computed from.
     """
-    record = {name: getattr(volume, name) for name in (*_ABOUT, "notes")}
+    record = {name: getattr(volume, name) for name in _ABOUT}
     record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: value for name, value in asdict(settings).items() if name in _SETTLED}
     save_pairs(path, pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
@@ -96,8 +96,7 @@ def read_pairs(
         tuple(arrays["origin"].tolist()),
         arrays.get("mask"),
         arrays.get("affine"),
-        notes=tuple(record["notes"]),
-        **{name: record[name] for name in _ABOUT if name in record},
+        **{name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])},
     )
     boundary = recorded_boundary(record["settings"])
     assert boundary is not None

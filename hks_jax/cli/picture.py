@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from hks_jax import Grid
 from hks_jax.cli.noise import z_of
 from hks_jax.cli.result import Result
-from hks_jax.domain.grid import Grid
 from hks_jax.fem.boundary import normalise_boundary
-from hks_jax.io.volume import TensorVolume
+from hks_jax.io import TensorVolume
 from hks_jax.plot import Orientation, new_figure, number_text, save_figure, scalar_image, volume_panels
-from hks_jax.plot.images import colours_of
+from hks_jax.plot.images import Colours, colours_of
 from hks_jax.plot.orientation import View
 
 SPAN = (0.002, 0.998)
@@ -40,8 +40,9 @@ def draw(
     first: tuple[str, Float[np.ndarray, "*shape"]] | None = None,
     title: str = "",
     view: View = "neurological",
+    through: tuple[int, int, int] | None = None,
 ) -> None:
-    """Draw the signature of a slice, one image per time with its own colours.
+    """Draw a signature for each time, with its own colours: the slice, or three orthogonal slices of a volume.
 
     The colours span the values away from the boundary; arrows at a colour bar's ends say that some lie beyond. Under
     "flat" normalisation they diverge from 1, which the signature is where the metric is flat. With error bars, what
@@ -50,90 +51,64 @@ def draw(
     Args:
         result: what to draw.
         path: the picture's file.
-        titles: one per time; None: “t = …”.
-        first: a title and a scalar (*shape,), drawn before the signature in grey.
-        title: of the whole picture.
+        titles: of a slice, one per time; None: “t = …”.
+        first: a title and a scalar (*shape,), drawn before the signature of a slice in grey.
+        title: of the whole picture of a slice.
         view: what is on the left, see `placed`.
+        through: the voxel that slices run through, or the nearest one in the domain; None: one in the middle.
     """
-    values, inside, volume = result.values, np.isfinite(result.values[0]), result.volume
-    titles = titles or [f"$t$ = {number_text(t)} {result.unit}".rstrip() for t in result.times]
-    if first is not None:
-        titles, values = [first[0], *titles], np.concatenate([first[1][None], values])
+    volume, inside, z = result.volume, np.isfinite(result.values[0]), z_of(result)
     grid, box = cropped(volume, inside)
-    values, inside, orientation = values[:, *box], inside[box], placed(volume, box, view)
-
-    z = z_of(result)
+    orientation, values = placed(volume, box, view), result.values[:, *box]
     z = None if z is None else z[:, *box]
-    rows = math.ceil(len(values) / 4)
-    columns = math.ceil(len(values) / rows)
+    colours = _colours(result, inside)
+    if volume.dimension == 3:
+        node = None if through is None else _nearest(inside, through)
+        volume_panels(
+            values,
+            result.times,
+            grid,
+            node=node and [i - part.start for i, part in zip(node, box, strict=True)],
+            limits=[each[:2] for each in colours],
+            cmap=[each.cmap for each in colours],
+            length_unit="mm" if volume.affine is not None else "",
+            label=LABELS[result.settings["normalisation"]],
+            orientation=orientation,
+            z=z,
+            path=path,
+        )
+        return
+    inside = inside[box]
+    titles = titles or [f"$t$ = {number_text(t)} {result.unit}".rstrip() for t in result.times]
+    faded = [None] * len(values) if z is None else list(z)
+    panels = list(zip(titles, values, colours, faded, strict=True))
+    if first is not None:
+        grey = first[1][box]
+        panels.insert(0, (first[0], grey, colours_of(grey[inside], (0.01, 0.96))._replace(cmap="gray"), None))
+    rows = math.ceil(len(panels) / 4)
+    columns = math.ceil(len(panels) / rows)
     figure = new_figure(columns * 3.3, rows * (2.4 * proportion(grid, orientation) + 0.4) + 0.4 * bool(title))
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    deep, span = _coloured(result, inside)
-    for i, (ax, image, text) in enumerate(zip(panels, values, titles, strict=False)):
-        grey = first is not None and i == 0
-        if grey:
-            colours = colours_of(image[inside], (0.01, 0.96))._replace(cmap="gray")
-        else:
-            colours = colours_of(image[deep], span, LEAST_RANGE, _centre(result))
-        low, high, cmap = colours
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, (text, image, (low, high, cmap), noise) in zip(axes, panels, strict=False):
         image = np.where(inside, image, np.nan)
-        faded = None if z is None or grey else z[i - (first is not None)]
-        scalar_image(ax, image, grid, cmap=cmap, vmin=low, vmax=high, orientation=orientation, z=faded)
+        scalar_image(ax, image, grid, cmap=cmap, vmin=low, vmax=high, orientation=orientation, z=noise)
         ax.set_title(text, fontsize="medium")
         ax.set_axis_off()
-    for ax in panels[len(values) :]:
+    for ax in axes[len(panels) :]:
         ax.remove()
     if title:
         figure.suptitle(title)
     save_figure(figure, path)
 
 
-def draw_volume(
-    result: Result, path: Path, through: tuple[int, int, int] | None = None, view: View = "neurological"
-) -> None:
-    """Draw the signature of a volume: for each time, with its own colours, three orthogonal slices; noise fades.
-
-    Args:
-        result: what to draw.
-        path: the picture's file.
-        through: the voxel that the slices run through, or the nearest one in the domain; None: one in the middle.
-        view: what is on the left, see `placed`.
-    """
-    inside, volume = np.isfinite(result.values[0]), result.volume
-    node = None if through is None else _nearest(inside, through)
-    grid, box = cropped(volume, inside)
-    deep, span = _coloured(result, inside)
-    colours = [colours_of(values[deep], span, LEAST_RANGE, _centre(result)) for values in result.values]
-    z = z_of(result)
-    volume_panels(
-        result.values[:, *box],
-        result.times,
-        grid,
-        node=node and [i - part.start for i, part in zip(node, box, strict=True)],
-        limits=[each[:2] for each in colours],
-        cmap=[each.cmap for each in colours],
-        length_unit="mm" if volume.affine is not None else "",
-        label=LABELS[result.settings["normalisation"]],
-        orientation=placed(volume, box, view),
-        z=None if z is None else z[:, *box],
-        path=path,
-    )
-
-
-def _centre(result: Result) -> float | None:
-    """Return the value of the middle colour, if there is one that means something."""
-    return 1.0 if result.settings["normalisation"] == "flat" else None
-
-
-def _coloured(
-    result: Result, inside: Bool[np.ndarray, "*shape"]
-) -> tuple[Bool[np.ndarray, "*shape"], tuple[float, float]]:
-    """Return which nodes' values the colours span, and from which quantile to which."""
+def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
+    """Return for each time the colours, which span the values away from the boundary but for a few."""
     rim = normalise_boundary(result.settings["boundary"], inside.ndim)[-1]
-    if "mean" not in rim:
-        return away_from_rim(inside), SPAN
-    # The rim is like all else, but for its corners; and in a volume but for the mask's thin parts, which are many.
-    return inside if inside.ndim == 2 else away_from_rim(inside), (0.01, 0.99)
+    # Under the mean the rim is like all else, but for its corners; in a volume but for the mask's thin parts, too.
+    deep = inside if "mean" in rim and inside.ndim == 2 else away_from_rim(inside)
+    span = (0.01, 0.99) if "mean" in rim else SPAN
+    centre = 1.0 if result.settings["normalisation"] == "flat" else None
+    return [colours_of(values[deep], span, LEAST_RANGE, centre) for values in result.values]
 
 
 def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) -> tuple[int, ...]:
@@ -150,13 +125,7 @@ def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> 
 
 
 def placed(volume: TensorVolume, box: Sequence[slice], view: View) -> Orientation | None:
-    """Return how a box of a volume or slice lies in space; None where that is not known.
-
-    Args:
-        volume: what the box is cut out of.
-        box: the box, a slice along each axis.
-        view: whether left is on the left (``"neurological"``) or on the right (``"radiological"``).
-    """
+    """Return how a box of a volume or slice lies in space; None where that is not known."""
     if volume.affine is None:
         return None
     thin = volume.thin_axis if volume.dimension == 2 else None
@@ -176,10 +145,9 @@ def proportion(grid: Grid, orientation: Orientation | None) -> float:
 
 def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[slice, ...]:
     """Return the slices that cut a box around the True entries, with a margin."""
-    ends = [(int(along.min()), int(along.max()) + 1) for along in np.nonzero(inside)]
-    return tuple(
-        slice(max(low - margin, 0), min(high + margin, n)) for (low, high), n in zip(ends, inside.shape, strict=True)
-    )
+    (box,) = ndimage.find_objects(inside.astype(int))
+    ends = zip(box, inside.shape, strict=True)
+    return tuple(slice(max(part.start - margin, 0), min(part.stop + margin, n)) for part, n in ends)
 
 
 def away_from_rim(inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:

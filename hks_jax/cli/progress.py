@@ -1,5 +1,6 @@
 """What goes to stderr: what is being done, since when, how long it will take, and messages of the library."""
 
+import io
 import shutil
 import sys
 import threading
@@ -42,7 +43,7 @@ class Progress:
 
     _LINE_END = "\n"
 
-    def __init__(self, quiet: bool = False, stream: TextIO | None = None) -> None:
+    def __init__(self, quiet: bool = False, stream: TextIO | io.StringIO | None = None) -> None:
         self.quiet = quiet
         self.stream = sys.stderr if stream is None else stream
         self.timings: dict[str, float] = {}
@@ -158,7 +159,7 @@ class StudyProgress(Progress):
 
     _LINE_END = "\r\x1b[K"
 
-    def __init__(self, total: int, quiet: bool = False, stream: TextIO | None = None) -> None:
+    def __init__(self, total: int, quiet: bool = False, stream: TextIO | io.StringIO | None = None) -> None:
         super().__init__(quiet, stream)
         self.total, self.ended, self._spent = total, 0, 0.0
 

@@ -33,28 +33,26 @@ import io
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hks_jax.cli.info import describe
 from hks_jax.cli.job import ComputationError, Settings
 from hks_jax.cli.noise import require_spectral, second_scan
-from hks_jax.cli.options import READING, SOLVING, Times, parse_times
+from hks_jax.cli.options import READING, SOLVING, Times, parse_times, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.cli.result import recorded_boundary
+from hks_jax.cli.study.folder import MAP, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
-from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import TensorVolume
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
 from hks_jax.signatures.suitable import LAST
-
-if TYPE_CHECKING:
-    from hks_jax.cli.study.folder import Study
 
 OPTIONS = f"""
 subjects SUBJECTS  the table of subjects
@@ -73,13 +71,7 @@ subjects SUBJECTS  the table of subjects
 
 
 def run(args: argparse.Namespace, _: Progress) -> None:
-    """Run the command.
-
-    Raises:
-        FileNotFoundError: no such table.
-        ValueError: a table or options that are wrong for all subjects.
-        ComputationError: some subjects failed; the others are done.
-    """
+    """Run the command; where some subjects fail, raise ComputationError when the others are done."""
     from hks_jax.cli.study.tasks import run_all
 
     if second_scan(args) is not None:
@@ -89,8 +81,9 @@ def run(args: argparse.Namespace, _: Progress) -> None:
         )
     args.strict_unit = True
     times, settle = parse_times(args.times), args.boundary is None
-    if settle:
-        args.boundary = _settled_boundary(args)
+    if settle:  # subjects are compared, and so have the same boundary, with or without a mask
+        before = {} if args.replace else read_json(args.output / "study.json")
+        args.boundary = recorded_boundary(before.get("settings", {})) or "mean"
     subjects = read_subjects(args.subjects, args)
     chosen = _only(subjects, args.only)
     for subject in chosen:
@@ -98,18 +91,18 @@ def run(args: argparse.Namespace, _: Progress) -> None:
             require_metric(subject.arguments)
             require_spectral(subject.arguments)
     with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
-    if args.names is not None and not with_regions:
-        raise ValueError("--names: it names labels; pass --atlas too, or a column atlas in the table")
+    if not with_regions:
+        refuse(args, ("names",), "it names labels; pass --atlas too, or a column atlas in the table")
     progress = StudyProgress(len(chosen), args.quiet)
     if settle:
         progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
     with progress.catching_warnings():
         study = _open(args, times, subjects, progress)
-        study.write_description(subjects, _text(times))
         problems = {subject.name: "" for subject in subjects if subject not in chosen}
         problems |= run_all(study, chosen, progress, args.debug)
         if args.only:  # what others have done in the meantime
-            problems = {name: why for name, why in problems.items() if why or not _is_there(study, subjects, name)}
+            there = {s.name for s in subjects if problems.get(s.name) == "" and _is_there(study, s)}
+            problems = {name: why for name, why in problems.items() if name not in there}
         problems |= _other_units(study, [subject for subject in subjects if subject.name not in problems])
         files = study.write_group(subjects, problems, with_regions)
     failed = [subject.name for subject in chosen if problems.get(subject.name)]
@@ -122,13 +115,18 @@ def run(args: argparse.Namespace, _: Progress) -> None:
         )
 
 
-def _other_units(study: "Study", done: list[Subject]) -> dict[str, str]:
+def _is_there(study: Study, subject: Subject) -> bool:
+    try:
+        return study.has(subject, MAP, study.fingerprint(subject))
+    except Exception:
+        return False
+
+
+def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
     """Return why subjects are refused whose diffusivities are so far from the others' that the unit must be another.
 
     Files that declare no lengths in mm, such as NumPy's, can be compared with each other alone.
     """
-    from hks_jax.cli.study.folder import MAP
-
     if study.settings.metric == "tensor":  # which need not be diffusion
         return {}
     inputs = {subject.name: read_json(study.path(subject, f"{MAP}.json")).get("Input", {}) for subject in done}
@@ -143,52 +141,31 @@ def _other_units(study: "Study", done: list[Subject]) -> dict[str, str]:
     }
 
 
-def _settled_boundary(args: argparse.Namespace) -> BoundarySpec:
-    """Return the boundary of a study that is given none: its own if it is there already, else the mean.
+def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> Study:
+    """Return the study, described in its folder, its times settled: as given, or as it has them, or as they suit all.
 
-    Subjects are compared, and so have the same boundary, with or without a mask.
+    A folder of a study of other settings, which is not to be replaced, is refused.
     """
-    before = {} if args.replace else read_json(args.output / "study.json")
-    return recorded_boundary(before.get("settings", {})) or "mean"
-
-
-def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> "Study":
-    """Return the study, its times settled: as given, or as it has them already, or as they suit all subjects.
-
-    Raises:
-        ValueError: the folder is a study of other settings, which is not to be replaced.
-    """
-    from hks_jax.cli.study.folder import Study, reading_options
-
-    settings = Settings.of(args, times=times)
-    study = Study(args.output, settings, args.time_unit, reading_options(args), args.save_pairs)
-    before = read_json(args.output / "study.json")
-    changed = _changes(before, study, _text(times))
-    if before and changed and not args.replace:
-        raise ValueError(
-            f"--output: {args.output} is a study that differs in {'; '.join(changed)}. Choose another folder, or pass "
-            "--replace to compute its subjects again"
-        )
-    if times.explicit:
-        return study
-    explicit = _suitable(args, times.automatic, subjects, progress) if changed else tuple(before["times"])
-    return replace(study, settings=replace(settings, times=Times(explicit, 0)))
-
-
-def _changes(before: dict[str, Any], study: "Study", chosen: str) -> list[str]:
-    """Say in which options a study differs from what it was; automatic times remain what they were."""
+    study = Study(args.output, Settings.of(args, times=times), args.time_unit, reading_options(args), args.save_pairs)
+    before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = study.record, dict(before)
-    if chosen != "explicit":
+    if times.automatic:  # they remain what they were
         now["times"], then["times"] = chosen, before.get("chosen")
     for part in ("settings", "reading"):
         now |= now.pop(part)
         then |= then.pop(part, {})
-    differing = [(name, then.get(name), value) for name, value in now.items() if then.get(name) != value]
-    return [f"--{name}: {json.dumps(old)}, now {json.dumps(new)}" for name, old, new in differing]
-
-
-def _text(times: Times) -> str:
-    return "explicit" if times.explicit else f"auto:{times.automatic}"
+    pairs = [(name, then.get(name), value) for name, value in now.items() if then.get(name) != value]
+    changed = "; ".join(f"--{name}: {json.dumps(old)}, now {json.dumps(new)}" for name, old, new in pairs)
+    if before and changed and not args.replace:
+        raise ValueError(
+            f"--output: {args.output} is a study that differs in {changed}. Choose another folder, or pass --replace "
+            "to compute its subjects again"
+        )
+    if times.automatic:
+        explicit = _suitable(args, times.automatic, subjects, progress) if changed else tuple(before["times"])
+        study = replace(study, settings=replace(study.settings, times=Times(explicit, 0)))
+    study.write_description(subjects, chosen)
+    return study
 
 
 def _suitable(
@@ -197,14 +174,12 @@ def _suitable(
     """Read all subjects, and return times that suit them; those that cannot be read have no say."""
     if args.metric == "adjugate":
         raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
-    ranges, silent = {}, StudyProgress(1, True)
-    silent.stream = io.StringIO()  # what is to be warned of is, with the subject's name, when its turn comes
+    ranges: dict[str, Range] = {}
+    silent = StudyProgress(1, True, io.StringIO())  # what is to be warned of is, when the subject's turn comes
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
-        try:
+        with suppress(Exception):  # said when its turn comes
             ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
-        except Exception:  # said when its turn comes
-            continue
     if not ranges:
         raise ValueError("--times: none of the subjects can be read; pass --times to see why of each")
     times = common_times(ranges, count, args.time_unit)
@@ -220,13 +195,8 @@ class Range(NamedTuple):
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
-    """Return the range of times that suits a subject, from its metric and its size, before anything is computed.
-
-    Raises:
-        KeyError: the metric is the adjugate, or no tensor is valid.
-    """
-    suits: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"]
-    of = suits[args.metric or "tensor"]
+    """Return the range of times that suits a subject, from its metric and its size, before anything is computed."""
+    of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][args.metric or "tensor"]
     by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
     return Range(max(of["least_time"], by_pairs), of["largest_time"])
 
@@ -234,14 +204,8 @@ def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
 def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
     """Return n times, log-spaced over what suits all subjects, rounded to three digits.
 
-    Args:
-        ranges: one for each subject, by name.
-        n: how many.
-        unit: ``"scanner"``: from the largest of the least times to the least of the largest; ``"lambda1"``: the same of
-            λ₁t, whose largest is `LAST`.
-
-    Raises:
-        ValueError: no time suits all.
+    They go from the largest of the least times to the least of the largest; of the unit ``"lambda1"`` they are λ₁t,
+    whose largest is `LAST`.
     """
     if unit == "lambda1":
         ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}
@@ -253,7 +217,7 @@ def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float,
             f"t = {largest:.3g} on. Choose times, or more eigenpairs (-k); see what 'hks-jax info' says of {late}: "
             "tensors with eigenvalues near zero take its pairs (--repair nearest:1e-4)"
         )
-    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n)) if n > 1 else (float(f"{least:.3g}"),)
+    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))
 
 
 def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
@@ -266,11 +230,3 @@ def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
     if missing:
         raise ValueError(f"--only: got {', '.join(sorted(missing))}; expected subjects of the table")
     return chosen
-
-
-def _is_there(study: "Study", subjects: list[Subject], name: str) -> bool:
-    subject = next(subject for subject in subjects if subject.name == name)
-    try:
-        return study.is_done(subject, study.fingerprint(subject))
-    except Exception:
-        return False

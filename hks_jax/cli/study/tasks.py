@@ -1,32 +1,32 @@
 """The computations of a study: what is to be done of each subject, and doing it."""
 
 import io
-import os
 import sys
 import time
 import traceback
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from hks_jax import Eigenpairs, TensorField
 from hks_jax.atomic import claim
 from hks_jax.cli import INPUT_ERRORS
-from hks_jax.cli.job import ComputationError, compute_pairs, signature_of
-from hks_jax.cli.noise import error_bars, noise_of, with_error_bars
+from hks_jax.cli.job import ComputationError, compute_pairs
+from hks_jax.cli.noise import signature_of
 from hks_jax.cli.options import Times
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
-from hks_jax.cli.picture import draw, draw_volume
+from hks_jax.cli.picture import draw
 from hks_jax.cli.progress import StudyProgress, duration
 from hks_jax.cli.reading import image_suffix, read_volume
 from hks_jax.cli.stats import region_table
-from hks_jax.cli.study.folder import MAP, PAIRS, Study
+from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
-from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.io import TensorVolume
+from hks_jax.io.tables import write_table
 from hks_jax.signatures.times import positive_range
 
 FORGETFUL = 8
@@ -39,47 +39,48 @@ PATIENCE = 0.5
 def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> dict[str, str]:
     """Compute what is not there yet; return why some subjects failed, by their names.
 
-    Other processes with the same study share the work: each subject is computed by the one that comes to it first.
-
-    Raises:
-        ValueError: another process has begun the study anew, with other settings.
+    Other processes with the same study share the work: each subject is computed by the one that comes to it first. One
+    that begins the study anew, with other settings, makes this one raise ValueError.
     """
     problems: dict[str, str] = {}
+
+    def failed(subject: Subject, error: Exception) -> None:
+        if debug:
+            traceback.print_exception(error, file=sys.stderr)
+        known = isinstance(error, (*INPUT_ERRORS, ComputationError, np.linalg.LinAlgError))
+        problems[subject.name] = " ".join(f"{'' if known else f'{type(error).__name__}: '}{error}".split())
+        progress.end(f"{subject.name} failed: {problems[subject.name]}")
+
     plan = []
     for subject in subjects:
         try:
-            task = _Task.of(study, subject)
+            plan.append(_Task.of(study, subject))
         except Exception as error:
-            problems[subject.name] = _said(error, debug)
-            progress.end(f"{subject.name} failed: {problems[subject.name]}")
-        else:
-            plan.append(task)
+            failed(subject, error)
     pending = [task for task in plan if task.signature or task.regions]
     # What ended a process before, for want of memory perhaps, may do so again: the others come first.
-    pending.sort(key=lambda task: study.attempt(task.subject).exists())
+    pending.sort(key=lambda task: task.attempt.exists())
     if len(pending) < len(plan):
         progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are done already")
     progress.total, number, waiting = len(pending), 0, False
     while pending:
         elsewhere = []
         for task in pending:
-            name = task.subject.name
             study.require_settings()
             try:
-                with claim(study.attempt(task.subject)) as ours:
+                with claim(task.attempt) as ours:
                     if not ours:
                         elsewhere.append(task)
-                    elif (left := task.left(study)) is None:
+                    elif (left := task.left()) is None:
                         progress.total -= 1
                     else:
                         if number and number % FORGETFUL == 0:
                             jax.clear_caches()
                         number += 1
-                        with progress.subject(name):
-                            left.run(study, progress)
+                        with progress.subject(task.subject.name):
+                            left.run(progress)
             except Exception as error:
-                problems[name] = _said(error, debug)
-                progress.end(f"{name} failed: {problems[name]}")
+                failed(task.subject, error)
         if len(elsewhere) == len(pending):
             if not waiting:
                 progress.end(f"waiting for other processes, which compute {len(elsewhere)} of the subjects")
@@ -92,41 +93,47 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
 
 
 class _Task(NamedTuple):
-    """What is to be done of a subject."""
+    """What is to be done of a subject: its signature, and the table of its regions, unless its fingerprint is empty."""
 
+    study: Study
     subject: Subject
     fingerprint: str
     signature: bool
     regions: str
-    """The fingerprint of the table of regions, if it is to be written; else nothing."""
 
     @classmethod
     def of(cls, study: Study, subject: Subject) -> "_Task":
         """Return what is to be done: what is not there, or was of other files or settings."""
         fingerprint = study.fingerprint(subject)
-        missing, regions = not study.is_done(subject, fingerprint), ""
-        if subject.args.atlas is not None:
-            regions = study.regions_fingerprint(subject, fingerprint)
-            regions = "" if not missing and study.has_regions(subject, regions) else regions
-        return cls(subject, fingerprint, missing, regions)
+        regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
+        task = cls(study, subject, fingerprint, True, regions)
+        return task.left() or task._replace(signature=False, regions="")
 
-    def left(self, study: Study) -> "_Task | None":
-        """Return what another process has not done meanwhile."""
-        missing = self.signature and not study.is_done(self.subject, self.fingerprint)
-        known = not missing and study.has_regions(self.subject, self.regions)
+    @property
+    def attempt(self) -> Path:
+        """The file that a process holds while it computes a subject, and leaves if it dies."""
+        return self.study.folder / self.subject.folder / ".attempt"
+
+    def left(self) -> "_Task | None":
+        """Return what is not there, as another process may have done it meanwhile."""
+        missing = self.signature and not self.study.has(self.subject, MAP, self.fingerprint)
+        known = not missing and self.study.has(self.subject, REGIONS, self.regions)
         left = self._replace(signature=missing, regions="" if known else self.regions)
         return left if left.signature or left.regions else None
 
-    def run(self, study: Study, progress: StudyProgress) -> None:
+    def run(self, progress: StudyProgress) -> None:
         """Do it."""
-        args = self.subject.args
+        study, subject = self.study, self.subject
         if self.signature:
-            _compute(study, self.subject, self.fingerprint, progress)
+            _compute(study, subject, self.fingerprint, progress)
         if self.regions:
-            study.forget_regions(self.subject)
+            table = study.path(subject, f"{REGIONS}.tsv")
+            for old in (table.with_suffix(".json"), table):  # the sidecar first
+                old.unlink(missing_ok=True)
             with progress.stage("regions"):
-                table = region_table(study.path(self.subject, f"{MAP}.npz"), args.atlas, args.names, progress)
-            study.write_regions(self.subject, self.regions, *table)
+                source, args = study.path(subject, f"{MAP}.npz"), subject.args
+                columns, rows, about = region_table(source, args.atlas, args.names, progress)
+                write_table(table, columns, rows, {**about, "Fingerprint": self.regions})
 
 
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
@@ -134,23 +141,17 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
     study.forget(subject)
     settings, args = study.settings, subject.args
     volume, field, pairs = _pairs(study, subject, progress)
+    scaled: dict[str, np.ndarray] = {}
     if study.time_unit == "lambda1":
-        own = np.array(settings.times.explicit) / float(positive_range(pairs)[0])
+        scaled["scaled_times"] = np.array(settings.times.explicit)
+        own = scaled["scaled_times"] / float(positive_range(pairs)[0])
         settings = replace(settings, times=Times(tuple(own.tolist()), 0))
-    if args.noise is not None:
-        if args.noise == "residuals" and volume.covariance is None:  # pairs that were kept do not have it
-            volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
-        noise = noise_of(args, volume, field.grid, progress)
-        bars, settings = error_bars(volume, noise, pairs, settings, args.draws, progress)
-    result = signature_of(volume, field, pairs, settings, progress)
-    if args.noise is not None:
-        result = with_error_bars(result, bars, os.path.basename(args.noise))
-    if study.time_unit == "lambda1":
-        scaled = {"scaled_times": np.array(study.settings.times.explicit)}
-        result = replace(result, arrays={**result.arrays, **scaled})
-    drawn = partial(draw if volume.dimension == 2 else draw_volume, result, view=args.view)
+    if args.noise == "residuals" and volume.covariance is None:  # pairs that were kept do not have it
+        volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
+    result = signature_of(args, volume, field, pairs, settings, progress)
+    result = replace(result, arrays={**scaled, **result.arrays})
     with progress.stage("writing"):
-        study.write_signature(subject, fingerprint, result, progress.warnings, drawn)
+        study.write_signature(subject, fingerprint, result, progress.warnings, partial(draw, result, view=args.view))
 
 
 def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[TensorVolume, TensorField, Eigenpairs]:
@@ -162,15 +163,7 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[Ten
     volume = read_volume(subject.args, progress)
     field, pairs, _ = compute_pairs(volume, study.settings, progress)
     if study.save_pairs:
-        domain, image = volume.with_mask(field.grid.mask), image_suffix(subject.args.file)
+        image, domain = image_suffix(subject.args.file), volume.with_mask(field.grid.mask)
         with progress.stage("writing"):
             write_pairs(kept, domain, pairs, study.settings, image, progress.warnings, fingerprint)
     return volume, field, pairs
-
-
-def _said(error: Exception, debug: bool) -> str:
-    """Return an error as one line."""
-    if debug:
-        traceback.print_exception(error, file=sys.stderr)
-    plain = isinstance(error, (*INPUT_ERRORS, ComputationError, np.linalg.LinAlgError))
-    return " ".join((str(error) if plain else f"{type(error).__name__}: {error}").split())
