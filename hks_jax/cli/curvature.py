@@ -11,7 +11,7 @@ examples:
 """
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,9 +25,6 @@ from hks_jax.curvature import gaussian_curvature
 from hks_jax.io import TensorVolume, save
 from hks_jax.io.formats import WRITTEN
 
-if TYPE_CHECKING:
-    from hks_jax.plot.orientation import View
-
 OPTIONS = f"""
 @file @metric {READING} @domain @dtype @output
 --periodic x|y|xy  axes of which node n is node 0 (default none)
@@ -39,11 +36,7 @@ COLOURED = 0.98
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
-    """Run the command.
-
-    Raises:
-        ValueError: tensors that have no Gaussian curvature that could be computed.
-    """
+    """Run the command."""
     from hks_jax.plot import save_figure
 
     volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
@@ -85,7 +78,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     return done
 
 
-def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume, view: "View") -> Any:
+def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume, view: Any) -> Any:
     """Return the picture: colours on either side of zero, as many as the values reach but for a few."""
     from hks_jax.cli.picture import cropped, placed, proportion
     from hks_jax.plot import new_figure, scalar_image

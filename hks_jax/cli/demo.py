@@ -11,6 +11,7 @@ examples:
 
 import argparse
 import importlib.util
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from hks_jax.cli.noise import signature_of
 from hks_jax.cli.options import Times
 from hks_jax.cli.outputs import Done, write_outputs
 from hks_jax.cli.progress import Progress
+from hks_jax.domain import examples
 from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
 
 OPTIONS = """
@@ -45,45 +47,24 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot import number_text
 
     brain = None if args.phantom else _installed_brain(progress)
-    volume = phantom_volume() if brain is None else _brain_slice(brain, progress)
+    volume = _volume(brain, progress)
     mean = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
     lengths = min(volume.spacing) * SPREADS
     times = lengths**2 / np.median(mean[volume.mask])
     chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
     settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
     result = signature_of(args, volume, *compute_pairs(volume, settings, progress), progress)
-    titles = [
-        rf"$t$ = {number_text(t)} s  ($\sqrt{{Dt}}$ ≈ {length:.2g} mm)"
-        for t, length in zip(times, lengths, strict=True)
-    ]
+    spread = (rf"($\sqrt{{Dt}}$ ≈ {length:.2g} mm)" for length in lengths)
+    titles = [f"$t$ = {number_text(t)} s  {text}" for t, text in zip(times, spread, strict=True)]
     title = (
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹: 1 is flat, above is "
         "positive curvature, that of the rim included"
     )
     first = "mean diffusivity, mm²/s", mean
-    done = write_outputs(
-        args.output,
-        result,
-        progress,
-        draw=lambda path: draw(result, path, titles=titles, first=first, title=title, view=args.view),
-        image="" if brain is None else ".nii.gz",
-    )
+    drawing = partial(draw, result, titles=titles, first=first, title=title, view=args.view)
+    done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")
     picture = next(file for file in done.files if file.suffix == ".png")
     return done._replace(text=f"The picture is {picture}")
-
-
-def phantom_volume() -> TensorVolume:
-    """Return the phantom as a slice."""
-    from hks_jax.domain.examples import phantom
-
-    tensors, mask, spacing = phantom(PHANTOM_SHAPE)
-    return TensorVolume(
-        np.asarray(tensors),
-        tuple(np.broadcast_to(np.asarray(spacing, float), (2,)).tolist()),
-        (0.0, 0.0),
-        np.asarray(mask, bool),
-        source="phantom",
-    )
 
 
 def _installed_brain(progress: Progress) -> ExampleBrain | None:
@@ -96,9 +77,12 @@ def _installed_brain(progress: Progress) -> ExampleBrain | None:
     return brain
 
 
-def _brain_slice(brain: ExampleBrain, progress: Progress) -> TensorVolume:
+def _volume(brain: ExampleBrain | None, progress: Progress) -> TensorVolume:
+    """Return a slice of the brain, or the phantom."""
+    if brain is None:
+        tensors, mask, spacing = examples.phantom(PHANTOM_SHAPE)
+        h: tuple[float, ...] = tuple(np.broadcast_to(np.asarray(spacing, float), (2,)).tolist())
+        return TensorVolume(np.asarray(tensors), h, (0.0, 0.0), np.asarray(mask, bool), source="phantom")
     with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
-        volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX)
-        plane = volume.slice("z", 0)
-        assert plane.mask is not None
-        return plane.with_mask(erode(plane.mask, RIM))
+        plane = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
+        return plane.with_mask(erode(plane.inside, RIM))

@@ -16,24 +16,20 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from hks_jax import Grid, TensorField
 from hks_jax.cli.job import ComputationError, use_dtype
 from hks_jax.cli.options import FORMATS, refuse
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.cli.result import Result, recorded_boundary
-from hks_jax.domain.grid import Grid
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
 from hks_jax.io.volume import digest
-
-if TYPE_CHECKING:
-    from hks_jax.inverse.metric_fit import MetricFit
 
 OPTIONS = f"""
 target TARGET  the signature: .npz
@@ -66,21 +62,19 @@ target TARGET  the signature: .npz
 """
 
 
-def run(args: argparse.Namespace, progress: Progress) -> Done:
-    """Run the command.
+_PASSED_ON = ("noise", "k", "boundary", "optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
+"""Options that `fit_metric` takes as they are, with the checkpoint."""
 
-    Raises:
-        ValueError: a target, a start or settings that cannot be fitted with.
-        ComputationError: a signature of the start that is NaN or infinite.
-    """
+
+def run(args: argparse.Namespace, progress: Progress) -> Done:
+    """Run the command."""
     if args.init is None:
         refuse(args, ("metric", "order"), "is about the tensors of --init; give both or none")
     elif args.metric is None and image_suffix(args.init):
         raise ValueError(
             "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors D, which are no metric"
         )
-
-    from hks_jax.inverse.fit import fit_metric
+    from hks_jax import fit_metric
     from hks_jax.inverse.metric_fit import RESULTS
     from hks_jax.inverse.regulariser import H1, TotalVariation
 
@@ -106,69 +100,68 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             args.parametrisation,
             regularisers=[kind(weight) for kind, weight in weights if weight is not None],
             progress=lambda step: progress.update(str(step)),
+            checkpoint=args.checkpoint,
             **{name: getattr(args, name) for name in _PASSED_ON},
         )
     if not math.isfinite(fit.loss):
         raise ComputationError(f"no fit: {RESULTS['not finite']}. Check --init and -k")
     if not fit.converged:
         progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; what was best is written")
-    return _write(args, fit, target, progress)
-
-
-_PASSED_ON = (
-    *("noise", "k", "boundary", "optimiser", "smoothness", "max_steps", "continuation", "starts", "seed"),
-    "checkpoint",
-)
-"""Options that `fit_metric` takes as they are."""
+    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", *_PASSED_ON)
+    settings = {name: getattr(args, name) for name in names if name != "k"}
+    report = {
+        "target": {
+            "source": str(args.target),
+            "shape": grid.shape,
+            "spacing": grid.spacing,
+            "nodes_inside": int(grid.inside.sum()),
+            "times": target.times.tolist(),
+        },
+        **{name: getattr(fit, name) for name in ("result", "loss", "misfit", "steps", "truncation_misfit")},
+        "explanation": RESULTS[fit.result],
+        "losses_of_starts": list(fit.losses),
+        "k": fit.problem.k,
+        "parametrisation": args.parametrisation,
+        "settings": {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()},
+    }
+    return _write(args, fit, target, report, progress)
 
 
 def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> TensorField:
     """Return the field to start from, on the target's grid."""
-
     if args.init is None:
-        d = grid.dimension
-        unit = np.broadcast_to(np.eye(d, dtype=args.dtype), (*grid.shape, d, d))
-        return TensorField(grid, unit, args.interpolation)
+        unit = np.eye(grid.dimension, dtype=args.dtype)
+        return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
     volume = read_tensors(args.init, args.order)
-    if volume.dimension > grid.dimension:
-        raise ValueError(
-            f"--init: got a volume of shape {volume.shape}; expected the target's shape {grid.shape}. Cut the slice "
-            f"out first: hks-jax convert {args.init} slice.npz --slice z=14, and --init slice.npz"
-        )
     if volume.shape != grid.shape:
+        remedy = "Give one tensor for each node of the target"
+        if volume.dimension > grid.dimension:
+            remedy = f"Cut the slice out first: hks-jax convert {args.init} slice.npz --slice z=14, --init slice.npz"
         raise ValueError(
-            f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. "
-            "Give one tensor for each node of the target"
+            f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. {remedy}"
         )
     if not np.allclose(volume.spacing, grid.spacing, rtol=1e-4):
         progress.warn(f"--init: its spacing {volume.spacing} is not the target's, {grid.spacing}, which is used")
-    if volume.mask is not None and (grid.inside & ~volume.mask).any():
+    if lacking := int((grid.inside & ~volume.inside).sum()):
         raise ValueError(
-            f"--init: got a mask without {int((grid.inside & ~volume.mask).sum())} of the target's "
-            f"{int(grid.inside.sum())} nodes; expected tensors at all of them. Cut the target's mask to it"
+            f"--init: got a mask without {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
+            "all of them. Cut the target's mask to it"
         )
+    metric: Any = args.metric or "tensor"
     tensors = volume.tensors.astype(args.dtype)
-    return TensorField.from_diffusion(
-        grid, tensors, args.metric or "tensor", interpolation=args.interpolation, name="--init"
-    )
+    return TensorField.from_diffusion(grid, tensors, metric, interpolation=args.interpolation, name="--init")
 
 
-def _write(args: argparse.Namespace, fit: "MetricFit", target: Result, progress: Progress) -> Done:
+def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str, Any], progress: Progress) -> Done:
     """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json."""
     from hks_jax.cli.picture import placed
     from hks_jax.plot import fit_panels, save_figure
 
-    of_target: dict[str, Any] = {
-        "source": str(args.target),
-        "digest": digest(args.target),
-        "order": "matrix",
-        "notes": (),
-    }
-    volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors), **of_target)
+    tensors, source = np.asarray(fit.field.domain_tensors), str(args.target)
+    volume = replace(target.volume, tensors=tensors, source=source, digest=digest(source), order="matrix", notes=())
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
-    report, stale = _report(args, fit, target), [args.output / "fit.png"]
-    with writing(args.output, report, progress, lambda: stale) as (folder, done):
+    with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):
         origin, extra = {"command": sys.argv, "settings": report["settings"]}, {"times": target.times, **columns}
         save_tensors(folder / "tensors.npz", volume, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
@@ -176,29 +169,3 @@ def _write(args: argparse.Namespace, fit: "MetricFit", target: Result, progress:
             orientation = placed(volume, [slice(0, n) for n in volume.shape], args.view)
             save_figure(fit_panels(fit, target.values, target.times, orientation=orientation), folder / "fit.png")
     return done
-
-
-def _report(args: argparse.Namespace, fit: "MetricFit", target: Result) -> dict[str, Any]:
-    from hks_jax.inverse.metric_fit import RESULTS
-
-    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", *_PASSED_ON)
-    settings = {name: getattr(args, name) for name in names if name != "k"}
-    return {
-        "target": {
-            "source": str(args.target),
-            "shape": target.volume.shape,
-            "spacing": target.volume.spacing,
-            "nodes_inside": int(fit.field.grid.inside.sum()),
-            "times": target.times.tolist(),
-        },
-        "result": fit.result,
-        "explanation": RESULTS[fit.result],
-        "loss": fit.loss,
-        "misfit": fit.misfit,
-        "steps": fit.steps,
-        "losses_of_starts": list(fit.losses),
-        "k": fit.problem.k,
-        "truncation_misfit": fit.truncation_misfit,
-        "parametrisation": args.parametrisation,
-        "settings": {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()},
-    }

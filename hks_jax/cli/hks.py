@@ -20,21 +20,30 @@ examples:
 """
 
 import argparse
+import math
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from hks_jax import assemble
+from hks_jax import SurfaceMesh, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
-from hks_jax.cli.job import Settings, compute_pairs, result_of, solve
+from hks_jax.cli.info import describe_mesh
+from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
 from hks_jax.cli.noise import require_spectral, signature_of
-from hks_jax.cli.options import READING, SOLVING, parse_times, refuse
+from hks_jax.cli.options import READING, SOLVING, options_in, parse_times, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import image_suffix, read_volume, require_metric
-from hks_jax.io import TensorVolume
-from hks_jax.io.mesh import is_mesh
+from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
+from hks_jax.cli.result import Result
+from hks_jax.fem.assembly import MESH_BOUNDARIES
+from hks_jax.io import TensorVolume, read_mesh, read_mesh_arrays, sample_tensors
+from hks_jax.io.mesh import WRITTEN, is_mesh
+from hks_jax.io.repair import require_valid
+from hks_jax.io.tensor_order import unpack
 
 OPTIONS = f"""
 @file @metric {READING} @output {SOLVING}
@@ -48,39 +57,25 @@ OPTIONS = f"""
 --save-pairs  keep the eigenpairs, in OUT as pairs.npz: 'hks-jax hks OUT/pairs.npz --times …' solves nothing again
 """
 
+_OF_TENSORS = ("metric", "order", "interpolation")
+"""Options that are about the tensors at a mesh's vertices."""
+_NO_NOISE = "it is for tensors on a grid; leave it out for meshes and for eigenpairs"
+
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     times = parse_times(args.times)
     if is_mesh(args.file):
-        refuse(args, ("noise",), "it is for tensors on a grid; leave it out for meshes and for eigenpairs")
         return _on_mesh(args, Settings.of(args, metric=args.metric, times=times), progress)
     refuse(args, ("clean",), "it is for meshes; leave it out for tensors on a grid, and see --repair")
     refuse(args, ("tensors",), "it is for a mesh that lies in a volume; leave it out for the volume itself")
     return _on_grid(args, Settings.of(args, times=times), progress)
 
 
-def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
-    from hks_jax.cli import mesh as meshes
-
-    meshes.check_options(args)
-    with progress.stage("reading", str(args.file)):
-        mesh = meshes.read_domain(args, progress)
-    boundary = settings.boundary or "neumann"
-    settings = replace(settings, boundary=boundary)
-    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
-        pencil = assemble(mesh, boundary)
-    pairs = solve(pencil, settings, progress)
-    result = result_of(mesh, meshes.describe_mesh(args.file, mesh), pairs, settings, progress)
-    image = meshes.mesh_suffix(args.file, mesh)
-    return write_outputs(args.output, result, progress, partial(meshes.draw, result), image)
-
-
 def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
-    saved = saved_pairs.is_saved_pairs(args.file)
     require_spectral(args)
-    if saved:
-        refuse(args, ("noise",), "it is for tensors on a grid; leave it out for meshes and for eigenpairs")
+    if saved := saved_pairs.is_saved_pairs(args.file):
+        refuse(args, ("noise",), _NO_NOISE)
         saved_pairs.check_options(args)
     else:
         require_metric(args)
@@ -112,6 +107,89 @@ def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
         raise ValueError(f"--through: got {text}; only the picture of a volume has slices, not that of one slice")
     if not all(i < n for i, n in zip(voxel, volume.shape, strict=True)):
         raise ValueError(f"--through: got {text}; expected a voxel of the volume, whose shape is {volume.shape}")
-    if volume.mask is not None and not volume.mask[voxel]:
-        middle = ",".join(map(str, np.argwhere(volume.mask)[volume.mask.sum() // 2]))
+    if not volume.inside[voxel]:
+        middle = ",".join(map(str, np.argwhere(volume.inside)[volume.inside.sum() // 2]))
         raise ValueError(f"--through: voxel {text} is outside the mask; {middle}, for one, is inside")
+
+
+def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
+    _check_mesh_options(args)
+    with progress.stage("reading", str(args.file)):
+        mesh = _read_domain(args, progress)
+    boundary = settings.boundary or "neumann"
+    settings = replace(settings, boundary=boundary)
+    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
+        pencil = assemble(mesh, boundary)
+    pairs = solve(pencil, settings, progress)
+    described = {"source": str(args.file), **describe_mesh(args.file, mesh)}
+    result = result_of(mesh, described, pairs, settings, progress)
+    image = args.file.suffix.lower()
+    if image not in WRITTEN or (image == ".ply" and isinstance(mesh, TetMesh)):  # no room for values at the vertices
+        image = ".vtu"
+    return write_outputs(args.output, result, progress, partial(_draw_mesh, result), image)
+
+
+def _check_mesh_options(args: argparse.Namespace) -> None:
+    """Raise ValueError for options that are for grids alone, and for tensors of which the metric is open."""
+    refuse(args, ("noise",), _NO_NOISE)
+    if args.tensors and args.array:
+        raise ValueError("--tensors, --array: got both; tensors come from a volume, or from the mesh's own vertices")
+    of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
+    if not args.tensors:  # they are about the volume in which the mesh lies
+        of_grids += [o.name for o in options_in(READING) if o.name not in (*_OF_TENSORS, "array")]
+    refuse(args, of_grids, "it is for tensors on a grid; leave it out for a mesh")
+    if args.boundary not in (None, *MESH_BOUNDARIES):
+        raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes one of {', '.join(MESH_BOUNDARIES)}")
+    if not (args.array or args.tensors):
+        why = "a mesh has the metric of space unless --array names tensors at its vertices, or --tensors a volume"
+        refuse(args, _OF_TENSORS, f"{why} of them; pass both, or neither")
+    elif args.metric is None:
+        raise ValueError("--metric: choose what the tensors at the vertices stand for: inverse, tensor or adjugate")
+
+
+def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:
+    """Read the mesh in the precision asked for, with the metric of the tensors at its vertices if asked to."""
+    use_dtype(args.dtype)
+    mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))
+    vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
+    kind: Any = type(mesh)
+    if args.tensors:
+        volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
+        require_valid(volume, "--repair")
+        tensors = sample_tensors(volume, mesh.vertices).astype(args.dtype)
+    elif args.array:
+        tensors = _tensors(args).astype(args.dtype)
+    else:
+        return kind(vertices, cells)
+    return kind.from_tensors(vertices, cells, tensors, args.metric, at="vertices", interpolation=args.interpolation)
+
+
+def _tensors(args: argparse.Namespace) -> Float[np.ndarray, "V 3 3"]:
+    arrays = read_mesh_arrays(args.file, clean=args.clean)
+    if args.array not in arrays:
+        raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {', '.join(arrays) or 'none'}")
+    values = arrays[args.array].reshape(len(arrays[args.array]), -1)
+    if values.shape[1] == 6 and args.order is not None:
+        return unpack(values, args.order)
+    if values.shape[1] != 9 or args.order is not None:
+        raise ValueError(
+            f"--array: {args.array!r} has {values.shape[1]} components; expected nine, or six with their --order"
+        )
+    return values.reshape(-1, 3, 3)
+
+
+def _draw_mesh(result: Result, path: Path) -> None:
+    """Draw the signature on the surface, or on the solid's boundary, once for each time with its own colours."""
+    from hks_jax.plot import new_figure, number_text, save_figure, surface
+
+    mesh, n = result.place, len(result.times)
+    assert isinstance(mesh, SurfaceMesh | TetMesh)
+    columns = min(n, 4)
+    rows = math.ceil(n / columns)
+    figure = new_figure(3.4 * columns, 3.0 * rows)
+    for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
+        ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
+        mappable = surface(ax, mesh, values)
+        ax.set_title(f"t = {number_text(float(time))}", fontsize="medium")
+        figure.colorbar(mappable, ax=ax, shrink=0.6)
+    save_figure(figure, path)

@@ -24,6 +24,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import MANY
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
@@ -40,7 +41,7 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
     """Run the command."""
     progress.quiet, questions = True, list[str]()
     if is_mesh(args.file):
-        description = describe_mesh(args.file, args.clean)
+        description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
     else:
         description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
     if args.json:
@@ -60,14 +61,9 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "sha256": volume.digest,
         "format": "".join(path.suffixes[-2:] if path.suffix == ".gz" else path.suffixes[-1:]),
         "dtype": volume.tensors.dtype.name,
-        "shape": list(volume.shape),
-        "spacing": list(volume.spacing),
-        "length_unit": volume.length_unit,
-        "unit": volume.unit,
-        "order": volume.order,
-        "frame": volume.frame,
+        **{name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit", "order", "frame")},
         "affine": None if volume.affine is None else volume.affine.tolist(),
-        "notes": list(volume.notes),
+        "notes": volume.notes,
         "inside": int(inside.sum()),
         "masked": volume.mask is not None,
         "components": count,
@@ -79,13 +75,12 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
     }
     wrong = volume.invalid_by_order
     if bad.any() and wrong is not None and wrong.fewer:
-        description["invalid_by_order"] = wrong.counts
-        description["question"] = wrong.question
+        description |= {"invalid_by_order": wrong.counts, "question": wrong.question}
     if good.any():
         tensors = volume.tensors[good].astype(np.float64)
         values = np.linalg.eigvalsh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)))
-        description["eigenvalues"] = {"least": float(values.min()), "median": float(np.median(values))}
-        description["eigenvalues"]["largest"] = float(values.max())
+        ends = {"least": values.min(), "median": np.median(values), "largest": values.max()}
+        description["eigenvalues"] = {name: float(value) for name, value in ends.items()}
         description["median_mean_diffusivity"] = float(np.median(values.mean(axis=-1)))
     # Of a few valid ones among indefinite tensors nothing can be told that suits.
     if count and good.any() and bad.sum() <= MANY * inside.sum():
@@ -94,24 +89,21 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
     return description
 
 
-def describe_mesh(path: Path, clean: bool = False) -> dict[str, Any]:
-    """Return what there is to say of a mesh."""
-    mesh = read_mesh(path, clean=clean)
+def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
+    """Return what there is to say of a mesh in space."""
     vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
-    words = WORDS[d]
     measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
     sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
     edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     return {
-        "file": str(path),
         "sha256": digest(path),
         "format": path.suffix,
         "vertices": len(vertices),
-        words.simplices: len(cells),
+        WORDS[d].simplices: len(cells),
         "boundary_vertices": int(mesh.triangulation.boundary_vertices.sum()),
         "components": mesh.triangulation.labels[1],
-        words.measure: measure,
+        WORDS[d].measure: measure,
         "median_edge": edge,
         "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices))},
     }
@@ -167,14 +159,13 @@ def _lines(description: dict[str, Any]) -> list[str]:
         ]
     lines += [f"question        {question}" for question in description.get("questions", ())]
     for name, s in description.get("suits", {}).items():
-        takes = f"takes k ≈ {s['k_for_least_time']}"
-        if s["k_for_least_time"] > s["unknowns"] / 4:
-            takes = "takes more pairs than are worth computing: see --method auto"
+        worth = s["k_for_least_time"] <= s["unknowns"] / 4
+        takes = f"k ≈ {s['k_for_least_time']}" if worth else "more pairs than are worth computing: see --method auto"
         of = time if name == "inverse" else ""
-        lines += [
-            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} by the spacing (to 1 %; {takes}); "
+        lines.append(
+            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} by the spacing (to 1 %; takes {takes}); "
             f"t ≥ {s['least_time_of_k']:.3g}{of} by k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the size"
-        ]
+        )
     return lines
 
 

@@ -181,18 +181,11 @@ DEFAULT_TIMES = Times((), 6)
 
 
 def parse_times(words: list[str] | None) -> Times:
-    """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``.
-
-    Raises:
-        ValueError: anything else.
-    """
-    pieces = [piece for word in words or ["auto"] for piece in word.split(",") if piece]
-    if pieces == ["auto"]:
-        return DEFAULT_TIMES
-    name, _, count = pieces[0].partition(":") if len(pieces) == 1 else ("", "", "")
-    if name == "auto" and count.isdecimal() and int(count) >= 1:
-        return Times((), int(count))
-    times = _numbers(",".join(pieces))
+    """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``."""
+    text = ",".join(piece for word in words or ["auto"] for piece in word.split(",") if piece)
+    if auto := re.fullmatch(r"auto(?::0*([1-9]\d*))?", text):
+        return Times((), int(auto[1])) if auto[1] else DEFAULT_TIMES
+    times = _numbers(text)
     if not times or min(times) <= 0:
         raise ValueError(f"--times: got {' '.join(words or ())!r}; expected positive numbers, or auto, or auto:N")
     return Times(tuple(sorted(times)), 0)
@@ -354,13 +347,7 @@ def defaults(text: str) -> argparse.Namespace:
 
 
 def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Raise ValueError for the first of some options that is given.
-
-    Args:
-        args: the command's arguments.
-        names: of options of the table.
-        why: what the error says after the option.
-    """
+    """Raise ValueError, which says why, for the first of some options that is given."""
     usual = vars(defaults(" ".join(f"@{name}" for name in SECTIONS if name not in ("file", "output"))))
     for name in names:
         if getattr(args, name) != usual.get(name) and getattr(args, name) is not False:

@@ -18,8 +18,6 @@ from hks_jax.atomic import atomic_folder
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.result import Result, plain, signature_file
 
-SIGNATURE = "hks"
-"""How the names of a signature's files begin."""
 REPORT = "report.json"
 PAIRS = "pairs.npz"
 """The file of eigenpairs that were kept."""
@@ -49,13 +47,8 @@ def writing(
 ) -> Iterator[tuple[Path, Done]]:
     """Yield a temporary folder, and what is filled at the end with the report and the paths of the results.
 
-    At the end report.json is written beside the other files, and all of them move to `folder`, or none of them does.
-
-    Args:
-        folder: for the results.
-        report: what report.json says after the command, and before warnings, versions and the seconds of each stage.
-        progress: what says that they are written.
-        stale: returns the files of earlier results that the new ones take away.
+    At the end report.json is written beside the other files, and all of them move to `folder`, or none of them does;
+    then the files of earlier results that `stale` returns are gone.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
@@ -72,8 +65,8 @@ def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callab
     """Write hks.npz, hks.png (by `draw`), report.json and, unless its suffix is empty, an image."""
     stale = partial(of_earlier, folder, result.eigenvalues, progress)
     with writing(folder, result.report, progress, stale) as (temporary, done):
-        result.save(temporary / SIGNATURE, image, {"command": sys.argv})
-        draw(temporary / f"{SIGNATURE}.png")
+        result.save(temporary / "hks", image, {"command": sys.argv})
+        draw(temporary / "hks.png")
     return done
 
 
@@ -85,7 +78,7 @@ def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> lis
     found, own = [], []
     if signature_file(folder).is_file():  # else what has these names is not ours
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
-        own = [*folder.glob(f"{SIGNATURE}.*"), folder / REPORT]
+        own = [*folder.glob("hks.*"), folder / REPORT]
         found = [*own, *(folder / name for name in ("explore.html", *regions) if (folder / name).is_file())]
     if not _are_pairs(folder / PAIRS, eigenvalues):
         found.append(folder / PAIRS)

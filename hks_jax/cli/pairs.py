@@ -57,14 +57,8 @@ def write_pairs(
 ) -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with what was settled in computing them.
 
-    Args:
-        path: the file.
-        volume: the tensors.
-        pairs: the eigenpairs.
-        settings: of the computation.
-        image: the suffix of images in the format of the tensors' file.
-        warnings: what was said of the tensors and of the pairs, to be said again.
-        fingerprint: of a study's subject, what the pairs were computed from.
+    The suffix of images and the warnings come back with them; the fingerprint says what those of a study's subject were
+    computed from.
     """
     record = {name: getattr(volume, name) for name in _ABOUT}
     record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
@@ -83,11 +77,7 @@ def are_of(path: Path, fingerprint: str) -> bool:
 def read_pairs(
     path: Path, settings: Settings, progress: Progress
 ) -> tuple[TensorVolume, TensorField, Eigenpairs, Settings, str]:
-    """Return the volume, its metric, the pairs, the settings with those that are settled, and the suffix of images.
-
-    Raises:
-        ValueError: a damaged file.
-    """
+    """Return the volume, its metric, the pairs, the settings with those that are settled, and the suffix of images."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     volume = TensorVolume(

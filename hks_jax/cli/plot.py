@@ -18,7 +18,6 @@ from hks_jax.cli.options import parse_times
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.result import Result
-from hks_jax.domain.grid import Grid
 from hks_jax.signatures.suitable import RESOLVED
 
 OPTIONS = """
@@ -45,11 +44,7 @@ MANY = 12
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
-    """Run the command.
-
-    Raises:
-        ValueError: a file without a result to draw, or options that do not suit it.
-    """
+    """Run the command."""
     from matplotlib import colormaps
 
     from hks_jax.plot import new_figure, save_figure
@@ -138,8 +133,7 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_curves, new_figure
 
     values, volume = result.values, result.volume
-    grid: Grid = result.grid
-    d, limit = grid.dimension, None
+    grid, d, limit = result.grid, volume.dimension, None
     orientation = placed(volume, [slice(0, n) for n in volume.shape], "neurological")
     if orientation is not None:  # points have the coordinates that the images show
         values, grid = orientation.array(values), orientation.grid(grid)

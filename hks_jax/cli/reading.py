@@ -32,12 +32,7 @@ def require_metric(args: argparse.Namespace) -> None:
 
 
 def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
-    """Read the tensors as `read` does, and refuse those that make no metric.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: what cannot be read as tensors, or a slice or a mask that does not fit them.
-    """
+    """Read the tensors as `read` does, and refuse those that make no metric."""
     require_metric(args)
     volume = read(args, progress)
     if 1 in volume.shape:
@@ -49,11 +44,8 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
     """Read or fit the tensors, cut the slice, settle the mask, and repair if asked to.
 
-    Args:
-        args: the command's arguments. With ``strict_unit``, tensors of an implausible unit are refused unless
-            ``--unit`` says that they have it.
-        progress: what says notes, and what is to be doubted.
-        ask: what says the latter instead.
+    What is to be doubted is a warning, unless `ask` says it. With ``args.strict_unit``, tensors of an implausible unit
+    are refused unless ``--unit`` says that they have it.
     """
     with progress.stage("reading", str(args.file)):
         volume, mask = _load(args)

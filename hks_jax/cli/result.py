@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.domain.grid import Grid
+from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.save import save
 from hks_jax.io.volume import TensorVolume, as_mask
@@ -47,16 +45,10 @@ class Result:
 
     @classmethod
     def read(cls, path: Path, name: str | None = None, over_times: bool = False) -> "Result":
-        """Read a result that `save` wrote as npz.
+        """Read a result that `save` wrote as npz, from the file or the folder of a signature.
 
-        Args:
-            path: the file, or the folder of a signature.
-            name: the array; None: the first of `NAMES` that is there.
-            over_times: whether it must be a signature over times.
-
-        Raises:
-            FileNotFoundError: no such file.
-            ValueError: no npz; arrays that are missing or of shapes that disagree.
+        The array is the one of that name, or the first of `NAMES` that is there; ``over_times`` says that it must be
+        one over times.
         """
         path = signature_file(path)
         arrays = load_npz(path)
@@ -69,21 +61,15 @@ class Result:
                 f"'hks-jax hks' and 'hks-jax curvature' write them. Add {', '.join(lacking)}"
             )
         values, d = np.asarray(arrays[name]), 1 if on_mesh else np.size(arrays["spacing"])
-        if values.dtype.kind not in "fiu" or values.ndim - d not in (0, 1) or not (on_mesh or d in (2, 3)):
+        over_times = over_times or values.ndim > d
+        times = arrays.get("times", np.arange(len(values))).astype(np.float64) if over_times else np.zeros(0)
+        numbers = values.dtype.kind in "fiu" and (on_mesh or d in (2, 3)) and values.ndim - d == over_times
+        if not numbers or (over_times and times.shape != values.shape[:1]):
             raise ValueError(
-                f"{path}: got {name} of shape {values.shape}, dtype {values.dtype}, for {d} axes; expected real "
-                "numbers, one per node or (n_times, *shape)"
+                f"{path}: got {name} of shape {values.shape}, dtype {values.dtype}, times of shape {times.shape} for "
+                f"{d} axes; expected real numbers, one per node, or (n_times, *shape) with (n_times,)"
             )
-        times = np.zeros(0)
-        if over_times or values.ndim > d:
-            times = np.asarray(arrays.get("times", np.arange(len(values))), dtype=np.float64)
-            if times.shape != values.shape[:1] or values.ndim == d:
-                raise ValueError(
-                    f"{path}: got {name} of shape {values.shape} and times of shape {times.shape}; expected "
-                    "(n_times, *shape) and (n_times,)"
-                )
         record = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
-        settings = record.get("settings") or {}
         values = values.reshape(-1, *values.shape[values.ndim - d :]).astype(np.float64)
         place: TensorVolume | SimplicialMesh
         if not on_mesh:
@@ -92,21 +78,16 @@ class Result:
             place = TetMesh(arrays["vertices"], arrays["cells"])
         else:
             place = SurfaceMesh(arrays["vertices"], arrays["faces"])
+        eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
         more = {n: a for n, a in arrays.items() if n in ("deviation", "noise_maps", "scaled_times", "input_tensors")}
-        return cls(
-            place, values, times, arrays.get("eigenvalues", np.zeros(0)), {"settings": settings}, more, str(path)
-        )
+        return cls(place, values, times, eigenvalues, report, more, str(path))
 
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:
         """Write it as `stem` with ``.npz`` after it and, unless that is empty, with the suffix of an image or a mesh.
 
         The former also has the times, the eigenvalues, the tensors that it is of, and all other arrays. Where the
         tensors are of single precision the values are, too: more digits mean nothing and take room.
-
-        Args:
-            stem: the files' path without a suffix.
-            image: the suffix.
-            origin: what the files say of its origin beside settings and times.
+        The files say the settings, the times, and the rest of their origin that is given.
         """
         origin = {**(origin or {}), "settings": plain(self.settings), "times": self.times}
         single = isinstance(self.place, TensorVolume) and self.place.tensors.dtype == np.float32

@@ -46,12 +46,7 @@ _SCALES = {
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
-    """Run the command.
-
-    Raises:
-        FileNotFoundError: no such result, labels or names.
-        ValueError: a result that has no regions, or labels that do not fit it.
-    """
+    """Run the command."""
     source = signature_file(args.result)
     table = args.output or source.with_name("regions.tsv")
     if table.suffix.lower() != ".tsv":
@@ -71,12 +66,7 @@ def names_of(labels: Path, names: Path | None) -> tuple[Path | None, dict[int, s
 def region_table(
     source: Path, atlas: Path, names: Path | None, progress: Progress
 ) -> tuple[tuple[str, ...], list[tuple[Any, ...]], dict[str, Any]]:
-    """Return the columns and rows of a result's table, a row for each region and time, and what its sidecar says.
-
-    Raises:
-        FileNotFoundError: no such result, labels or names.
-        ValueError: a result that is on no grid, or labels that do not fit it.
-    """
+    """Return the columns and rows of a result's table, a row for each region and time, and what its sidecar says."""
     result = Result.read(source, "hks")
     volume, values = result.volume, result.values
     if not result.times.size:

@@ -57,12 +57,8 @@ class _RowParser(argparse.ArgumentParser):
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     """Read the table, and join each row with the arguments that hold for all subjects.
 
-    A row with wrong options becomes a subject with a problem.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no table, no columns `participant_id` and `file`, labels that BIDS does not allow, or a subject
-            (and session) twice.
+    A row with wrong options becomes a subject with a problem. What is wrong for all raises ValueError: no table, no
+    columns `participant_id` and `file`, labels that BIDS does not allow, or a subject (and session) twice.
     """
     rows, parser = read_table(path), _RowParser(add_help=False)
     add_options(parser, f"@file {READING} @noise @atlas @names")
@@ -72,7 +68,16 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
             raise ValueError(f"{path}: row {number} has no participant_id; expected one in every row")
         participant = _label(path, "sub", row.pop("participant_id"))
         session = _label(path, "ses", row.pop("session_id")) if "session_id" in row else ""
-        subject = _subject(parser, path.parent, participant, session, row, common)
+        words, covariates = _words(path.parent, row)
+        try:
+            if not words or words[0].startswith("--"):
+                raise ValueError("the row has no file")
+            arguments, problem = parser.parse_args(words, copy.copy(common)), ""
+            if second_scan(arguments) is not None:
+                arguments.noise = str(path.parent / arguments.noise)
+        except ValueError as error:
+            arguments, problem = None, str(error)
+        subject = Subject(participant, session, arguments, problem, covariates)
         if subject.name in subjects:
             raise ValueError(f"{path}: {subject.name} is there twice; tell the rows apart by a column session_id")
         subjects[subject.name] = subject
@@ -86,14 +91,8 @@ def _label(path: Path, entity: str, text: str) -> str:
     return f"{entity}-{label}"
 
 
-def _subject(
-    parser: argparse.ArgumentParser,
-    folder: Path,
-    participant: str,
-    session: str,
-    row: dict[str, str],
-    common: argparse.Namespace,
-) -> Subject:
+def _words(folder: Path, row: dict[str, str]) -> tuple[list[str], dict[str, str]]:
+    """Return what a row says as a command line does, and its other columns."""
     words, covariates = [], {}
     if "file" in row:
         words.append(str(folder / row.pop("file")))
@@ -105,12 +104,4 @@ def _subject(
             words += [f"--{option}", *(text.replace(",", " ").split() if option == "spacing" else [text])]
         else:
             covariates[column] = text
-    try:
-        if not words or words[0].startswith("--"):
-            raise ValueError("the row has no file")
-        arguments = parser.parse_args(words, copy.copy(common))
-        if second_scan(arguments) is not None:
-            arguments.noise = str(folder / arguments.noise)
-        return Subject(participant, session, arguments, "", covariates)
-    except ValueError as error:
-        return Subject(participant, session, None, str(error), covariates)
+    return words, covariates
