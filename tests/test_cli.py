@@ -19,13 +19,11 @@ import pytest
 import hks_jax as hj
 from hks_jax import paper
 from hks_jax.cache import cache_folder
-from hks_jax.cli import demo, fit, main, picture
+from hks_jax.cli import demo, fit, main
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.options import Times, options_in, parse_boundary, parse_times
-from hks_jax.cli.picture import away_from_rim, bounding_box
 from hks_jax.cli.progress import Progress, bar, duration
-from hks_jax.cli.result import Result, recorded_boundary
 from hks_jax.eigen.solver import Status
 from hks_jax.fem.boundary import default_boundary
 from hks_jax.inverse.metric_fit import RESULTS
@@ -33,6 +31,9 @@ from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.inverse.problem import pairs_for
 from hks_jax.inverse.search import OPTIMISERS
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
+from hks_jax.io.result import Result, recorded_boundary
+from hks_jax.plot import signature
+from hks_jax.plot.signature import away_from_rim, bounding_box
 
 SHAPE = (14, 12)
 QUIET_FILES = ["hks.npz", "hks.png", "report.json"]
@@ -208,8 +209,8 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
     mask[:4, :, 0] = False
     np.save(tmp_path / "mask.npy", mask)
     arguments = ["--metric", "inverse", "--mask", str(tmp_path / "mask.npy"), "-k", "12", "--through", "8,5,3"]
-    drawn, draw = [], picture.volume_panels
-    monkeypatch.setattr(picture, "volume_panels", lambda *args, **more: drawn.append(draw(*args, **more)))
+    drawn, draw = [], signature.volume_panels
+    monkeypatch.setattr(signature, "volume_panels", lambda *args, **more: drawn.append(draw(*args, **more)))
     assert main(["hks", str(nifti), "-o", str(out), "-q", *arguments, "--times", "20000", "50000"]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["hks.json", "hks.nii.gz", *QUIET_FILES]
 

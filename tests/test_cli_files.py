@@ -15,8 +15,8 @@ from hks_jax.cli.options import as_options
 from hks_jax.cli.outputs import write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.result import Result
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
+from hks_jax.io.result import Result
 
 SHAPE = (14, 12, 5)
 AFFINE = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])

@@ -80,8 +80,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume, view: Any) -> Any:
     """Return the picture: colours on either side of zero, as many as the values reach but for a few."""
-    from hks_jax.cli.picture import cropped, placed, proportion
     from hks_jax.plot import new_figure, scalar_image
+    from hks_jax.plot.signature import cropped, placed, proportion
 
     grid, box = cropped(volume, np.isfinite(curvature))
     limit = float(np.nanquantile(np.abs(curvature), COLOURED)) or 1.0

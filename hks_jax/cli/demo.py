@@ -43,8 +43,7 @@ PHANTOM_SHAPE = (72, 80)
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    from hks_jax.cli.picture import draw
-    from hks_jax.plot import number_text
+    from hks_jax.plot import number_text, signature_panels
 
     brain = None if args.phantom else _installed_brain(progress)
     volume = _volume(brain, progress)
@@ -61,7 +60,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "positive curvature, that of the rim included"
     )
     first = "mean diffusivity, mm²/s", mean
-    drawing = partial(draw, result, titles=titles, first=first, title=title, view=args.view)
+    drawing = partial(signature_panels, result, titles=titles, first=first, title=title, view=args.view)
     done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")
     picture = next(file for file in done.files if file.suffix == ".png")
     return done._replace(text=f"The picture is {picture}")

@@ -21,11 +21,11 @@ import numpy as np
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.result import Result, signature_file
 from hks_jax.cli.stats import names_of
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.io.masks import read_labels
+from hks_jax.io.result import Result, signature_file
 from hks_jax.io.volume import TensorVolume
 
 OPTIONS = """
@@ -39,12 +39,7 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
-    """Run the command.
-
-    Raises:
-        FileNotFoundError: no such result, labels or names.
-        ValueError: a result that cannot be shown, or labels that do not fit it.
-    """
+    """Run the command."""
     from hks_jax.plot import explore
 
     source = signature_file(args.result)
@@ -55,17 +50,18 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("names",), "it names labels; pass --labels too")
     with progress.stage("reading", str(source)):
         result = Result.read(source, "hks", over_times=True)
-        place, tensors, shape = result.place, result.arrays.get("input_tensors"), result.values.shape[1:]
+        place, shape, affine, world = result.place, result.values.shape[1:], None, None
         if isinstance(place, TetMesh):
             raise ValueError(
                 f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu beside it"
             )
-        assert isinstance(place, SurfaceMesh | TensorVolume)
-        on_mesh = isinstance(place, SurfaceMesh)
-        affine = None if isinstance(place, SurfaceMesh) else place.affine
-        thin = place.thin_axis if isinstance(place, TensorVolume) and place.dimension == 2 else None
-        labels = None if args.labels is None else read_labels(args.labels, shape, affine, thin)
-        names = None if args.labels is None else names_of(args.labels, args.names)[1]
+        if isinstance(place, TensorVolume) and place.affine is not None:
+            affine, axes = place.affine, [a for a in range(4) if place.dimension == 3 or a != place.thin_axis]
+            world = affine[:3, axes]
+        labels, names = None, None
+        if args.labels is not None:
+            labels = read_labels(args.labels, shape, affine, getattr(place, "slice_axis", None))
+            names = names_of(args.labels, args.names)[1] or None
     with progress.stage("writing", str(page)):
         explore(
             result.values,
@@ -73,16 +69,16 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             place if isinstance(place, SurfaceMesh) else result.grid,
             page,
             deviation=result.arrays.get("deviation"),
-            tensors=tensors,
+            tensors=result.arrays.get("input_tensors"),
             labels=labels,
-            label_names=names or None,
+            label_names=names,
             normalisation=result.settings.get("normalisation", "raw"),
-            title=args.title or ("" if on_mesh else Path(result.volume.source).name) or source.parent.name,
+            title=args.title or Path(getattr(place, "source", "")).name or source.parent.name,
             facts=_facts(result),
             unit=result.unit if args.unit is None else args.unit,
             lengths=_spread(result),
             length_unit="" if affine is None else "mm",
-            world=None if affine is None else affine[:3, [a for a in range(4) if a != thin]],
+            world=world,
         )
     return Done([page], {"source": str(source), "times": result.times.tolist()})
 
@@ -101,8 +97,7 @@ def _facts(result: Result) -> dict[str, Any]:
     settings, place, facts = result.settings, result.place, dict[str, Any]()
     if isinstance(place, TensorVolume):
         facts["grid"] = " × ".join(map(str, place.shape))
-        cuts = [note.partition(":")[0].removeprefix("slice ") for note in place.notes if note.startswith("slice ")]
-        facts |= dict.fromkeys(["slice"] * bool(cuts), cuts[-1] if cuts else "")
+        facts |= {note[:5]: note[6:].partition(":")[0] for note in place.notes if note.startswith("slice ")}
     else:
         facts |= {"vertices": len(place.vertices), "triangles": len(place.triangulation.cells)}
     if metric := settings.get("metric"):

@@ -26,9 +26,9 @@ from hks_jax.cli.options import FORMATS, refuse
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.result import Result, recorded_boundary
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
+from hks_jax.io.result import Result, recorded_boundary
 from hks_jax.io.volume import digest
 
 OPTIONS = f"""
@@ -154,8 +154,8 @@ def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> Tensor
 
 def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str, Any], progress: Progress) -> Done:
     """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json."""
-    from hks_jax.cli.picture import placed
     from hks_jax.plot import fit_panels, save_figure
+    from hks_jax.plot.signature import placed
 
     tensors, source = np.asarray(fit.field.domain_tensors), str(args.target)
     volume = replace(target.volume, tensors=tensors, source=source, digest=digest(source), order="matrix", notes=())
@@ -166,6 +166,6 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
         save_tensors(folder / "tensors.npz", volume, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
         if volume.dimension == 2:
-            orientation = placed(volume, [slice(0, n) for n in volume.shape], args.view)
-            save_figure(fit_panels(fit, target.values, target.times, orientation=orientation), folder / "fit.png")
+            figure = fit_panels(fit, target.values, target.times, orientation=placed(volume, None, args.view))
+            save_figure(figure, folder / "fit.png")
     return done

@@ -38,11 +38,11 @@ from hks_jax.cli.options import READING, SOLVING, options_in, parse_times, refus
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
-from hks_jax.cli.result import Result
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN, is_mesh
 from hks_jax.io.repair import require_valid
+from hks_jax.io.result import Result
 from hks_jax.io.tensor_order import unpack
 
 OPTIONS = f"""
@@ -79,7 +79,7 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
         saved_pairs.check_options(args)
     else:
         require_metric(args)
-    from hks_jax.cli.picture import draw
+    from hks_jax.plot import signature_panels
 
     if saved:
         volume, field, pairs, settings, image = saved_pairs.read_pairs(args.file, settings, progress)
@@ -96,7 +96,7 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
             domain = volume.with_mask(field.grid.mask)
             saved_pairs.write_pairs(args.output / PAIRS, domain, pairs, settings, image, progress.warnings)
     result = signature_of(args, volume, field, pairs, settings, progress)
-    drawing = partial(draw, result, view=args.view, through=args.through)
+    drawing = partial(signature_panels, result, view=args.view, through=args.through)
     return write_outputs(args.output, result, progress, drawing, image)
 
 

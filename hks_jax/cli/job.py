@@ -24,12 +24,12 @@ from hks_jax import (
 )
 from hks_jax.cli.options import DEFAULT_TIMES, SOLVING, Times, as_options, defaults
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.result import Result
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
 from hks_jax.eigen.automatic import choose_solver
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
+from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.signatures.hks import HKSMethod, Normalisation
 from hks_jax.signatures.suitable import SHOWN, default_k

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from hks_jax import (
     AccuracyWarning,
@@ -26,8 +25,8 @@ from hks_jax.cli.job import Settings, automatic_times, describe_input, result_of
 from hks_jax.cli.options import Times
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
-from hks_jax.cli.result import Result
 from hks_jax.io import TensorVolume
+from hks_jax.io.result import Result
 
 _CANDIDATES = 4
 """How many times as many times are looked at as automatic ones are asked for."""
@@ -152,17 +151,3 @@ def _error_bars(
     for message in bars.messages():
         progress.warn(message)
     return bars, np.stack(maps)[:, chosen], interior[chosen], tuple(times[i] for i in chosen)
-
-
-def z_of(result: Result) -> Float[np.ndarray, "n_times *shape"] | None:
-    """Return how many standard deviations the signature is from that of flat space, or from its median."""
-    if "deviation" not in result.arrays:
-        return None
-    values, normalisation = result.values, result.settings["normalisation"]
-    ones = (-1, *[1] * (values.ndim - 1))
-    if normalisation in ("raw", "flat"):
-        power = 0 if normalisation == "flat" else -(values.ndim - 1) / 2
-        reference = ((4 * np.pi * result.times) ** power).reshape(ones)
-    else:
-        reference = np.nanmedian(values.reshape(len(values), -1), axis=1).reshape(ones)
-    return (values - reference) / result.arrays["deviation"]

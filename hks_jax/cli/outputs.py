@@ -16,7 +16,7 @@ import numpy as np
 
 from hks_jax.atomic import atomic_folder
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.result import Result, plain, signature_file
+from hks_jax.io.result import Result, plain, signature_file
 
 REPORT = "report.json"
 PAIRS = "pairs.npz"

@@ -13,12 +13,12 @@ import numpy as np
 from hks_jax.cli.job import Settings, field_of
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.result import plain, recorded_boundary
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.io.arrays import place_of
 from hks_jax.io.pairs import pairs_of, save_pairs
+from hks_jax.io.result import plain, recorded_boundary
 from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npz
 

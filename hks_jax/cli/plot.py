@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.options import parse_times
+from hks_jax.cli.options import parse_times, refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.result import Result
+from hks_jax.cli.reading import sliced
+from hks_jax.io.result import Result
 from hks_jax.signatures.suitable import RESOLVED
 
 OPTIONS = """
@@ -50,14 +51,10 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot import new_figure, save_figure
 
     if args.cmap not in colormaps:
-        raise ValueError(
-            f"--cmap: got {args.cmap!r}; expected a name that matplotlib knows, such as viridis or cividis"
-        )
-    formats = new_figure(1, 1).canvas.get_supported_filetypes()
+        raise ValueError(f"--cmap: got {args.cmap!r}; expected a name that matplotlib knows, such as viridis")
+    formats = sorted(new_figure(1, 1).canvas.get_supported_filetypes())
     if args.output.suffix.lstrip(".").lower() not in formats:
-        raise ValueError(
-            f"--output: got {args.output}; expected a name that ends in one of {', '.join(sorted(formats))}"
-        )
+        raise ValueError(f"--output: got {args.output}; expected a name that ends in one of {', '.join(formats)}")
     result = Result.read(args.result, args.array)
     chosen = _choose_times(result, args)
     result = replace(result, values=result.values[chosen], times=result.times[chosen[: result.times.size]])
@@ -72,8 +69,7 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
     """Return the indices of the times to draw."""
     times = result.times
     if not times.size:
-        if args.times is not None or args.points is not None:
-            raise ValueError(f"--{'times' if args.times else 'points'}: {args.result} has no times; leave this out")
+        refuse(args, ("times", "points"), f"{args.result} has no times; leave this out")
         return np.arange(1)
     if args.times is None:
         count = times.size if args.points is not None else MANY
@@ -92,20 +88,17 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
 
 
 def _panels(result: Result, args: argparse.Namespace) -> Any:
-    from hks_jax.cli.picture import LEAST_RANGE, cropped, placed
     from hks_jax.plot import hks_panels, middle_node
+    from hks_jax.plot.signature import LEAST_RANGE, cropped, placed
 
     values, volume, title = result.values, result.volume, args.title or ""
     if volume.dimension == 3:
         axis, index = args.slice or ("z", middle_node(result.grid.inside)[2])
-        try:
-            volume = volume.slice(axis, index)
-        except ValueError as error:
-            raise ValueError(f"--slice: {error}") from error
+        volume = sliced(volume, axis, index)
         values = values.take(index, 1 + "xyz".index(axis))
         title = f"{title}, slice {axis} = {index}".lstrip(", ")
-    elif args.slice is not None:
-        raise ValueError(f"--slice: {args.result} is a slice already (two axes); leave this out")
+    else:
+        refuse(args, ("slice",), f"{args.result} is a slice already (two axes); leave this out")
     drawn = volume.inside & np.isfinite(values).all(axis=0)
     if not drawn.any():
         raise ValueError(f"--slice: no value of {args.result} is finite there; choose another")
@@ -129,12 +122,12 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
 
 
 def _curves(result: Result, args: argparse.Namespace) -> Any:
-    from hks_jax.cli.picture import placed
     from hks_jax.plot import hks_curves, new_figure
+    from hks_jax.plot.signature import placed
 
     values, volume = result.values, result.volume
     grid, d, limit = result.grid, volume.dimension, None
-    orientation = placed(volume, [slice(0, n) for n in volume.shape], "neurological")
+    orientation = placed(volume, None, "neurological")
     if orientation is not None:  # points have the coordinates that the images show
         values, grid = orientation.array(values), orientation.grid(grid)
     if any(len(point) != d for point in args.points):

@@ -55,10 +55,7 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
             volume = _without_filling(without_background(volume), args.background, progress)
         volume = _reviewed(volume, args, progress.warn if ask is None else ask)
         if args.slice is not None:
-            try:
-                volume = volume.slice(*args.slice)
-            except ValueError as error:
-                raise ValueError(f"--slice: {error}") from error
+            volume = sliced(volume, *args.slice)
         if mask is not None:  # it may be one of the slice alone
             if mask.shape != volume.shape:
                 raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
@@ -77,6 +74,14 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
                 "replaces them"
             )
     return volume
+
+
+def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
+    """Return the slice that ``--slice`` names."""
+    try:
+        return volume.slice(axis, index)
+    except ValueError as error:
+        raise ValueError(f"--slice: {error}") from error
 
 
 def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:

@@ -22,8 +22,8 @@ import numpy as np
 from hks_jax import __version__
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.result import Result, signature_file
 from hks_jax.io.masks import names_beside, read_labels, read_names
+from hks_jax.io.result import Result, signature_file
 from hks_jax.io.tables import write_table
 from hks_jax.io.volume import digest
 from hks_jax.signatures.regions import region_statistics
@@ -73,7 +73,7 @@ def region_table(
         raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
     if volume.affine is None:
         progress.warn(f"{source.name} has no place in space: the labels are taken voxel by voxel, and not checked")
-    labels = read_labels(atlas, volume.shape, volume.affine, volume.thin_axis if volume.dimension == 2 else None)
+    labels = read_labels(atlas, volume.shape, volume.affine, volume.slice_axis)
     names, called = names_of(atlas, names)
     # A slice of a volume is one voxel thick.
     of_one = math.prod(volume.spacing) if volume.affine is None else abs(np.linalg.det(volume.affine[:3, :3]))

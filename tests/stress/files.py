@@ -38,10 +38,10 @@ from typing import Any
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.cli.result import Result
 from hks_jax.inverse import checkpoint
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.io.dwi import _numbers
+from hks_jax.io.result import Result
 
 from .harness import Outcome
 

@@ -46,10 +46,10 @@ from hks_jax.cli.options import READING, SOLVING, Times, parse_times, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
-from hks_jax.cli.result import recorded_boundary
 from hks_jax.cli.study.folder import MAP, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
 from hks_jax.io import TensorVolume
+from hks_jax.io.result import recorded_boundary
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
 from hks_jax.signatures.suitable import LAST

@@ -17,11 +17,11 @@ from hks_jax.cli.job import Settings
 from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS, Times
 from hks_jax.cli.reading import image_suffix
-from hks_jax.cli.result import Result, plain
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.components import is_one_of_six, siblings
 from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import is_nifti, sidecar_of
+from hks_jax.io.result import Result, plain
 from hks_jax.io.tables import read_json, read_table, write_json, write_table
 from hks_jax.io.volume import digest
 from hks_jax.reading import existing

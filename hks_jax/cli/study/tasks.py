@@ -19,7 +19,6 @@ from hks_jax.cli.job import ComputationError, compute_pairs
 from hks_jax.cli.noise import signature_of
 from hks_jax.cli.options import Times
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
-from hks_jax.cli.picture import draw
 from hks_jax.cli.progress import StudyProgress, duration
 from hks_jax.cli.reading import image_suffix, read_volume
 from hks_jax.cli.stats import region_table
@@ -27,6 +26,7 @@ from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io import TensorVolume
 from hks_jax.io.tables import write_table
+from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
 
 FORGETFUL = 8
@@ -150,8 +150,9 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
         volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
     result = signature_of(args, volume, field, pairs, settings, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
+    drawing = partial(signature_panels, result, view=args.view)
     with progress.stage("writing"):
-        study.write_signature(subject, fingerprint, result, progress.warnings, partial(draw, result, view=args.view))
+        study.write_signature(subject, fingerprint, result, progress.warnings, drawing)
 
 
 def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[TensorVolume, TensorField, Eigenpairs]:

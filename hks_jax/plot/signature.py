@@ -1,4 +1,4 @@
-"""The picture that a job leaves: the signature over t, and what it is of."""
+"""The picture of a result: the signature over t, cropped to the domain and placed in space."""
 
 import math
 from collections.abc import Sequence
@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hks_jax import Grid
-from hks_jax.cli.noise import z_of
-from hks_jax.cli.result import Result
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io import TensorVolume
-from hks_jax.plot import Orientation, new_figure, number_text, save_figure, scalar_image, volume_panels
-from hks_jax.plot.images import Colours, colours_of
-from hks_jax.plot.orientation import View
+from hks_jax.io.result import Result
+from hks_jax.plot.figure import new_figure, number_text, save_figure
+from hks_jax.plot.images import Colours, colours_of, scalar_image
+from hks_jax.plot.orientation import Orientation, View
+from hks_jax.plot.volumes import volume_panels
 
 SPAN = (0.002, 0.998)
 """The quantiles, away from the boundary, that the colours span."""
@@ -32,7 +32,7 @@ RIM = 5
 """Nodes from the boundary. At small t it raises a Neumann signature up to fourfold: no colours would be left inside."""
 
 
-def draw(
+def signature_panels(
     result: Result,
     path: Path,
     *,
@@ -57,7 +57,7 @@ def draw(
         view: what is on the left, see `placed`.
         through: the voxel that slices run through, or the nearest one in the domain; None: one in the middle.
     """
-    volume, inside, z = result.volume, np.isfinite(result.values[0]), z_of(result)
+    volume, inside, z = result.volume, np.isfinite(result.values[0]), result.z
     grid, box = cropped(volume, inside)
     orientation, values = placed(volume, box, view), result.values[:, *box]
     z = None if z is None else z[:, *box]
@@ -124,13 +124,13 @@ def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> 
     return Grid(inside[box].shape, volume.spacing, origin), box
 
 
-def placed(volume: TensorVolume, box: Sequence[slice], view: View) -> Orientation | None:
-    """Return how a box of a volume or slice lies in space; None where that is not known."""
+def placed(volume: TensorVolume, box: Sequence[slice] | None, view: View) -> Orientation | None:
+    """Return how a volume or slice, or a box of it, lies in space; None where that is not known."""
     if volume.affine is None:
         return None
     thin = volume.thin_axis if volume.dimension == 2 else None
     first = np.zeros(4)
-    first[[a for a in range(3) if a != thin]] = [part.start for part in box]
+    first[[a for a in range(3) if a != thin]] = 0 if box is None else [part.start for part in box]
     affine = volume.affine.copy()
     affine[:, 3] += affine @ first
     return Orientation.of(affine, thin, view=view)

@@ -45,10 +45,16 @@ class Result:
 
     @classmethod
     def read(cls, path: Path, name: str | None = None, over_times: bool = False) -> "Result":
-        """Read a result that `save` wrote as npz, from the file or the folder of a signature.
+        """Read a result that `save` or the command line wrote as npz.
 
-        The array is the one of that name, or the first of `NAMES` that is there; ``over_times`` says that it must be
-        one over times.
+        Args:
+            path: the file, or the folder of a signature.
+            name: the array; None: ``hks``, else ``curvature``.
+            over_times: whether it must be a signature over times.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: no npz; arrays that are missing or of shapes that disagree.
         """
         path = signature_file(path)
         arrays = load_npz(path)
@@ -116,6 +122,18 @@ class Result:
         """The settings of the computation; empty where the file does not say them."""
         settings: Mapping[str, Any] = self.report["settings"]
         return settings
+
+    @property
+    def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
+        """By how many standard deviations the signature differs from that of flat space, or from its median."""
+        if "deviation" not in self.arrays:
+            return None
+        ones, normalisation = (-1, *[1] * (self.values.ndim - 1)), self.settings["normalisation"]
+        if normalisation in ("raw", "flat"):
+            reference = (4 * np.pi * self.times) ** (0 if normalisation == "flat" else -(self.values.ndim - 1) / 2)
+        else:
+            reference = np.nanmedian(self.values.reshape(len(self.values), -1), axis=1)
+        return (self.values - reference.reshape(ones)) / self.arrays["deviation"]
 
     @property
     def unit(self) -> str:
