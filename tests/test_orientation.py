@@ -315,7 +315,7 @@ def test_a_centre_of_zero_is_one_of_either_sign():
 def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "hks_jax.cli.picture.scalar_image", lambda ax, values, grid, **more: drawn.append((values, more))
+        "hks_jax.plot.signature.scalar_image", lambda ax, values, grid, **more: drawn.append((values, more))
     )
     field = hj.examples.torus_field((16, 16))
     np.savez(tmp_path / "t.npz", tensors=field.tensors, spacing=field.grid.spacing)

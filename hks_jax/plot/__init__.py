@@ -21,6 +21,7 @@ from hks_jax.plot.images import scalar_image as scalar_image
 from hks_jax.plot.orientation import Orientation as Orientation
 from hks_jax.plot.rows import influence_map as influence_map
 from hks_jax.plot.rows import time_rows as time_rows
+from hks_jax.plot.signature import signature_panels as signature_panels
 from hks_jax.plot.surfaces import isosurfaces as isosurfaces
 from hks_jax.plot.surfaces import surface as surface
 from hks_jax.plot.tracing import evenly_spaced_lines as evenly_spaced_lines

@@ -40,10 +40,10 @@ from typing import Any
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.cli.plot import read_saved
 from hks_jax.inverse import checkpoint
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.io.dwi import _numbers
+from hks_jax.io.result import Result
 
 from .harness import Outcome
 
@@ -332,7 +332,7 @@ def _result(rng: np.random.Generator, folder: Path) -> Sample:
     path = hj.io.save(folder / "hks.npz", values, volume, name="hks", extra={"times": times})
 
     def read(path: Path) -> Content:
-        saved = read_saved(path)
+        saved = Result.read(path)
         return {
             "values": saved.values,
             "times": saved.times,
