@@ -94,9 +94,9 @@ class Triangulation:
     def _edges(self) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "n m"]]:
         """The edges, and for each cell the numbers of its own, in the order of ``combinations``."""
         pairs = list(combinations(range(self.dimension + 1), 2))
-        ends = np.sort(self.cells[:, pairs], axis=-1).reshape(-1, 2)
-        edges, numbers = np.unique(ends, axis=0, return_inverse=True)
-        return edges, numbers.reshape(len(self.cells), len(pairs))
+        ends = np.sort(self.cells[:, pairs], axis=-1)
+        keys, numbers = np.unique(ends[..., 0] * self.n_vertices + ends[..., 1], return_inverse=True)
+        return np.stack(np.divmod(keys, self.n_vertices), axis=-1), numbers.reshape(len(self.cells), len(pairs))
 
     @property
     def edges(self) -> Int[np.ndarray, "E 2"]:

@@ -121,9 +121,13 @@ def assemble(
         given = {name: value if callable(value) else domain.inside(value) for name, value in given.items()}
         held = _checked_fields(operator, given, spaces[0], points, nodes.dtype)
         operator = operator._replace(checked=not (operator.own and is_traced((domain, held, nodes))))
-        return _joined(
-            [_assemble_mesh(domain, nodes, held, each, operator, midpoints is not None) for each in spaces], operator
-        )
+        curved = midpoints is not None
+        pencils = [_assemble_mesh(domain, nodes, held, each, operator, curved) for each in spaces]
+        if curved and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
+            raise ValueError(
+                "midpoints: they fold cells, or turn them inside out; move them nearer to the middles of straight sides"
+            )
+        return _joined(pencils, operator)
     if not isinstance(domain, TensorField):
         raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
     if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
@@ -314,12 +318,14 @@ def _grid_integrals(
         return element_matrices(metric, element, operator, x, fields)
 
     stiffness, mass = map(kept, jax.vmap(integrals)(metric, places, held))
-    volume = jnp.sum(kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None]))
     if operator.components > 1:
-        return stiffness, mass, jnp.sum(mass, axis=-1), volume
+        return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
     stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
     # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
-    lumped = jnp.sum(mass, axis=0)
+    lumped = volumes = jnp.sum(mass, axis=0)
+    if "density" in fields:
+        volumes = kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None])
+    volume = jnp.sum(volumes)
     if couplings is None:
         return stiffness, mass, lumped, volume
     return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, volume
@@ -357,12 +363,12 @@ def _nodes_of_mesh(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[A
     """Return the places of the nodes: the vertices, and of degree 2 the middles of the edges."""
     if degree not in (1, 2):
         raise ValueError(f"degree: got {degree!r}; expected 1 or 2")
-    vertices, edges = mesh.vertices, mesh.triangulation.edges
-    if midpoints is None and degree == 1:
-        return vertices
+    vertices = mesh.vertices
     if degree == 1:
-        raise ValueError("midpoints: got with degree=1, whose sides are straight; pass degree=2")
-    middles = jnp.mean(vertices[edges], axis=1)
+        if midpoints is not None:
+            raise ValueError("midpoints: got with degree=1, whose sides are straight; pass degree=2")
+        return vertices
+    middles = jnp.mean(vertices[mesh.triangulation.edges], axis=1)
     if midpoints is None:
         return jnp.concatenate([vertices, middles])
     if mesh._metric is not None:
@@ -413,12 +419,15 @@ def _assemble_mesh(
         return element_matrices(metric, element, operator, x, fields, frames)
 
     stiffness, mass = jax.vmap(integrals)(metric, x, seen, held)
-    volume = jnp.sum(jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype))
     own = space if operator.components == 1 else vector_space(space, operator.components)
-    lumped = _row_sums(own, mass)
+    lumped = volumes = _row_sums(own, mass)
+    if "density" in fields:
+        volumes = jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype)
     # How far P1 elements err is known from their edges; of P2 no such estimate is.
     sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
-    return _pencil(_gathered(own, stiffness), _gathered(own, mass), lumped, sampled, volume, own, operator, fields)
+    return _pencil(
+        _gathered(own, stiffness), _gathered(own, mass), lumped, sampled, jnp.sum(volumes), own, operator, fields
+    )
 
 
 def _gathered(space: MeshSpace | VectorSpace, matrices: Float[Array, "E m m"]) -> SparseOperator:
