@@ -15,6 +15,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.one_pencil import solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
+from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
@@ -28,6 +29,7 @@ def solve_doubled(
     a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask for all that there can be.
     """
     parts, total = pencil.parts, k + extra
+    whole = pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil)
     limits = _limits(pencil, total)
     traced = is_traced(jax.lax.stop_gradient(pencil))
     wanted = limits if traced else [*map(min, limits, _shares(pencil, total))]
@@ -38,7 +40,7 @@ def solve_doubled(
     ]
 
     def solve(number: int, report: Report) -> Eigenpairs:
-        return solve_lowest(parts[number], solvers[number], wanted[number], 0, name, throw, report)
+        return solve_lowest(whole.parts[number], solvers[number], wanted[number], 0, name, throw, report)
 
     solved = [solve(i, _of_problem(report, i, len(parts))) for i in range(len(parts))]
     while not traced:
@@ -51,7 +53,7 @@ def solve_doubled(
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve(i, report)
-    return merge(pencil, tuple(solved), k, extra, name)
+    return merge(whole, tuple(solved), k, extra, name)
 
 
 def _limits(pencil: MirrorPencil, total: int) -> list[int]:

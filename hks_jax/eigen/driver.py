@@ -16,6 +16,7 @@ from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, silent
+from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
@@ -91,8 +92,8 @@ def eigenpairs(
                 "Use a smaller k or a finer grid, or give an interval"
             )
         pairs = _lowest(pencil, int(k), solver, multiplet, throw, report)
-    gauge = pairs.eigenvalues, pairs.next_eigenvalue, pairs.kept, pairs.part, pencil
-    pairs = eqx.tree_at(lambda p: p.vectors, pairs, of_simple(pairs.vectors, *gauge))
+    gauge = pairs.eigenvalues, pairs.next_eigenvalue, pairs.kept, pairs.part, pairs.pencil
+    pairs = eqx.tree_at(lambda p: p.vectors, pairs, of_simple(pairs.vectors, *gauge)).on(pencil)
     if throw:
         result = jax.lax.stop_gradient(pairs).result
         pairs = result.error_if(pairs, result != RESULTS.successful)
@@ -170,7 +171,9 @@ def _lowest(
     if isinstance(pencil, MirrorPencil):
         pairs = solve_doubled(pencil, choices, size, extra, name, throw, report)
     else:
-        pairs = solve_lowest(pencil, choices[0], size, extra, name, throw, report)
+        whole = pencil if isinstance(choices[0], Dense) else on_all_nodes(pencil)
+        assert isinstance(whole, Pencil)
+        pairs = solve_lowest(whole, choices[0], size, extra, name, throw, report)
     return truncate(pairs, k, multiplet)
 
 
@@ -186,12 +189,13 @@ def _in_interval(
         raise ValueError("k: the problems of a doubled domain are counted one by one; leave k out")
     checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
-    problems = zip(pencil.parts, checked, solvers, strict=True)
+    whole = pencil if any(isinstance(method, Dense) for method in solvers) else on_all_nodes(pencil)
+    problems = zip(whole.parts, checked, solvers, strict=True)
     solved = tuple(solve_interval(part, each, method, throw, report) for part, each, method in problems)
-    if not isinstance(pencil, MirrorPencil):
+    if not isinstance(whole, MirrorPencil):
         return solved[0]
     name = " + ".join(dict.fromkeys(pairs.solver_name for pairs in solved))
-    return merge(pencil, solved, sum(pairs.k for pairs in solved), 0, name)
+    return merge(whole, solved, sum(pairs.k for pairs in solved), 0, name)
 
 
 def _for_interval(solver: str | Eigensolver, pencil: Pencil, interval: Interval) -> BlockLanczos | Dense:

@@ -119,6 +119,13 @@ class Eigenpairs(eqx.Module):
         """Return the pairs, with those of one part of a doubled domain kept: others count as pairs with f = 0."""
         return self if self.part is None else eqx.tree_at(lambda p: p.kept, self, self.kept & (self.part == number))
 
+    def on(self, pencil: AnyPencil) -> "Eigenpairs":
+        """Return the pairs as those of a pencil on the same nodes, of which others are free; see `on_all_nodes`."""
+        if pencil.space == self.space:
+            return self
+        rows = (self.space.transfer(each, pencil.space) for each in (self.vectors, self.frame))
+        return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (*rows, pencil))
+
     @property
     def null_space_known(self) -> bool:
         """Whether these are the lowest pairs of pencils whose null spaces are known."""

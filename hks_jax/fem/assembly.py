@@ -205,7 +205,9 @@ def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
         return pencils[0]
     if pencils[0].space.n_dof == pencils[-1].space.n_dof:
         raise ValueError('boundary: got "mean", but the domain has no rim: leave it out')
-    return MirrorPencil(tuple(pencils))
+    free = [pencil.space.free for pencil in pencils]
+    including = (tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))
+    return MirrorPencil(tuple(pencils), tuple(including))
 
 
 def _assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:

@@ -67,9 +67,16 @@ class MirrorPencil(eqx.Module):
 
     Their spectra united are the spectrum of the doubled domain. An eigenfunction of a part, divided by √2^m, is
     one of the doubled domain, restricted to the original.
+
+    Attributes:
+        parts: the mixed problems, the one that is Neumann everywhere first.
+        including: for each part the parts whose functions include its own: some before it, and itself. By min–max no
+            eigenvalue of a part is less than that of the same number of a part that includes it. So of the lowest
+            eigenvalues of all parts, a part that c parts include has at most 1/c.
     """
 
     parts: tuple[Pencil, ...]
+    including: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     @property
     def measured(self) -> bool:
@@ -90,16 +97,6 @@ class MirrorPencil(eqx.Module):
     def volume(self) -> Float[Array, ""] | None:
         """The area or volume of the doubled domain."""
         return None if self.parts[0].volume is None else len(self.parts) * self.parts[0].volume
-
-    @property
-    def including(self) -> tuple[tuple[int, ...], ...]:
-        """For each part the parts whose functions include its own: itself, and some before it.
-
-        By min–max no eigenvalue of a part is less than that of the same number of a part that includes it. So of the
-        lowest eigenvalues of all parts, a part that c parts include has at most 1/c.
-        """
-        free = [part.space.free for part in self.parts]
-        return tuple(tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))
 
 
 AnyPencil: TypeAlias = Pencil | MirrorPencil

@@ -10,11 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.compilation import by_numpy, known_here
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
 from hks_jax.traced import is_traced
+
+_COPIED = 1 << 22
+"""Numbers that NumPy copies in less time than it takes to compile that."""
 
 
 class FunctionSpace:
@@ -111,15 +115,36 @@ class FunctionSpace:
         return hash(self._key)
 
 
+def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Float[Array, "... m"]:
+    """Return the values at some places of the last axis."""
+    if _by_numpy(values):
+        return by_numpy(lambda known: np.take(known, indices, axis=-1), values)
+    return _taken(values, indices)
+
+
+def _spread(
+    values: Float[Array, "... m"], indices: Int[np.ndarray, " m"], fill: Float[np.ndarray, " n"]
+) -> Float[Array, "... n"]:
+    """Return values put at some places of the last axis, and others elsewhere."""
+    if not _by_numpy(values):
+        return _spread_by_jax(values, indices, fill)
+    full = np.tile(fill, (*values.shape[:-1], 1))
+    full[..., indices] = values
+    return jax.device_put(full)
+
+
+def _by_numpy(values: Array) -> bool:
+    return np.size(values) <= _COPIED and known_here(values)
+
+
 # The indices go in as arrays, so that equal numbers of them, wherever they lie, share one compilation.
 @jax.jit
-def taken(values: Float[Array, "... n"], indices: Int[np.ndarray | Array, " m"]) -> Float[Array, "... m"]:
-    """Return the values at some places of the last axis."""
+def _taken(values: Float[Array, "... n"], indices: Int[np.ndarray | Array, " m"]) -> Float[Array, "... m"]:
     return values[..., indices]
 
 
 @jax.jit
-def _spread(
+def _spread_by_jax(
     values: Float[Array, "... m"], indices: Int[np.ndarray | Array, " m"], fill: Float[np.ndarray | Array, " n"]
 ) -> Float[Array, "... n"]:
     full = jnp.broadcast_to(fill, (*values.shape[:-1], fill.size))

@@ -13,10 +13,12 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.not_differentiable import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
+from hks_jax.nan_outside import nan_outside
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter
 from hks_jax.static_array import StaticArray
@@ -34,21 +36,26 @@ def spectral_diagonal(
     pairs: Eigenpairs, filters: Filter, scale: Float[Array, " m"] | None = None
 ) -> Float[Array, "m *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters, times its scale; NaN outside the mask."""
-    diagonal = _kernel(Diagonal(), filters, pairs)
+    everywhere = pairs.on(on_all_nodes(pairs.pencil))
+    diagonal = _kernel(Diagonal(), filters, everywhere)
     # NaN comes last: as 0·NaN it would reach the derivatives of the scale.
-    return pairs.space.extend(diagonal if scale is None else scale[:, None] * diagonal)
+    nodal = everywhere.space.extend(diagonal if scale is None else scale[:, None] * diagonal)
+    return nan_outside(nodal, pairs.space.domain)
 
 
 def spectral_columns(pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x_s) φᵢ(x) for each filter and each source node (flat node index); NaN outside the mask."""
-    return pairs.space.extend(_kernel(Columns(pairs.space, StaticArray(sources)), filters, pairs))
+    everywhere = pairs.on(on_all_nodes(pairs.pencil))
+    columns = _kernel(Columns(everywhere.space, StaticArray(sources)), filters, everywhere)
+    return nan_outside(everywhere.space.extend(columns), pairs.space.domain)
 
 
 def spectral_squared_distances(
     pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]
 ) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) (φᵢ(x_s) − φᵢ(x))² for each filter and each source node; meaningless outside the mask."""
-    squared = _kernel(SquaredDistances(pairs.space, StaticArray(sources)), filters, pairs)
+    everywhere = pairs.on(on_all_nodes(pairs.pencil))
+    squared = _kernel(SquaredDistances(everywhere.space, StaticArray(sources)), filters, everywhere)
     return squared.reshape(*squared.shape[:-1], *pairs.space.node_shape)
 
 
@@ -60,9 +67,11 @@ def spectral_flow(
     Under "mirror" and "mean" the functions are continued evenly, as the metric is.
     """
     # Inner products over the doubled domain: twice those over the domain for each doubling, and 0 with odd functions.
-    parts = pairs.pencil.parts
-    functionals = len(parts) * parts[0].mass.apply(pairs.space.restrict(functions))
-    return pairs.space.extend(_kernel(Applied(functionals), filters, pairs.of_part(0)))
+    everywhere = pairs.on(on_all_nodes(pairs.pencil))
+    parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
+    functionals = len(parts) * parts[0].mass.apply(pairs.space.transfer(known, everywhere.space))
+    flow = _kernel(Applied(functionals), filters, everywhere.of_part(0))
+    return nan_outside(everywhere.space.extend(flow), pairs.space.domain)
 
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
+from threadpoolctl import threadpool_limits
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.eigen.complement.adjoint import Adjoint
@@ -71,7 +72,9 @@ class ShiftInvert(Eigensolver[Pencil]):
                 shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
             else:
                 shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
-            return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift, report))
+            # ARPACK's products with a basis gain little by threads, and wait for them where cores have other work.
+            with threadpool_limits(1, user_api="blas"):
+                return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift, report))
 
         inputs = (jnp.inf if pencil.volume is None else pencil.volume, *data)
         if is_traced(inputs):
