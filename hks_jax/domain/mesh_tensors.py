@@ -93,7 +93,8 @@ def _check(
 ) -> None:
     """Raise ValueError unless the tensors are finite, symmetric, and positive definite on the cells that take them."""
     words = WORDS[triangulation.dimension]
-    everywhere, place = np.ones(len(tensors), dtype=bool), "vertex" if at_vertices else words.one
+    everywhere = triangulation.used if at_vertices else np.ones(len(tensors), dtype=bool)
+    place = "vertex" if at_vertices else words.one
     if triangulation.dimension == 3:
         return require_spd("tensors", tensors, everywhere, place)
     require_finite_symmetric("tensors", tensors, everywhere, place)

@@ -33,8 +33,11 @@ WORDS = {
 }
 
 
-def checked_cells(cells: Any, n_vertices: int, dimension: int) -> Int[np.ndarray, "n corners"]:
-    """Return the vertex indices of simplices; raise ValueError unless they have that shape and every vertex is used."""
+def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> Int[np.ndarray, "n corners"]:
+    """Return the vertex indices of simplices; raise ValueError unless they have that shape.
+
+    Without a mask every vertex must be used.
+    """
     words, indices = WORDS[dimension], np.asarray(cells)
     if indices.ndim != 2 or indices.shape[1] != dimension + 1 or not np.issubdtype(indices.dtype, np.integer):
         raise ValueError(
@@ -49,12 +52,40 @@ def checked_cells(cells: Any, n_vertices: int, dimension: int) -> Int[np.ndarray
         )
     used = np.zeros(n_vertices, dtype=bool)
     used[indices] = True
-    if not used.all():
+    if not (used.all() or masked):
         raise ValueError(
             f"vertices: {int((~used).sum())} of {n_vertices} belong to no {words.one} (the first is vertex "
-            f"{int(np.argmin(used))}); remove them"
+            f"{int(np.argmin(used))}); remove them, or leave them out by a mask"
         )
     return indices
+
+
+def checked_mask(
+    mask: Any, cells: Int[np.ndarray, "n corners"], n_vertices: int, dimension: int
+) -> Bool[np.ndarray, " n"]:
+    """Return which simplices are inside a mask, of themselves or of the vertices: those all of whose vertices are.
+
+    Raises:
+        ValueError: another shape, other values than 0 and 1, a shape that could be either; a mask that leaves none.
+    """
+    words, inside = WORDS[dimension], np.asarray(mask)
+    if inside.shape not in ((n_vertices,), (len(cells),)):
+        raise ValueError(
+            f"mask: got shape {inside.shape}; expected {(n_vertices,)}, one for each vertex, or {(len(cells),)}, one "
+            f"for each {words.one}"
+        )
+    if inside.dtype != bool and not np.isin(inside, (0, 1)).all():
+        raise ValueError(f"mask: got dtype {inside.dtype} with values other than 0 and 1; expected booleans")
+    inside = inside.astype(bool)
+    kept = inside[cells].all(axis=1) if len(inside) == n_vertices else inside
+    if len(inside) == len(cells) and (kept != inside).any():
+        raise ValueError(
+            f"mask: there are as many {words.argument} as vertices, {n_vertices}, and it may belong to either; for one "
+            f"of {words.argument} pass {words.argument}[mask], and for the mask True for each vertex"
+        )
+    if not kept.any():
+        raise ValueError(f"mask: {int(inside.sum())} of {inside.size} are inside, but no {words.simplex} is")
+    return kept
 
 
 def signed_measure(
@@ -77,7 +108,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
     Of triangles two with the same vertices overlap. Warn of surfaces with three triangles at one edge, or with an edge
     that passes through a vertex.
     """
-    infinite = ~np.isfinite(vertices).all(axis=1)
+    infinite = triangulation.used & ~np.isfinite(vertices).all(axis=1)
     if infinite.any():
         raise ValueError(
             f"vertices: {int(infinite.sum())} are NaN or infinite (the first is vertex {int(np.argmax(infinite))}); "

@@ -19,14 +19,17 @@ class SurfaceMesh(SimplicialMesh):
         faces: vertex indices (F, 3).
         metric: (F, 2, 2), the metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀, in place of the
             induced one.
+        mask: the domain, bool, True inside: of the triangles (F,), or of the vertices (V,), where it consists of
+            the triangles all of whose vertices are inside. What lies outside may be degenerate or NaN. The rim of the
+            mask belongs to the boundary, results are NaN at vertices outside, and ``faces`` are those inside.
 
     Raises:
-        ValueError: wrong shapes, indices out of range, vertices without a face, triangles without area, NaN, a metric
-            that is not positive definite.
+        ValueError: wrong shapes, a mask that leaves nothing, indices out of range, vertices without a face, triangles
+            without area, NaN, a metric that is not positive definite.
     """
 
-    def __init__(self, vertices: Any, faces: Any, metric: Any = None) -> None:
-        super().__init__(vertices, faces, metric, dimension=2)
+    def __init__(self, vertices: Any, faces: Any, metric: Any = None, mask: Any = None) -> None:
+        super().__init__(vertices, faces, metric, dimension=2, mask=mask)
 
     @classmethod
     def from_tensors(
@@ -38,6 +41,7 @@ class SurfaceMesh(SimplicialMesh):
         *,
         at: Literal["faces", "vertices"] | None = None,
         interpolation: Interpolation = "linear",
+        mask: Any = None,
     ) -> "SurfaceMesh":
         """Return the surface with the metric of a field of tensors D in space, of which the tangential part counts.
 
@@ -59,13 +63,14 @@ class SurfaceMesh(SimplicialMesh):
             metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
             at: whether the tensors belong to ``"faces"`` or ``"vertices"``; None: their number tells, unless F = V.
             interpolation: ``"linear"`` or ``"log-euclidean"``, see `TensorField`; for tensors at vertices.
+            mask: the domain, see the class; tensors outside are ignored.
 
         Raises:
             ValueError: a metric or interpolation that is none of these; wrong shapes; tensors that are NaN or infinite,
                 unsymmetric or not positive definite on a face (with how many, and where the first is); what
                 `SurfaceMesh` raises.
         """
-        return with_tensors(cls(vertices, faces), tensors, metric, at, interpolation)
+        return with_tensors(cls(vertices, faces, mask=mask), tensors, metric, at, interpolation)
 
     @property
     def faces(self) -> Int[np.ndarray, "F 3"]:

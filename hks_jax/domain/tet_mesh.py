@@ -23,15 +23,18 @@ class TetMesh(SimplicialMesh):
         cells: vertex indices (C, 4).
         metric: (C, 3, 3), the metric of each tetrahedron in the basis of its edges v₁ − v₀, v₂ − v₀ and v₃ − v₀, in
             place of that of space. For tensors in the axes of space see `from_tensors`.
+        mask: the domain, bool, True inside: of the tetrahedra (C,), or of the vertices (V,), where it consists of
+            the tetrahedra all of whose vertices are inside. What lies outside may be degenerate or NaN. The rim of the
+            mask belongs to the boundary, results are NaN at vertices outside, and ``cells`` are those inside.
 
     Raises:
-        ValueError: wrong shapes, indices out of range, vertices without a cell, NaN, a metric that is not positive
-            definite; tetrahedra that have no volume, are inverted, or overlap across a common triangle (with how many,
-            and which is the first).
+        ValueError: wrong shapes, a mask that leaves nothing, indices out of range, vertices without a cell, NaN, a
+            metric that is not positive definite; tetrahedra that have no volume, are inverted, or overlap across a
+            common triangle (with how many, and which is the first).
     """
 
-    def __init__(self, vertices: Any, cells: Any, metric: Any = None) -> None:
-        super().__init__(vertices, cells, metric, dimension=3)
+    def __init__(self, vertices: Any, cells: Any, metric: Any = None, mask: Any = None) -> None:
+        super().__init__(vertices, cells, metric, dimension=3, mask=mask)
 
     @classmethod
     def from_tensors(
@@ -43,6 +46,7 @@ class TetMesh(SimplicialMesh):
         *,
         at: Literal["cells", "vertices"] | None = None,
         interpolation: Interpolation = "linear",
+        mask: Any = None,
     ) -> "TetMesh":
         """Return the mesh with the metric of a field of tensors D in the axes of space.
 
@@ -60,12 +64,13 @@ class TetMesh(SimplicialMesh):
             metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
             at: whether the tensors belong to ``"cells"`` or ``"vertices"``; None: their number tells, unless C = V.
             interpolation: ``"linear"`` or ``"log-euclidean"``, see `TensorField`; for tensors at vertices.
+            mask: the domain, see the class; tensors outside are ignored.
 
         Raises:
             ValueError: a metric or interpolation that is none of these; wrong shapes; tensors that are NaN or infinite,
                 unsymmetric or not positive definite (with how many, and where the first is); what `TetMesh` raises.
         """
-        return with_tensors(cls(vertices, cells), tensors, metric, at, interpolation)
+        return with_tensors(cls(vertices, cells, mask=mask), tensors, metric, at, interpolation)
 
     @property
     def cells(self) -> Int[np.ndarray, "C 4"]:

@@ -91,12 +91,47 @@ class Triangulation:
         return on_boundary
 
     @cached_property
+    def _edges(self) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "n m"]]:
+        """The edges, and for each cell the numbers of its own, in the order of ``combinations``."""
+        pairs = list(combinations(range(self.dimension + 1), 2))
+        ends = np.sort(self.cells[:, pairs], axis=-1)
+        keys, numbers = np.unique(ends[..., 0] * self.n_vertices + ends[..., 1], return_inverse=True)
+        return np.stack(np.divmod(keys, self.n_vertices), axis=-1), numbers.reshape(len(self.cells), len(pairs))
+
+    @property
+    def edges(self) -> Int[np.ndarray, "E 2"]:
+        """The ends of each edge, the smaller number first; in ascending order."""
+        return self._edges[0]
+
+    @property
+    def cell_edges(self) -> Int[np.ndarray, "n m"]:
+        """The edges of each cell: between its corners 0 and 1, 0 and 2, 0 and 3, 1 and 2, …."""
+        return self._edges[1]
+
+    @cached_property
+    def boundary_edges(self) -> Bool[np.ndarray, " E"]:
+        """The edges of facets that belong to one cell only, bool (E,)."""
+        corners = self.facet_vertices(self.boundary_facets)
+        ends = np.sort(corners[:, list(combinations(range(self.dimension), 2))], axis=-1).reshape(-1, 2)
+        keys, own = (pairs[:, 0] * self.n_vertices + pairs[:, 1] for pairs in (self.edges, ends))
+        return np.isin(keys, own)
+
+    @cached_property
+    def used(self) -> Bool[np.ndarray, " V"]:
+        """The vertices of the cells, bool (V,): all but those outside of a mask."""
+        used = np.zeros(self.n_vertices, dtype=bool)
+        used[self.cells] = True
+        return used
+
+    @cached_property
     def labels(self) -> tuple[Int[np.ndarray, " V"], int]:
-        """The connected component of each vertex (1 … n), and their number n."""
+        """The connected component of each vertex (1 … n; 0 of those without a cell), and their number n."""
         rows, cols = self.cells[:, :-1].ravel(), self.cells[:, 1:].ravel()
         graph = coo_matrix((np.ones(rows.size), (rows, cols)), shape=(self.n_vertices,) * 2)
-        count, labels = connected_components(graph, directed=False)
-        return labels + 1, int(count)
+        known, labels = np.unique(connected_components(graph, directed=False)[1][self.used], return_inverse=True)
+        every = np.zeros(self.n_vertices, dtype=np.int64)
+        every[self.used] = labels + 1
+        return every, known.size
 
     def __repr__(self) -> str:
         """Return one line."""

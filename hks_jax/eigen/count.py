@@ -62,10 +62,14 @@ def count_eigenvalues(
 
 
 def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
-    """Return the pencil of a domain as a user gives it; of matrices, where concrete, M is tested for definiteness."""
+    """Return the pencil of a domain as a user gives it.
+
+    Of matrices and forms of the user's own, where concrete, M is tested for definiteness.
+    """
     pencil = pencil_of(domain, boundary, mass)
     for part in jax.lax.stop_gradient(pencil).parts:
-        if not isinstance(part.space, MatrixSpace) or isinstance(part.mass, DiagonalOperator) or is_traced(part):
+        own = isinstance(part.space, MatrixSpace) or part.volume is None
+        if not own or isinstance(part.mass, DiagonalOperator) or is_traced(part):
             continue
         assert isinstance(part.mass, PatternedOperator)
         ones, zero = jnp.ones(part.size, part.mass.dtype), jnp.zeros((), part.mass.dtype)

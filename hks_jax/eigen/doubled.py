@@ -30,8 +30,7 @@ def solve_doubled(
     """
     parts, total = pencil.parts, k + extra
     whole = pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil)
-    shares = [max(total // len(including), 1) for including in pencil.including]
-    limits = [min(share, part.size) for share, part in zip(shares, parts, strict=True)]
+    limits = _limits(pencil, total)
     traced = is_traced(jax.lax.stop_gradient(pencil))
     wanted = limits if traced else [*map(min, limits, _shares(pencil, total))]
     # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
@@ -55,6 +54,12 @@ def solve_doubled(
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve(i, report)
     return merge(whole, tuple(solved), k, extra, name)
+
+
+def _limits(pencil: MirrorPencil, total: int) -> list[int]:
+    """Return how many of the lowest pairs each part has at most."""
+    shares = zip(pencil.including, pencil.parts, strict=True)
+    return [min(max(total // len(including), 1), part.size) for including, part in shares]
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
@@ -104,7 +109,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         kept=jnp.ones(k, bool),
         part=jnp.asarray(np.repeat(np.arange(len(solved)), sizes))[lowest],
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
-        complete_below=jnp.min(jnp.stack([_complete_below(pairs) for pairs in solved])),
+        complete_below=_complete_below(pencil, solved, values[order[k + extra - 1 :][:1]], k + extra),
         spectral_origin=solved[0].spectral_origin,
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         pencil=pencil,
@@ -127,8 +132,20 @@ def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Flo
     return keys
 
 
-def _complete_below(pairs: Eigenpairs) -> Float[Array, ""]:
-    """Return the bound below which a part's pairs are complete: of those beyond its last, nothing is known here."""
-    if pairs.k == pairs.space.n_dof or not pairs.lowest:
-        return pairs.complete_below
-    return jnp.minimum(pairs.complete_below, pairs.eigenvalues[-1])
+def _complete_below(
+    pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], reach: Float[Array, " 1"], total: int
+) -> Float[Array, ""]:
+    """Return the bound below which the pairs of all parts are complete.
+
+    Beyond the last of a part nothing is known here; but a part that gave as many as it has at most among those up to a
+    reach has no others below that.
+    """
+    bounds = []
+    for pairs, limit in zip(solved, _limits(pencil, total), strict=True):
+        bound = pairs.complete_below
+        if pairs.k < pairs.space.n_dof and pairs.lowest:
+            last = pairs.eigenvalues[-1]
+            beyond = jnp.maximum(last, reach[0]) if pairs.k >= limit else last
+            bound = jnp.where(bound >= last, beyond, bound)
+        bounds.append(bound)
+    return jnp.min(jnp.stack(bounds))

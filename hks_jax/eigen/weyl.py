@@ -54,13 +54,15 @@ def weyl_count(
         (n,), on the host.
 
     Raises:
-        ValueError: a negative λ; a domain that the problem is not of.
+        ValueError: a negative λ; a problem with a potential; a domain that the problem is not of.
     """
     pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
     d = pencil.space.dimension
     volume = pencil.volume if pencil.measured else None
     if volume is None:
         raise ValueError("problem: Weyl's law needs dimension and volume; give them to `sparse_pencil`")
+    if any(part.metric is not None and part.null_space is None for part in pencil.parts):
+        raise ValueError("problem: got one with a potential, which Weyl's law leaves out; `count_eigenvalues` counts")
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import by_numpy, known_here
-from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes
+from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
@@ -32,6 +32,7 @@ class FunctionSpace:
         boundary: the conditions per axis and, last, on the rim of a mask; ``(("neumann", "neumann"),)`` or its like for
             a mesh.
         n_components: the number of connected components of the domain.
+        elements: the elements that exist, bool; of a grid n − 1 per axis, n where periodic, of a mesh all its cells.
     """
 
     node_shape: tuple[int, ...]
@@ -40,6 +41,7 @@ class FunctionSpace:
     free: Bool[np.ndarray, "*node_shape"]
     boundary: tuple[Sides, ...]
     n_components: int
+    elements: Bool[np.ndarray, "*elements"]
     _labels: Int[np.ndarray, "*node_shape"]
     _key: tuple
 
@@ -158,7 +160,6 @@ class GridSpace(FunctionSpace):
     Attributes:
         inside: the nodes inside the mask, bool (*shape).
         periodic: per axis, whether node n is node 0 again.
-        elements: the elements that exist, bool; n − 1 per axis, n where periodic.
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
@@ -188,21 +189,61 @@ class GridSpace(FunctionSpace):
         self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
         self._key = (self._grid, boundary)
 
+    @cached_property
+    def cells(self) -> Int[np.ndarray, "E n"]:
+        """The nodes of each element that exists."""
+        numbers = wrap_nodes(np.arange(self.free.size).reshape(self.node_shape), self.periodic)
+        corners = [numbers[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * self.dimension)]
+        return np.stack(corners, axis=-1)[self.elements]
+
 
 @jax.tree_util.register_static
 class MeshSpace(FunctionSpace):
-    """The P1 space on a mesh of triangles or tetrahedra."""
+    """The space of P1 or P2 elements on a mesh of triangles or tetrahedra.
 
-    def __init__(self, triangulation: Triangulation, condition: str) -> None:
-        self.triangulation = triangulation
+    Attributes:
+        triangulation: the cells.
+        degree: 1 or 2.
+        cells: the nodes of each cell. Of degree 2 they are its vertices and then the middles of its edges: node
+            ``n_vertices + e`` belongs to edge e of the triangulation.
+    """
+
+    def __init__(self, triangulation: Triangulation, condition: str, degree: int = 1) -> None:
+        self.triangulation, self.degree = triangulation, degree
         self.boundary = ((condition, condition),)
-        self.node_shape, self.dimension = (triangulation.n_vertices,), triangulation.dimension
-        self.domain = np.ones(self.node_shape, dtype=bool)
-        self.free = ~triangulation.boundary_vertices if condition == "dirichlet" else self.domain
+        self.cells, self.dimension = triangulation.cells, triangulation.dimension
+        rim, (labels, self.n_components) = triangulation.boundary_vertices, triangulation.labels
+        self.domain = triangulation.used
+        if degree == 2:
+            self.cells = np.concatenate([self.cells, triangulation.n_vertices + triangulation.cell_edges], axis=1)
+            rim = np.concatenate([rim, triangulation.boundary_edges])
+            labels = np.concatenate([labels, labels[triangulation.edges[:, 0]]])
+            self.domain = np.concatenate([self.domain, np.ones(len(triangulation.edges), bool)])
+        self.node_shape, self.elements = rim.shape, np.ones(len(self.cells), bool)
+        self.free = self.domain & ~rim if condition == "dirichlet" else self.domain
         if not self.free.any():
             raise ValueError("boundary: every vertex is on the mesh's boundary, so that Dirichlet leaves none free")
-        self._labels, self.n_components = triangulation.labels
-        self._key = (triangulation, condition)
+        self._labels, self._key = labels, (triangulation, condition, degree)
+
+
+@jax.tree_util.register_static
+class VectorSpace(FunctionSpace):
+    """Functions of several components on the nodes of another space: results have an axis more, of components.
+
+    Attributes:
+        base: the space of each component.
+        cells: the unknowns of each element, those of a node beside each other.
+    """
+
+    def __init__(self, base: "GridSpace | MeshSpace", components: int) -> None:
+        self.base, self.components = base, components
+        self.node_shape, self.dimension = (*base.node_shape, components), base.dimension
+        self.domain, self.free, self._labels = (
+            np.repeat(x[..., None], components, axis=-1) for x in (base.domain, base.free, base._labels)
+        )
+        self.boundary, self.n_components, self.elements = base.boundary, base.n_components, base.elements
+        self.cells = (base.cells[..., None] * components + np.arange(components)).reshape(len(base.cells), -1)
+        self._key = (base, components)
 
 
 @jax.tree_util.register_static
@@ -233,6 +274,7 @@ def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
 
 _unit_space = lru_cache(maxsize=32)(GridSpace)
 mesh_space = lru_cache(maxsize=32)(MeshSpace)
+vector_space = lru_cache(maxsize=32)(VectorSpace)
 
 
 def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:

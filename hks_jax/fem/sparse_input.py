@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.sparse import BCOO, BCSR
 from jaxtyping import Array, Float, Int
-from scipy.sparse import coo_matrix, issparse
+from scipy.sparse import issparse
 from scipy.sparse.linalg import LinearOperator
 
 from hks_jax.checks import real_array, require_number
@@ -18,14 +18,10 @@ from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import MatrixSpace
-from hks_jax.linear.operators import DiagonalOperator, Operator, SparseOperator
+from hks_jax.linear.operators import ROUNDING, DiagonalOperator, Operator, SparseOperator, require_symmetric
 from hks_jax.linear.pattern import SparsePattern
 from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
-
-_ROUNDING = 1000
-"""By how many units of rounding of the largest entry a matrix may differ from its transpose."""
-
 
 _FEW = 8
 """Null vectors that are checked one by one."""
@@ -153,7 +149,7 @@ def require_null_space(pencil: SymmetricPencil) -> None:
     # Of many, a random combination does for all.
     weights = np.random.default_rng(0).standard_normal(len(vectors))
     some = vectors if len(vectors) <= _FEW else [weights @ (vectors / np.where(lengths > 0, lengths, 1))]
-    if max(map(defect, some)) > _ROUNDING * finfo.eps:
+    if max(map(defect, some)) > ROUNDING * finfo.eps:
         defects = [defect(vector) for vector in vectors]
         worst = int(np.argmax(defects))
         raise ValueError(
@@ -217,7 +213,8 @@ def _entries(name: str, matrix: Any) -> _Entries:
             rows, cols = np.nonzero(np.asarray(array))
         entries = _Entries(array[rows, cols], rows, cols, array.shape[0])
     if not is_traced(entries.values):
-        _check_symmetric(name, entries)
+        places, remedy = (entries.rows, entries.cols), f"If it means nothing, pass ({name} + {name}.T) / 2"
+        require_symmetric(name, entries.values, places, entries.size, remedy)
     return entries
 
 
@@ -262,23 +259,6 @@ def _check_diagonal(diagonal: Array) -> None:
                 f"M: {wrong.size} of its {diagonal.size} diagonal entries are not positive (the first is "
                 f"{float(diagonal[wrong[0]]):.6g}, of row {wrong[0]}); a mass must be positive definite"
             )
-
-
-def _check_symmetric(name: str, matrix: _Entries) -> None:
-    values = np.asarray(matrix.values)
-    wrong = int((~np.isfinite(values)).sum())
-    if wrong:
-        raise ValueError(f"{name}: {wrong} of {values.size} entries are NaN or infinite")
-    held = coo_matrix((values, (matrix.rows, matrix.cols)), shape=(matrix.size, matrix.size)).tocsr()
-    difference = abs(held - held.T).tocoo()
-    largest = float(np.max(np.abs(values), initial=0))
-    if difference.nnz and difference.data.max() > _ROUNDING * np.finfo(values.dtype).eps * largest:
-        at = int(np.argmax(difference.data))
-        i, j = int(difference.row[at]), int(difference.col[at])
-        raise ValueError(
-            f"{name}: not symmetric: entry ({i}, {j}) is {held[i, j]:.6g}, and entry ({j}, {i}) differs from it by "
-            f"{difference.data[at]:.2g}, which is more than rounding. If it means nothing, pass ({name} + {name}.T) / 2"
-        )
 
 
 def _pattern(n: int, *matrices: _Entries) -> SparsePattern:

@@ -18,6 +18,9 @@ from hks_jax.linear.products import aligned, of_each_row
 Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 
+ROUNDING = 1000
+"""By how many units of rounding of the largest entry a matrix may differ from its transpose."""
+
 
 class Operator(eqx.Module):
     """A symmetric matrix, applied without being formed."""
@@ -210,3 +213,23 @@ def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, 
         return entries - shift * mass.flat().astype(dtype)
     change = -shift * mass.diagonal().astype(dtype)
     return entries.at[stiffness.pattern.diagonal()].add(change, unique_indices=True)
+
+
+def require_symmetric(
+    name: str, values: Float[Array | np.ndarray, " m"], places: Places, size: int, remedy: str
+) -> None:
+    """Raise ValueError unless entries, of which those at one place add up, are finite and symmetric up to rounding."""
+    data, (rows, cols) = np.asarray(values), places
+    wrong = int((~np.isfinite(data)).sum())
+    if wrong:
+        raise ValueError(f"{name}: {wrong} of {data.size} entries are NaN or infinite")
+    held = coo_matrix((data, (rows, cols)), shape=(size, size)).tocsr()
+    difference = abs(held - held.T).tocoo()
+    largest = float(np.max(np.abs(data), initial=0))
+    if difference.nnz and difference.data.max() > ROUNDING * np.finfo(data.dtype).eps * largest:
+        at = int(np.argmax(difference.data))
+        i, j = int(difference.row[at]), int(difference.col[at])
+        raise ValueError(
+            f"{name}: not symmetric: entry ({i}, {j}) is {held[i, j]:.6g}, and entry ({j}, {i}) differs from it by "
+            f"{difference.data[at]:.2g}, which is more than rounding. {remedy}"
+        )

@@ -100,6 +100,9 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     (errors above 10 %) down to a quarter. On meshes only the first part is estimated. Of matrices from elsewhere the
     spacing is not known, and its error NaN.
 
+    A potential changes both. Where nothing is known of the null space, the exponent is the one that the mean of the
+    pairs' eigenvalues tells, if it is more than d/2, and the error by the spacing is NaN.
+
     Raises:
         ValueError: times that are not positive and finite; pairs in an interval; matrices whose dimension is not known.
     """
@@ -109,12 +112,14 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     pairs, at = jax.lax.stop_gradient((pairs, checked_times("times", times, dtype)))
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
     dimension, resolution = dimension_of(pairs, "an estimate of the truncation"), pairs.pencil.resolution
-    errors = resolution and (resolution.dispersion, resolution.turning, resolution.swelling)
+    by_weyl, errors = pairs.null_space_known, None
+    if resolution is not None and by_weyl:
+        errors = resolution.dispersion, resolution.turning, resolution.swelling
     free = mask_for(known, pairs.space.free)
-    return Truncation(at, *_truncation(errors, free, *known, at, dimension))
+    return Truncation(at, *_truncation(errors, free, *known, at, dimension, by_weyl))
 
 
-@numpy_where_known(static_argnums=7)
+@numpy_where_known(static_argnums=(7, 8))
 def _truncation(
     xp: Any,
     errors: tuple[Any, Any, Any] | None,
@@ -125,19 +130,28 @@ def _truncation(
     bottom: Any,
     at: Any,
     dimension: int,
+    by_weyl: bool,
 ) -> tuple[Any, ...]:
-    """Return what `Truncation` has beside the times."""
+    """Return what `Truncation` has beside the times; the exponent is Weyl's or that of the spectrum."""
     # Weyl's law counts from the bottom of the spectrum, which a potential moves.
     values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
     complete = xp.isinf(next_eigenvalue)
     following = xp.where(complete, 1, next_eigenvalue)
-    left = beyond_by_weyl(xp, xp.sum(kept, dtype=at.dtype), dimension, following * at)
+    count = xp.sum(kept, dtype=at.dtype)
+    if by_weyl:
+        left, least = beyond_by_weyl(xp, count, dimension, following * at), resolving(TAIL_LIMIT, dimension)
+    else:  # between two levels, of which there may be few
+        following = (following + xp.max(xp.where(kept, values, 0))) / 2
+        mean = xp.sum(xp.where(kept, values, 0)) / (count * following)
+        exponent = xp.maximum(_exponent(xp, mean), dimension / 2)
+        left = xp.asarray(beyond(*map(jnp.asarray, (count, exponent, following * at))))
+        least = xp.interp(exponent, *(xp.asarray(x, at.dtype) for x in (_EXPONENTS, _RESOLVING)))
     exponents = at[:, None] * values[None]
     terms = xp.where(kept[None], xp.exp(-exponents), 0)
     trace = xp.sum(terms, axis=1)
     tail = xp.where(complete, 0, left / (left + trace))
     slope = xp.sum(xp.where(kept[None], exponents * terms, 0), axis=1) / (dimension / 2 * trace)
-    smallest = xp.where(complete, 0, resolving(TAIL_LIMIT, dimension) / following)
+    smallest = xp.where(complete, 0, least / following)
     if errors is None:
         unknown = xp.full_like(at, xp.nan)
         return tail, unknown, unknown, unknown, smallest
@@ -193,8 +207,10 @@ def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
         warn_of_accuracy(message)
 
 
-_LEAST_EXPONENT, _GREATEST_EXPONENT = 0.5, 8.0
+_EXPONENTS = np.geomspace(0.5, 8, 33)
 """Between a strip, which is a line to all eigenfunctions that were computed, and a corner of Dirichlet sides in 3D."""
+_RESOLVING = scipy.special.gammainccinv(_EXPONENTS, TAIL_LIMIT)
+"""The Λt from which on no more than that share of the heat trace lies beyond Λ, for each of these exponents."""
 _POINTS, _WEIGHTS = np.polynomial.laguerre.laggauss(24)
 """Gauss and Laguerre's quadrature, of f(u) e^(−u) from 0 to ∞."""
 
@@ -234,6 +250,11 @@ def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
 def resolving(share: float, dimension: int) -> float:
     """Return the Λt from which on no more than this share of the heat trace lies beyond Λ, by Weyl's law."""
     return float(scipy.special.gammainccinv(dimension / 2, share))
+
+
+def _exponent(xp: Any, mean: Any) -> Any:
+    """Return the exponent of a counting function from the mean of λ/Λ below Λ."""
+    return xp.clip(mean / xp.maximum(1 - mean, 1e-3), _EXPONENTS[0], _EXPONENTS[-1])
 
 
 @nan_is_meant
@@ -282,8 +303,7 @@ def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
     # The derivative of exp(−λt) by t at 0 is −λ.
     moment = -spectral_diagonal(pairs, Derivative(Heat(at_zero), Heat(jnp.ones(1, dtype))))[0]
     mean = moment / jnp.where(count > 0, count * following, 1)
-    exponent = jnp.clip(mean / jnp.maximum(1 - mean, 1e-3), _LEAST_EXPONENT, _GREATEST_EXPONENT)
-    left = beyond(count, exponent, following * at.reshape(-1, *axes))
+    left = beyond(count, _exponent(jnp, mean), following * at.reshape(-1, *axes))
     kept = spectral_diagonal(pairs, Heat(at))
     share = left / jnp.where(count > 0, left + kept, 1)
     return jnp.where(complete & ~jnp.isnan(share), 0, share)

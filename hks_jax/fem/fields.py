@@ -1,0 +1,150 @@
+"""Fields that forms read: given at the nodes, on the elements, or as functions of the position."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hks_jax.checks import real_array
+from hks_jax.fem.space import FunctionSpace, MeshSpace, mask_for
+from hks_jax.traced import is_traced
+
+Place = Literal["everywhere", "nodes", "elements", "points"]
+
+
+class Field(eqx.Module):
+    """A field on the elements of a domain.
+
+    Attributes:
+        values: one for all, or those of the nodes (*node_shape, …), of the elements (*elements, …), or of the
+            quadrature points in each element (*elements, q, …).
+        at: which of these; static.
+    """
+
+    values: Float[Array, "..."]
+    at: Place = eqx.field(static=True)
+
+    def at_points(
+        self, corners: Callable[[Array], Array], shape_values: Float[np.ndarray, "q n"], elements: tuple[int, ...]
+    ) -> Float[Array, "E q ..."]:
+        """Return the field at the quadrature points of all elements; nodal values are interpolated.
+
+        Args:
+            corners: what takes values at the nodes to those at the nodes of each element, (E, n, …).
+            shape_values: the shape functions at the quadrature points.
+            elements: the shape of the elements.
+        """
+        values, n, q, axes = self.values, int(np.prod(elements)), len(shape_values), len(elements)
+        if self.at == "nodes":
+            h = jnp.asarray(shape_values, values.dtype)
+            return jnp.einsum("qn,En...->Eq...", h, corners(values), precision="highest")
+        if self.at == "points":
+            return values.reshape(n, *values.shape[axes:])
+        rest = values.shape[axes:] if self.at == "elements" else values.shape
+        one = values.reshape(n, 1, *rest) if self.at == "elements" else values
+        return jnp.broadcast_to(one, (n, q, *rest))
+
+
+def checked_field(
+    name: str,
+    given: Any,
+    space: FunctionSpace,
+    positions: Callable[[], Float[Array, "*elements q m"]],
+    dtype: Any,
+    *,
+    scalar: bool = False,
+    positive: bool = False,
+) -> Field:
+    """Return a field as a user gives it.
+
+    What lies outside of the domain is ignored. Where values are traced, those that should be positive and are not
+    become NaN.
+
+    Args:
+        name: of the argument.
+        given: a number, an array over the nodes or the elements, or a function of one position.
+        space: of the domain.
+        positions: returns the quadrature points' positions, for functions.
+        dtype: that of the matrices.
+        scalar: whether it must have one number at each place.
+        positive: whether these must be positive.
+
+    Raises:
+        ValueError: another shape; values that are NaN, infinite, or not positive (how many, and where the first is).
+    """
+    values, at, inside = _placed(name, given, space, positions)
+    # A field with several numbers at each place is judged by the worst of them.
+    rest = values.ndim - (0 if inside is None else inside.ndim)
+    if scalar and rest:
+        raise ValueError(f"{name}: got shape {values.shape}; expected one number at each place: {_expected(space)}")
+    trailing = tuple(range(values.ndim - rest, values.ndim))
+    if not is_traced(values):
+        _check(name, np.asarray(values), at, inside, trailing, positions, positive)
+    values = values.astype(dtype)
+    if positive:
+        values = jnp.where(values > 0, values, jnp.nan)
+    if inside is not None and not inside.all():
+        known = mask_for(values, inside)
+        values = jnp.where(known.reshape(*inside.shape, *(1,) * rest), values, 1)
+    return Field(values, at)
+
+
+def _placed(
+    name: str, given: Any, space: FunctionSpace, positions: Callable[[], Float[Array, "*elements q m"]]
+) -> tuple[Array, Place, Bool[np.ndarray, "..."] | None]:
+    """Return the values of a field, what they belong to, and which of these are in the domain."""
+    nodes, elements = space.node_shape, space.elements
+    if callable(given):
+        x = positions()
+        values = jax.vmap(lambda at: real_array(name, given(at)))(x.reshape(-1, x.shape[-1]))
+        inside = np.broadcast_to(elements[..., None], x.shape[:-1])
+        return values.reshape(*x.shape[:-1], *values.shape[1:]), "points", inside
+    values = real_array(name, given)
+    if isinstance(space, MeshSpace) and space.degree == 2 and values.shape[:1] == (space.triangulation.n_vertices,):
+        values = jnp.concatenate([values, jnp.mean(values[space.triangulation.edges], axis=1)])
+    if values.ndim == 0:
+        return values, "everywhere", None
+    if values.shape[: len(nodes)] == nodes:
+        return values, "nodes", space.domain
+    if values.shape[: elements.ndim] == elements.shape:
+        return values, "elements", elements
+    raise ValueError(f"{name}: got shape {values.shape}; expected {_expected(space)}")
+
+
+def _expected(space: FunctionSpace) -> str:
+    return (
+        f"{space.node_shape}, one per node, {space.elements.shape}, one per element, a number, or a function of the "
+        "position"
+    )
+
+
+def _check(
+    name: str,
+    values: np.ndarray,
+    at: Place,
+    inside: Bool[np.ndarray, "..."] | None,
+    trailing: tuple[int, ...],
+    positions: Callable[[], Array],
+    positive: bool,
+) -> None:
+    counted = np.ones((), bool) if inside is None else inside
+    finite = np.isfinite(values).all(axis=trailing)
+    wrong, what = counted & ~finite, "NaN or infinite"
+    if positive and not wrong.any():
+        wrong, what = counted & ~(values > 0), "not positive"
+    if not wrong.any():
+        return
+    first = tuple(int(i) for i in np.argwhere(wrong)[0])
+    where = f"{at[:-1]} {first if len(first) > 1 else first[0]}" if first else "each place"
+    if at == "points":
+        where = f"x = {np.asarray(positions())[first].round(6).tolist()}"
+    number = "" if trailing else f"{values[first]:.6g} "
+    remedy = "Raise" if positive and what == "not positive" else "Replace"
+    raise ValueError(
+        f"{name}: {int(wrong.sum())} of {int(counted.sum())} values are {what} (the first is {number}at {where}). "
+        f"{remedy} them, or leave these places out by a mask"
+    )
