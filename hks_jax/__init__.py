@@ -41,11 +41,15 @@ from hks_jax.eigen.weyl import weyl_count as weyl_count
 from hks_jax.fem.assembly import assemble as assemble
 from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import reflect as reflect
+from hks_jax.fem.factorise import Multifrontal as Multifrontal
+from hks_jax.fem.factorise import SparseLinearOperator as SparseLinearOperator
+from hks_jax.fem.factorise import factorise as factorise
 from hks_jax.fem.pencil import MirrorPencil as MirrorPencil
 from hks_jax.fem.pencil import Pencil as Pencil
 from hks_jax.fem.sparse_input import sparse_pencil as sparse_pencil
 from hks_jax.linear.dense_eigh import DenseEigenpairs as DenseEigenpairs
 from hks_jax.linear.dense_eigh import eigh as eigh
+from hks_jax.linear.factorised_matrix import FactorisedMatrix as FactorisedMatrix
 from hks_jax.linear.matrix_function import matrix_function as matrix_function
 from hks_jax.linear.pencil import SymmetricPencil as SymmetricPencil
 from hks_jax.signatures.boundary import boundary_influence as boundary_influence
@@ -65,6 +69,9 @@ from hks_jax.signatures.kernels import heat_trace as heat_trace
 from hks_jax.signatures.kernels import scale_invariant_hks as scale_invariant_hks
 from hks_jax.signatures.kernels import spectral_signature as spectral_signature
 from hks_jax.signatures.kernels import wks as wks
+from hks_jax.signatures.log_determinant import LogDeterminant as LogDeterminant
+from hks_jax.signatures.log_determinant import heat_coefficients as heat_coefficients
+from hks_jax.signatures.log_determinant import log_determinant as log_determinant
 from hks_jax.signatures.regions import RegionStatistics as RegionStatistics
 from hks_jax.signatures.regions import region_statistics as region_statistics
 from hks_jax.signatures.times import default_energies as default_energies

@@ -32,6 +32,7 @@ def test_inverse_and_inertia_of_indefinite_matrices(rng, way, n):
     inverted, pivots = jax.jit(WAYS[way])(jnp.asarray(a), jnp.zeros(3))
     np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(n), a.shape), atol=1e-8)
     np.testing.assert_array_equal((pivots < 0).sum(axis=1), (np.linalg.eigvalsh(a) < 0).sum(axis=1))
+    np.testing.assert_allclose(jnp.sum(jnp.log(jnp.abs(pivots)), axis=1), np.linalg.slogdet(a)[1], rtol=1e-10)
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -52,7 +53,7 @@ def test_definite_matrices_and_a_batch_of_which_one_is_not(rng, negative):
     values = rng.uniform(0.5, 2, (5, 24))
     values[2, :negative] *= -1
     a = of_spectrum(rng, values)
-    inverted, pivots = jax.jit(by_cholesky_factors)(jnp.asarray(a))
+    inverted, pivots = jax.jit(by_cholesky_factors)(jnp.asarray(a), jnp.zeros(5))
     np.testing.assert_allclose(inverted @ a, np.broadcast_to(np.eye(24), a.shape), atol=1e-13)
     np.testing.assert_array_equal((pivots < 0).sum(axis=1), [0, 0, negative, 0, 0])
 

@@ -16,15 +16,12 @@ from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.factorised_matrix import certain_factorisation
 from hks_jax.linear.multifrontal import factorise, try_out
 from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
-_PROBES = 4
-"""Random right-hand sides to try a factorisation out."""
-_LEAST_PIVOT = 0.375
-"""The least pivot with which a count is tried again, as a power of ε."""
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
 """How far beside σ, relative, to count where the factorisation at σ itself is not to be trusted."""
 
@@ -119,20 +116,8 @@ def certain_count(pencil: SymmetricPencil, shift: Float[Array, ""]) -> Count:
 # The dissection is an argument: as a constant, 74 MB at 1024² nodes, it would be compiled.
 @jit_quickly()
 def _certain_count(pencil: SymmetricPencil, dissection: Dissection, shift: Float[Array, ""]) -> Count:
-    probes = jax.random.normal(jax.random.key(0), (pencil.size, _PROBES), shift.dtype)
-
-    bounded = float(jnp.finfo(shift.dtype).eps) ** _LEAST_PIVOT
-
-    def attempt(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        tries, _, _ = state
-        least = jnp.where(tries > 0, bounded, 0).astype(shift.dtype)
-        return tries + 1, *count_once(pencil, dissection, shift, probes, least)
-
-    # A loop, so that the factorisation is compiled once.
-    none = jnp.zeros((), int)
-    start = none, none, jnp.zeros((), bool)
-    _, negative, sound = jax.lax.while_loop(lambda state: (state[0] < 2) & ~state[2], attempt, start)
-    return negative, sound
+    factor, trial, _ = certain_factorisation(dissection, pencil, shift)
+    return factor.negative, trial.sound
 
 
 def count_once(

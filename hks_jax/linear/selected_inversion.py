@@ -1,4 +1,4 @@
-"""The diagonal of a sparse symmetric matrix' inverse, without the rest of it: selected inversion.
+"""The inverse of a sparse symmetric matrix, where the matrix has entries: selected inversion.
 
 Takahashi, Fagan and Chin (1973), here on the elimination tree. Once a front with own block A and coupling B to its
 boundary is eliminated, the inverse G of the whole matrix satisfies there, with C = BA⁻¹,
@@ -21,6 +21,9 @@ from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import eliminate, gather_symmetric, taken
 from hks_jax.linear.products import batched, transposed
+
+Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts _r _s"]]]
+"""(A⁻¹, BA⁻¹) of each level's fronts."""
 
 
 class Cost(NamedTuple):
@@ -48,22 +51,34 @@ def diagonal_of_inverse(dissection: Dissection, matrix: Inexact[Array, " m"]) ->
     Returns:
         The diagonal. Differentiable in both modes: what is kept for the transpose are some copies of the factors.
     """
-    eliminated = eliminate(dissection, matrix, lambda blocks, _: _inverses(blocks))
-    diagonals = []
+    return selected(dissection, eliminated_differentiably(dissection, matrix), diagonal=True)
+
+
+def eliminated_differentiably(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Eliminated:
+    """Return what `eliminate` does, with blocks inverted by a rule that is differentiable any number of times."""
+    return eliminate(dissection, matrix, lambda blocks, _: _inverses(blocks))
+
+
+def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> Inexact[Array, " m"]:
+    """Return the inverse's diagonal, (n_dof,), or its columns (fronts, s + r, s) as `Dissection.places` counts them."""
+    parts = []
     known: Array | None = None
     for number, (level, (inverse, coupling)) in enumerate(zip(dissection.levels, eliminated, strict=True)):
-        boundary = jnp.zeros((1, 0, 0), matrix.dtype)
+        boundary = jnp.zeros((1, 0, 0), inverse.dtype)
         if known is not None:
             boundary = gather_symmetric(known, jnp.asarray(level.boundary)[None])[0]
         beside = -batched(boundary, coupling)
-        if number == len(dissection.levels) - 1:  # of the cells, nothing but the diagonal is wanted
+        last = number == len(dissection.levels) - 1
+        if diagonal and last:  # of the cells, nothing else is wanted
             own = jnp.diagonal(inverse, axis1=1, axis2=2) - jnp.sum(coupling * beside, axis=1)
         else:
             block = inverse - batched(transposed(coupling), beside)
-            known = jnp.block([[block, transposed(beside)], [beside, boundary]])
-            own = jnp.diagonal(block, axis1=1, axis2=2)
-        diagonals.append(own.reshape(-1))
-    return taken(jnp.concatenate(diagonals), dissection.order)
+            if not last:
+                known = jnp.block([[block, transposed(beside)], [beside, boundary]])
+            own = jnp.diagonal(block, axis1=1, axis2=2) if diagonal else jnp.concatenate([block, beside], axis=1)
+        parts.append(own.reshape(-1))
+    whole = jnp.concatenate(parts)
+    return taken(whole, dissection.order) if diagonal else whole
 
 
 def inversion_cost(dissection: Dissection) -> Cost:

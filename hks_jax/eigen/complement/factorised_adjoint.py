@@ -198,7 +198,7 @@ def _factorise(
     """Return the fields of the stacked factorisations of K − σM, without the dissection, and the shifts."""
     shifts = adjoint._shifts(pencil, values, adjoint._groups(dissection, values, k))
     factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
-    return (factors.downward, factors.upward, factors.negative), shifts
+    return (factors.downward, factors.upward, factors.pivots), shifts
 
 
 @partial(jax.jit, static_argnames="adjoint")
@@ -214,7 +214,7 @@ def _solve(
     k, tolerance, clean = len(rhs), attainable(adjoint.tolerance, rhs.dtype), without_known(pencil, vectors)
 
     def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
-        fields = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.negative))
+        fields = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.pivots))
         near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]]
         return Factorisation(factors.dissection, *fields), near.T, pencil.mass.apply(near)
 

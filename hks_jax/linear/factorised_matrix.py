@@ -1,0 +1,313 @@
+"""A factorised symmetric matrix, whose solves, determinant and inverse are differentiable by its entries."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import real_array
+from hks_jax.compilation import jit_quickly
+from hks_jax.linear.dissection import Dissection, dissect
+from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
+from hks_jax.linear.operators import DiagonalOperator, OfColumns, PatternedOperator
+from hks_jax.linear.pencil import SymmetricPencil, tabulated
+from hks_jax.linear.selected_inversion import Eliminated, eliminated_differentiably, selected
+from hks_jax.linear.symmetric_inverse import symmetric_inverses
+from hks_jax.traced import is_traced
+
+_PROBES = 4
+"""Random right-hand sides to try a factorisation out."""
+_LEAST_PIVOT = 0.375
+"""The least pivot with which a factorisation is tried again, as a power of ε."""
+_DOUBTFUL = 0.01
+"""The error of determinants and inverses from which on a warning says so."""
+_BACKWARD = 4
+"""The backward error from which on solutions are not refined, in units of rounding."""
+_NULL = 1000
+"""The eigenvalues that count as zero in an error, in units of rounding of the matrix' norm."""
+_SEARCHED, _TURNS = 16, 4
+"""How many null vectors are looked for, and in how many steps."""
+
+
+Fields = tuple[tuple[Array, ...], tuple[Array, ...], Array]
+"""Those of a factorisation without its dissection: what a compiled function hands through is copied."""
+
+
+class Inertia(NamedTuple):
+    """How many eigenvalues are negative, and positive; −1 where that is uncertain."""
+
+    negative: Int[Array, "..."]
+    positive: Int[Array, "..."]
+
+
+class FactorisedMatrix(eqx.Module):
+    """A symmetric matrix A = LDLᵀ, factorised once; a pytree. See `hks_jax.factorise`.
+
+    Attributes:
+        matrix: A, by whose entries results are differentiable, any number of times, forward and reverse.
+        factor: LDLᵀ; constant to derivatives.
+        sound: whether the factorisation was found, on random right-hand sides, to be that of A: its inertia is then
+            that of A, and iterative refinement converges. Results are NaN where it is not.
+        error: an estimate of ‖I − AF⁻¹‖ in Frobenius' norm, F being what LDLᵀ is by rounding: the error of log|det A|,
+            and the relative one of A⁻¹. Infinite where pivots were replaced; these two are then NaN. Solutions are
+            refined, and do not have it.
+    """
+
+    matrix: PatternedOperator
+    factor: Factorisation
+    sound: Bool[Array, ""]
+    error: Float[Array, ""]
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"FactorisedMatrix(size={self.size}, dtype={self.matrix.dtype})"
+
+    @property
+    def size(self) -> int:
+        """The number of rows, n."""
+        return self.matrix.size
+
+    @property
+    def inertia(self) -> Inertia:
+        """How many eigenvalues of A are negative, and positive: of K − σM, those of the pencil below and above σ."""
+        negative = self.factor.negative
+        counts = negative, jnp.asarray(self.size, negative.dtype) - negative
+        return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
+
+    @property
+    def sign(self) -> Float[Array, ""]:
+        """The sign of the determinant, ±1; NaN where it is uncertain."""
+        return _nan_unless(self.sound, (1 - 2 * (self.factor.negative % 2)).astype(self.matrix.dtype))
+
+    def solve(self, b: Float[Array | np.ndarray, "n *m"]) -> Float[Array, "n *m"]:
+        """Solve A x = b for a vector (n,), or the columns of a block (n, m), to a backward error of rounding.
+
+        Raises:
+            ValueError: b of another shape, or complex.
+        """
+        b = real_array("b", b).astype(self.matrix.dtype)
+        if b.ndim not in (1, 2) or b.shape[0] != self.size:
+            raise ValueError(f"b: got shape {b.shape}; expected ({self.size},) or ({self.size}, m)")
+        x = _solve(self.matrix, jax.lax.stop_gradient(self.factor), b.reshape(self.size, -1)).reshape(b.shape)
+        return _nan_unless(self.sound, x)
+
+    def logdet(self) -> Float[Array, ""]:
+        """Return log|det A|; `sign` has the sign.
+
+        Raises:
+            ValueError: concrete values of which pivots were replaced.
+
+        Warns:
+            AccuracyWarning: an `error` above 0.01.
+        """
+        return self._unless_replaced(_log_determinant)
+
+    def inverse_diagonal(self) -> Float[Array, " n"]:
+        """Return the diagonal of A⁻¹, by selected inversion: in about the time of the factorisation.
+
+        Raises:
+            ValueError: concrete values of which pivots were replaced.
+
+        Warns:
+            AccuracyWarning: an `error` above 0.01.
+        """
+        return self._unless_replaced(_inverse_diagonal)
+
+    def _unless_replaced(self, function: Callable[[PatternedOperator, Factorisation], Array]) -> Array:
+        if not is_traced(self.error) and self.sound:
+            if jnp.isinf(self.error):
+                raise ValueError(
+                    "matrix: A is regular, but a block of it, from which the elimination begins, is singular or nearly "
+                    "so; that leaves solutions accurate, but not the determinant and the inverse. Shift A a little"
+                )
+            if self.error > _DOUBTFUL:
+                warn_of_accuracy(
+                    f"matrix: rounding in {self.matrix.dtype} leaves an error of about {float(self.error):.1g} in "
+                    "log|det A|, and relative in the inverse. Use float64, or shift A a little"
+                )
+        return _nan_unless(jnp.isfinite(self.error), function(self.matrix, jax.lax.stop_gradient(self.factor)))
+
+
+def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return x, or NaN, of which derivatives are NaN, too: those of a choice would be zero."""
+    return x * jnp.where(known, 1.0, jnp.nan).astype(x.dtype)
+
+
+def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMatrix:
+    """Factorise a symmetric matrix.
+
+    Args:
+        matrix: A; only the lower or upper of two entries that are equal by symmetry is read.
+        name: what errors call it.
+
+    Raises:
+        ValueError: A, concrete, is not finite or singular, with its null vectors.
+    """
+    ones = jnp.ones(matrix.size, matrix.dtype)
+    pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))
+    known = jax.lax.stop_gradient(pencil)
+    dissection = jax.tree.map(jnp.asarray, dissect(matrix.pattern))
+    fields, sound, error = _factorised(dissection, known)
+    factor = Factorisation(dissection, *fields)
+    if not is_traced(sound) and not sound:
+        raise ValueError(_failure(name, known, factor))
+    return FactorisedMatrix(pencil.stiffness, factor, sound, error)
+
+
+@jit_quickly()
+def _factorised(dissection: Dissection, pencil: SymmetricPencil) -> tuple[Fields, Bool[Array, ""], Float[Array, ""]]:
+    """Return a factorisation, whether it is sound, and its error."""
+    factor, trial, tries = certain_factorisation(dissection, pencil, jnp.zeros((), pencil.stiffness.dtype))
+    # A random vector is as long in the image of a matrix as the matrix in Frobenius' norm, over √n.
+    error = jnp.where(trial.sound & (tries == 1), trial.rate * math.sqrt(pencil.size), jnp.inf)
+    return (factor.downward, factor.upward, factor.pivots), trial.sound, error
+
+
+def certain_factorisation(
+    dissection: Dissection, pencil: SymmetricPencil, shift: Float[Array, ""]
+) -> tuple[Factorisation, Trial, Int[Array, ""]]:
+    """Factorise K − σM, if need be once more with small pivots replaced; return what it is good for, and the tries."""
+    probes = jax.random.normal(jax.random.key(0), (pencil.size, _PROBES), shift.dtype)
+    bounded, matrix = float(jnp.finfo(shift.dtype).eps) ** _LEAST_PIVOT, pencil.shifted(shift)
+
+    def attempt(tries: Int[Array, ""]) -> tuple[Fields, Trial]:
+        least = jnp.where(tries > 0, bounded, 0).astype(shift.dtype)
+        factor = factorise(dissection, matrix, least)
+        return (factor.downward, factor.upward, factor.pivots), try_out(factor, pencil, shift, probes)
+
+    def step(state: tuple[Array, tuple[Fields, Trial]]) -> tuple[Array, tuple[Fields, Trial]]:
+        return state[0] + 1, attempt(state[0])
+
+    # A loop, so that the factorisation is compiled once.
+    none = jnp.zeros((), int)
+    start = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(attempt, none))
+    tries, (fields, trial) = jax.lax.while_loop(lambda s: (s[0] < 2) & ~s[1][1].sound, step, (none, start))
+    return Factorisation(dissection, *fields), trial, tries
+
+
+def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
+    """Say why a matrix could not be factorised, given the factorisation with small pivots replaced."""
+    entries = np.asarray(pencil.stiffness.triplets()[0])
+    wrong = int((~np.isfinite(entries)).sum())
+    if wrong:
+        return f"{name}: {wrong} of {entries.size} entries are NaN or infinite"
+    # x − F⁻¹Ax keeps null vectors, and takes all else away but for what F differs from A.
+    product, norm = pencil.stiffness.of_columns(), max(float(_norm(pencil.stiffness)), np.finfo(entries.dtype).tiny)
+    size = min(_SEARCHED, pencil.size)
+    x = np.random.default_rng(0).standard_normal((pencil.size, size)).astype(entries.dtype)
+    for _ in range(_TURNS):
+        x = np.linalg.qr(np.nan_to_num(np.asarray(x - factor.solve_columns(product(jnp.asarray(x))))))[0]
+    sizes = np.linalg.svd(np.asarray(product(jnp.asarray(x))), compute_uv=False) / norm
+    null = sizes <= _NULL * np.finfo(entries.dtype).eps
+    if not null.any():
+        return (
+            f"{name}: singular within rounding of {entries.dtype}, ‖Av‖ ≤ {sizes.min():.1e} ‖A‖ ‖v‖ for some v, or of "
+            "a form that an elimination without pivoting cannot take. Shift it, scale rows and columns, or use float64"
+        )
+    many = f"{'at least ' if null.all() and size < pencil.size else ''}{null.sum()}"
+    return (
+        f"{name}: singular: {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. "
+        "Shift it, fix as many unknowns, or add a term that is definite on them"
+    )
+
+
+@jax.jit
+def _norm(matrix: PatternedOperator) -> Float[Array, ""]:
+    """Return the largest sum of a row's moduli."""
+    ones = jnp.ones((matrix.size, 1), matrix.dtype)
+    return jnp.max(matrix.with_flat(jnp.abs(matrix.flat())).of_columns()(ones))
+
+
+# A dx = db − dA x. JAX has the derivatives of a linear solve, any number of times and in both modes, from the product
+# with A alone; how it is solved is a constant to them.
+@jax.jit
+def _solve(matrix: PatternedOperator, factor: Factorisation, b: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    product, norm = matrix.of_columns(), jax.lax.stop_gradient(_norm(matrix))
+    return jax.lax.custom_linear_solve(product, b, partial(_refined, factor, norm), symmetric=True)
+
+
+def _refined(
+    factor: Factorisation, norm: Float[Array, ""], product: OfColumns, b: Float[Array, "n m"]
+) -> Float[Array, "n m"]:
+    """Solve, and solve again for what is left of b, as long as that at least halves the largest backward error."""
+    finfo = jnp.finfo(b.dtype)
+
+    def largest(x: Array) -> Float[Array, " m"]:
+        return jnp.max(jnp.abs(x), axis=0)
+
+    def measured(x: Array) -> tuple[Array, Array, Float[Array, ""]]:
+        rest = b - product(x)
+        return x, rest, jnp.max(largest(rest) / (norm * largest(x) + largest(b) + finfo.tiny))
+
+    def again(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        x, rest, error, _ = state
+        new = measured(x + factor.solve_columns(rest))
+        x, rest, least = (jnp.where(new[2] < error, *both) for both in zip(new, state[:3], strict=True))
+        return x, rest, least, least < error / 2
+
+    def goes_on(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+        return (state[2] > _BACKWARD * finfo.eps) & state[3]
+
+    return jax.lax.while_loop(goes_on, again, (*measured(factor.solve_columns(b)), jnp.ones((), bool)))[0]
+
+
+def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated:
+    """Return (A⁻¹, BA⁻¹) of the elimination tree; where solves go along another one it is eliminated once more."""
+    tree = factor.dissection
+    if tree.merged is not None:
+        return eliminate(tree, matrix, lambda blocks, _: symmetric_inverses(blocks)[0])
+    sizes = [level.shape[2] for level in tree.levels]
+    return [(both[:, :s], both[:, s:]) for s, both in zip(sizes, factor.downward, strict=True)]
+
+
+# d(A⁻¹) = −A⁻¹ dA A⁻¹, at some places: the derivative of the elimination itself and of the recurrence from the first
+# separator to the cells. Transposed, it takes a few times as many operations as these. The factors have the values.
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
+    return selected(factor.dissection, _eliminated(matrix, factor), diagonal)
+
+
+@_inverse.defjvp
+def _inverse_jvp(diagonal: bool, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    matrix, factor = primals
+
+    def of_matrix(matrix: Array) -> Array:
+        return selected(factor.dissection, eliminated_differentiably(factor.dissection, matrix), diagonal)
+
+    return _inverse(diagonal, matrix, factor), jax.jvp(of_matrix, (matrix,), tangents[:1])[1]
+
+
+@jax.custom_jvp
+def _log_of_pivots(matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, ""]:
+    return jnp.sum(jnp.log(jnp.abs(factor.pivots)))
+
+
+# d log|det A| = tr(A⁻¹ dA) = Σ (A⁻¹)ᵢⱼ dAᵢⱼ: the inverse is needed where A has entries. Those of a front's own block
+# are all listed; of its coupling to the boundary and the transpose one of two, which counts twice.
+@_log_of_pivots.defjvp
+def _log_of_pivots_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (matrix, factor), (change, _) = primals, tangents
+    tree = factor.dissection
+    times = [np.where(np.arange(h) < s, 1, 2)[None, :, None] for _, h, s in (level.shape for level in tree.levels)]
+    weights = [jnp.broadcast_to(t, level.shape).reshape(-1) for t, level in zip(times, tree.levels, strict=True)]
+    weighted = _inverse(False, matrix, factor) * jnp.concatenate(weights).astype(matrix.dtype)
+    slope = weighted.at[tree.places].get(mode="fill", fill_value=0, wrap_negative_indices=False)
+    listed = change if tree.entries is None else change[tree.entries]
+    return _log_of_pivots(matrix, factor), jnp.vdot(slope, listed)
+
+
+@jax.jit
+def _log_determinant(matrix: PatternedOperator, factor: Factorisation) -> Float[Array, ""]:
+    return _log_of_pivots(matrix.flat(), factor)
+
+
+@jax.jit
+def _inverse_diagonal(matrix: PatternedOperator, factor: Factorisation) -> Float[Array, " n"]:
+    return _inverse(True, matrix.flat(), factor)
