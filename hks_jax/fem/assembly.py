@@ -168,6 +168,9 @@ def _checked_operator(
         raise ValueError(f'mass: got {mass!r}; expected "consistent", "lumped" or a form')
     if stiffness is not None and not callable(stiffness):
         raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form, a function of u, v and w")
+    for name, form in (("stiffness", stiffness), ("mass", mass)):
+        if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
+            raise ValueError(f"{name}: the form closes over traced values; hand them over by fields={{…}}, numbers too")
     require_count("components", components)
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
