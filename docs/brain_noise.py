@@ -18,7 +18,7 @@ import numpy as np
 from brain_study import tissues
 
 import hks_jax as hj
-from hks_jax.cli.picture import cropped, placed
+from hks_jax.plot.signature import cropped, placed
 
 jax.config.update("jax_enable_x64", True)
 

@@ -19,18 +19,21 @@ import pytest
 import hks_jax as hj
 from hks_jax import paper
 from hks_jax.cache import cache_folder
-from hks_jax.cli import demo, fit, main, picture
+from hks_jax.cli import demo, fit, main
 from hks_jax.cli import job as job_module
 from hks_jax.cli import outputs as outputs_module
-from hks_jax.cli.arguments import Times, default_boundary, parse_boundary, parse_times
-from hks_jax.cli.picture import away_from_rim, bounding_box
+from hks_jax.cli.options import Times, options_in, parse_boundary, parse_times
 from hks_jax.cli.progress import Progress, bar, duration
 from hks_jax.eigen.solver import Status
+from hks_jax.fem.boundary import default_boundary
 from hks_jax.inverse.metric_fit import RESULTS
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.inverse.problem import pairs_for
 from hks_jax.inverse.search import OPTIMISERS
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
+from hks_jax.io.result import Result, recorded_boundary
+from hks_jax.plot import signature
+from hks_jax.plot.signature import away_from_rim, bounding_box
 
 SHAPE = (14, 12)
 QUIET_FILES = ["hks.npz", "hks.png", "report.json"]
@@ -206,8 +209,8 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
     mask[:4, :, 0] = False
     np.save(tmp_path / "mask.npy", mask)
     arguments = ["--metric", "inverse", "--mask", str(tmp_path / "mask.npy"), "-k", "12", "--through", "8,5,3"]
-    drawn, draw = [], picture.volume_panels
-    monkeypatch.setattr(picture, "volume_panels", lambda *args, **more: drawn.append(draw(*args, **more)))
+    drawn, draw = [], signature.volume_panels
+    monkeypatch.setattr(signature, "volume_panels", lambda *args, **more: drawn.append(draw(*args, **more)))
     assert main(["hks", str(nifti), "-o", str(out), "-q", *arguments, "--times", "20000", "50000"]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["hks.json", "hks.nii.gz", *QUIET_FILES]
 
@@ -572,7 +575,7 @@ def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(tmp_path):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.01)
 
-        def run(args):
+        def run(args, progress):
             gc.callbacks.append(callback)
             gc.collect()
             for _ in range(400):
@@ -683,8 +686,8 @@ def test_picture_helpers():
 
 
 def test_what_fit_offers_is_what_there_is():
-    assert tuple(PARAMETRISATIONS) == fit.PARAMETRISATIONS
-    assert fit.OPTIMISERS == OPTIMISERS
+    offered = {option.name: option.settings.get("choices") for option in options_in(fit.OPTIONS)}
+    assert (offered["parametrisation"], offered["optimiser"]) == (tuple(PARAMETRISATIONS), OPTIMISERS)
 
 
 def test_help_does_not_wait_for_the_optimisers():
@@ -714,9 +717,9 @@ def write_target(path, values, **changes):
 def test_a_fit_has_the_boundary_that_its_target_says(conformal, tmp_path):
     _, values = conformal
     record = json.dumps({"settings": {"boundary": [["dirichlet", "mean"], "neumann"]}})
-    said = fit.read_target(write_target(tmp_path / "said.npz", values, provenance=record))
-    assert said.boundary == (("dirichlet", "mean"), "neumann")
-    assert fit.read_target(write_target(tmp_path / "unsaid.npz", values)).boundary is None
+    said = Result.read(write_target(tmp_path / "said.npz", values, provenance=record))
+    assert recorded_boundary(said.settings) == (("dirichlet", "mean"), "neumann")
+    assert recorded_boundary(Result.read(write_target(tmp_path / "unsaid.npz", values)).settings) is None
 
 
 @pytest.mark.slow

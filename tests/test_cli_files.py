@@ -11,11 +11,12 @@ import pytest
 
 import hks_jax as hj
 from hks_jax.cli import main
-from hks_jax.cli.job import Result
+from hks_jax.cli.options import as_options
 from hks_jax.cli.outputs import write_outputs
-from hks_jax.cli.progress import OPTIONS, Progress, as_options
+from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
+from hks_jax.io.result import Result
 
 SHAPE = (14, 12, 5)
 AFFINE = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
@@ -337,7 +338,7 @@ def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library
     assert image_suffix(tmp_path / f"t{suffix}") == suffix
     report = {"settings": {"k": 3, "metric": "inverse"}}
     volume = replace(volume, tensors=volume.tensors.astype(np.float32))
-    result = Result(volume, np.array([1.0, 2.0]), np.ones((2, *SHAPE)), np.arange(3.0), report)
+    result = Result(volume, np.ones((2, *SHAPE)), np.array([1.0, 2.0]), np.arange(3.0), report)
     out = tmp_path / "out"
     write_outputs(out, result, Progress(quiet=True), Path.touch, suffix)
     names = {f"hks{suffix}", "hks.npz", "hks.png", "report.json"} | ({"hks.json"} if suffix == ".nii.gz" else set())
@@ -361,7 +362,7 @@ def test_messages_name_the_options():
         ("b_max: 10 leaves none", "--b-max: 10 leaves none"),
         ("outside, pass the mask or mask them", "outside, pass the mask or mask them"),
     ):
-        assert as_options(said, OPTIONS) == expected
+        assert as_options(said) == expected
 
 
 def test_help(capsys):

@@ -166,7 +166,7 @@ def test_plot_of_a_volume(tmp_path, capsys):
         assert main(["plot", str(path), "-o", str(tmp_path / "p.png"), *more]) == 0
     capsys.readouterr()
     for more, words in (
-        (["--slice", "x=6"], "--slice: got x=6; expected x=0 … x=5"),
+        (["--slice", "x=6"], "--slice: index: got x = 6; expected 0 … 5"),
         (["--points", "1,2"], "expected 3 coordinates"),
     ):
         assert error_of(capsys, main(["plot", str(path), "-o", str(tmp_path / "p.png"), *more]), words) == 2

@@ -188,7 +188,9 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
     assert "pass --labels too" in error(result, "--names", tmp_path / "names.tsv")
     assert "ends in .html" in error(result, "-o", tmp_path / "page.png")
     assert "no such file" in error(tmp_path / "nowhere")
-    np.savez(tmp_path / "mesh.npz", hks=np.ones((1, 4)), vertices=np.eye(4, 3), cells=np.array([[0, 1, 2, 3]]))
+    np.savez(
+        tmp_path / "mesh.npz", hks=np.ones((1, 4)), times=[1.0], vertices=np.eye(4, 3), cells=np.array([[1, 0, 2, 3]])
+    )
     assert "is on tetrahedra" in error(tmp_path / "mesh.npz")
     assert not (result / "explore.html").exists()
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -114,3 +115,18 @@ def compare(single, pairs, gradient, tensors, boundary, solver):
         np.testing.assert_allclose(got["slope"], np.sum(gradient * tensors), atol=1e-3 * size)
     if boundary == "neumann":
         np.testing.assert_allclose(got["gram"], np.eye(K), atol=1e-4)
+
+
+@pytest.mark.parametrize("stretch", [100.0, 6e4])
+def test_tensors_that_float32_does_not_hold_are_told(stretch):
+    axes = np.array([[1, -1], [1, 1]]) / np.sqrt(2)
+    tensors = np.broadcast_to(axes @ np.diag([1, 1 / stretch]) @ axes.T, (16, 16, 2, 2))
+    grid = hj.Grid((16, 16), 1 / 15)
+    exact = hj.eigenpairs(hj.TensorField(grid, jnp.asarray(tensors)), 20).eigenvalues
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        rounded = hj.eigenpairs(hj.TensorField(grid, jnp.asarray(tensors, jnp.float32)), 20)
+    known = np.flatnonzero(np.asarray(rounded.converged))[1:]
+    error = np.max(np.abs(np.asarray(rounded.eigenvalues)[known] / np.asarray(exact)[known] - 1))
+    said = any("which residuals do not show" in str(each.message) for each in told)
+    assert (error > 5e-4, said) == (stretch > 1e3,) * 2

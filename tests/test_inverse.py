@@ -12,9 +12,8 @@ import hks_jax as hj
 from hks_jax.domain import spd
 from hks_jax.inverse import H1, LogDeterminant, Prior, TotalVariation, identifiability
 from hks_jax.inverse.observation import observe
-from hks_jax.inverse.outcome import more_pairs, outcome_of, truncation_shows
 from hks_jax.inverse.parametrisation import PARAMETRISATIONS
-from hks_jax.inverse.problem import Problem, pairs_for
+from hks_jax.inverse.problem import Problem, more_pairs, outcome_of, pairs_for, truncation_shows
 from hks_jax.inverse.unknowns import Nodal, nodes_of
 
 N = 10

@@ -315,7 +315,7 @@ def test_a_centre_of_zero_is_one_of_either_sign():
 def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "hks_jax.cli.picture.scalar_image", lambda ax, values, grid, **more: drawn.append((values, more))
+        "hks_jax.plot.signature.scalar_image", lambda ax, values, grid, **more: drawn.append((values, more))
     )
     field = hj.examples.torus_field((16, 16))
     np.savez(tmp_path / "t.npz", tensors=field.tensors, spacing=field.grid.spacing)
@@ -342,7 +342,7 @@ def test_a_fit_is_the_same_picture_too(monkeypatch, tmp_path):
         array, affine = stored(tensors()[:, :, 2:3] + 1e-4 * np.eye(3), RAS, (0, 1, 2), turned)
         images = values[:, ::-1] if turned[0] else values
         field = hj.TensorField(hj.Grid(SHAPE[:2], SPACING[:2]), array[:, :, 0, :2, :2])
-        observation = SimpleNamespace(times=None, signature="hks")
+        observation = SimpleNamespace(times=None, signature=SimpleNamespace(symbol="t"))
         fit = SimpleNamespace(field=field, hks=images + 0.1, problem=SimpleNamespace(observation=observation))
         with unchecked():
             figure = fit_panels(fit, images, [1.0], orientation=Orientation.of(affine, 2))

@@ -23,10 +23,10 @@ import hks_jax as hj
 from hks_jax.atomic import claim
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.job import Settings
-from hks_jax.cli.study import Study
-from hks_jax.cli.study_progress import StudyProgress
-from hks_jax.cli.study_times import Range, common_times, suitable_range
-from hks_jax.cli.subjects import read_subjects
+from hks_jax.cli.progress import StudyProgress
+from hks_jax.cli.study.batch import Range, common_times, suitable_range
+from hks_jax.cli.study.folder import Study
+from hks_jax.cli.study.subjects import read_subjects
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.components import component_of
 from hks_jax.io.masks import names_beside, read_names
@@ -221,7 +221,9 @@ LAMBDA1 = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "vo
 
 @pytest.mark.slow
 def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
     assert main(command(study, "whole", *LAMBDA1, "-q")) == 0
     write, count = Study.write_signature, []
 
@@ -261,7 +263,7 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
     np.testing.assert_allclose([float(r["mean"]) for r in rows[2:4]], np.asarray(values)[:, :4].mean((1, 2)), rtol=1e-7)
 
     # Again, nothing is computed; with other labels, only the tables.
-    monkeypatch.setattr("hks_jax.cli.study_tasks._compute", None)
+    monkeypatch.setattr("hks_jax.cli.study.tasks._compute", None)
     assert main(command(study, "whole", *LAMBDA1)) == 0
     assert "3 of 3 subjects are done already" in capsys.readouterr().err
     nib.save(nib.Nifti1Image(np.full(SHAPE, 3, np.int16), AFFINE), study / "atlas_dseg.nii.gz")
@@ -270,7 +272,9 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
 
 
 def test_a_study_is_a_bids_derivative(study, monkeypatch):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
     assert main([*command(study, "out", "--times", "3e3", "--only", "sub-01"), "-q"]) == 0
     out = study / "out"
     about = json.loads((out / "dataset_description.json").read_text())
@@ -294,7 +298,9 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
 
 
 def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
     lines = (study / "subjects.tsv").read_text().splitlines()
     bad = ["04\tabsent.nii.gz\tx", "05\tt1.nii.gz\tx\tz=99", "06\tt1.nii.gz\tx\tz=1\tmoved.nii.gz"]
     (study / "subjects.tsv").write_text("\n".join([lines[0] + "\tslice\tatlas", *bad, lines[3]]) + "\n")
@@ -310,7 +316,9 @@ def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
 
 
 def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, view: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, view: path.write_text("picture")
+    )
     image = nib.load(study / "t1.nii.gz")
     for number, matrix, scale in ((4, AFFINE, 1e6), (5, AFFINE, 1e6), (6, AFFINE @ np.diag([-1.0, 1, 1, 1]), 1.0)):
         other = nib.Nifti1Image(image.get_fdata() * scale, matrix)  # without the record that our files have
@@ -335,7 +343,9 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
 
 
 def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, view: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, view: path.write_text("picture")
+    )
     for i, scale in enumerate((1e3, 0.8e3, 1e6)):  # two in um2/ms, one in um2/s
         np.savez(study / f"n{i}.npz", tensors=tensors(scale), spacing=(2.0, 2.0, 3.0))
     rows = "".join(f"0{i}\tn{i}.npz\n" for i in range(3))
@@ -354,7 +364,7 @@ def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch
 
 def test_a_subject_is_done_again_when_its_sidecar_changes(study):
     rows = read_subjects(study / "subjects.tsv", build_parser().parse_args(command(study, "out")))
-    whole = Study(study / "out", Settings("inverse"), "scanner", {})
+    whole = Study(study / "out", Settings.of(metric="inverse"), "scanner", {})
     before = [whole.fingerprint(row) for row in rows]
     for name in ("t1", "sub-2_param-txx"):
         (study / f"{name}.json").write_text(json.dumps({"OrientationEncoding": {"Reference": "xyz"}}))
@@ -424,7 +434,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
         assert main([*command(study, "out", "--times", "auto:2", *more), "-q"]) == 0
         return json.loads((study / "out" / "study.json").read_text())["times"]
 
-    monkeypatch.setattr("hks_jax.cli.study_tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     first = times()
     with open(study / "subjects.tsv", "a") as stream:
@@ -480,7 +490,9 @@ def test_processes_share_a_study(study, capsys):
 
 
 def test_a_process_waits_for_what_another_computes(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
     other = study / "out" / "sub-02" / ".attempt"
     with contextlib.ExitStack() as stack:
         assert stack.enter_context(claim(other))
@@ -488,7 +500,7 @@ def test_a_process_waits_for_what_another_computes(study, monkeypatch, capsys):
         def end_of_the_other(seconds):
             stack.close()  # it did not come to an end: the subject is ours
 
-        monkeypatch.setattr("hks_jax.cli.study_tasks.time.sleep", end_of_the_other)
+        monkeypatch.setattr("hks_jax.cli.study.tasks.time.sleep", end_of_the_other)
         assert main(command(study, "out", *LAMBDA1)) == 0
     printed = capsys.readouterr().err
     assert printed.index(": sub-03") < printed.index("waiting for other processes, which compute 1 of the subjects")
@@ -497,7 +509,9 @@ def test_a_process_waits_for_what_another_computes(study, monkeypatch, capsys):
 
 
 def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
     write = Study.write_signature
 
     def write_and_lose(self, *rest):
@@ -579,7 +593,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
         assert main(command(study, out, "--times", "3e3", *more)) == 0
         return json.loads((study / out / "study.json").read_text())["settings"]["boundary"]
 
-    monkeypatch.setattr("hks_jax.cli.study_tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     assert boundary("new") == "mean"
     assert "boundary mean (of all subjects alike" in capsys.readouterr().err
@@ -592,11 +606,13 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
 
 @pytest.mark.slow
 def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit(study, monkeypatch):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
     other = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume", "--only", "02", "-q")
     assert main(command(study, "kept", "--times", "3e3", "--only", "02", "--save-pairs", "-q")) == 0
     assert main(command(study, "direct", *other)) == 0
-    monkeypatch.setattr("hks_jax.cli.study_tasks.compute_pairs", None)
+    monkeypatch.setattr("hks_jax.cli.study.tasks.compute_pairs", None)
     assert main(command(study, "kept", "--replace", *other)) == 0
     kept, direct = contents(study / "kept"), contents(study / "direct")
     assert len(kept.pop("sub-02/dwi/sub-02_model-tensor_param-hks_pairs.npz")) > 8 * 8 * 72
@@ -606,7 +622,9 @@ def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit
 
 
 def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(study, monkeypatch, capsys, rng):
-    monkeypatch.setattr("hks_jax.cli.study_tasks.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
     head, first, _, third = (study / "subjects.tsv").read_text().splitlines()
     (study / "subjects.tsv").write_text(f"{head}\tnoise\n{first}\tsecond.nii.gz\n{third}\t\n")
 
@@ -632,7 +650,7 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     assert main([*words, "--draws", "6"]) == 2
     assert "differs in --draws: 4, now 6" in capsys.readouterr().err
     scan_again()  # nothing is solved again but the noisy maps, of the one subject
-    monkeypatch.setattr("hks_jax.cli.study_tasks.compute_pairs", None)
+    monkeypatch.setattr("hks_jax.cli.study.tasks.compute_pairs", None)
     assert main(words) == 0
     assert "1 of 2 subjects are done already" in capsys.readouterr().err
     changed = {name for name, content in contents(study / "out").items() if before[name] != content}
@@ -646,7 +664,7 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
 def test_saved_pairs_give_the_signature_of_other_times_without_another_computation(
     tmp_path, monkeypatch, capsys, boundary
 ):
-    monkeypatch.setattr("hks_jax.cli.picture.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.plot.signature_panels", lambda result, path, **_: path.write_text("picture"))
     save_tensors(tmp_path / "t.nii.gz", volume())
     arguments = ["--metric", "inverse", "--slice", "z=1", "-k", "8", "--boundary", boundary, "-q"]
 
@@ -695,7 +713,7 @@ def test_pairs_of_another_pencil_are_refused(tmp_path):
 
 def test_a_folder_that_is_used_again_holds_one_result(tmp_path, monkeypatch, capsys):
     """What was made of an earlier signature goes with it; eigenpairs stay where they are those of the new one."""
-    monkeypatch.setattr("hks_jax.cli.picture.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.plot.signature_panels", lambda result, path, **_: path.write_text("picture"))
     save_tensors(tmp_path / "one.nii.gz", volume())
     save_tensors(tmp_path / "two.nii.gz", volume(1.5))
     np.savez(tmp_path / "three.npz", tensors=1e3 * tensors()[:, :, 1, :2, :2])
@@ -736,7 +754,7 @@ def test_pairs_that_were_kept_do_not_stand_beside_an_older_signature(tmp_path, m
     out = tmp_path / "out"
     out.mkdir()
     (out / "regions.tsv").write_text("not made of a signature")
-    monkeypatch.setattr("hks_jax.cli.picture.draw", lambda result, path, **_: path.write_text("picture"))
+    monkeypatch.setattr("hks_jax.plot.signature_panels", lambda result, path, **_: path.write_text("picture"))
     assert main(["hks", str(tmp_path / "one.nii.gz"), "-o", str(out), *options]) == 0
     monkeypatch.setattr("hks_jax.cli.hks.signature_of", None)
     assert main(["hks", str(tmp_path / "two.nii.gz"), "-o", str(out), *options, "--save-pairs"]) == 1

@@ -145,6 +145,8 @@ def test_damaged_images_of_mrtrix(tmp_path):
     (tmp_path / "t.mih").write_bytes(whole)
     with pytest.raises(ValueError, match=r"MRtrix makes one file of it: mrconvert .*t\.mih .*t\.mif"):
         hj.io.read_tensors(tmp_path / "t.mih")
+    with pytest.raises(ValueError, match=r"Camino's own files .* dt2nii -inputfile .*dt\.Bdouble -header"):
+        hj.io.read_tensors(tmp_path / "dt.Bdouble")
 
 
 def test_what_fsl_writes(scan, tmp_path):

@@ -13,8 +13,11 @@ import numpy as np
 
 from hks_jax import __version__
 from hks_jax.cache import keep_compiled
-from hks_jax.cli import batch, convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum, stats
-from hks_jax.cli.progress import OPTIONS, as_options
+from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum, stats
+from hks_jax.cli.options import SPELLED, add_command, as_options
+from hks_jax.cli.outputs import show
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.study import batch
 
 EPILOG = """\
 examples:
@@ -25,19 +28,13 @@ examples:
   hks-jax hks --help
 """
 
-SUBCOMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
+COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
+"""Each has its help (the docstring), its `OPTIONS`, and `run`, which returns what is to be printed."""
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 # What users can put right: wrong values, missing files, missing extras. All else is a failure of the computation.
-INPUT_ERRORS = (
-    ValueError,
-    FileNotFoundError,
-    IsADirectoryError,
-    NotADirectoryError,
-    PermissionError,
-    ImportError,
-)
+INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
 
 
 class Parser(argparse.ArgumentParser):
@@ -49,7 +46,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of all subcommands."""
+    """Return the parser of all commands."""
     parser = Parser(
         prog="hks-jax",
         description="Heat kernel signatures of tensor fields.",
@@ -58,14 +55,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"hks-jax {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for subcommand in SUBCOMMANDS:
-        sub = subcommand.add_parser(subparsers)
-        sub.add_argument("-q", "--quiet", action="store_true", help="show no progress")
-        sub.add_argument(
-            "--no-cache", action="store_true", help="neither use nor keep compiled programs in the user's cache folder"
-        )
-        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        sub.set_defaults(run=subcommand.run, prog=sub.prog)
+    for command in COMMANDS:
+        add_command(subparsers, command)
     return parser
 
 
@@ -86,18 +77,22 @@ def main(argv: Sequence[str] | None = None) -> int:
             Parser(prog=args.prog).error(f"unrecognized arguments: {' '.join(unknown)}")
     except SystemExit as stop:  # argparse has printed its message
         return int(stop.code or 0)
+    progress = Progress(args.quiet)
     try:
         if args.no_cache:
             jax.config.update("jax_enable_compilation_cache", False)
         else:
             keep_compiled()
-        args.run(args)
+        with progress.catching_warnings():
+            done = args.run(args, progress)
+        if done is not None:
+            show(args, done)
     except KeyboardInterrupt:
         return _fail(args, "interrupted", INTERRUPTED)
     except np.linalg.LinAlgError as error:
         return _fail(args, str(error), FAILED, error)
     except INPUT_ERRORS as error:
-        return _fail(args, as_options(str(error), [name for name in OPTIONS if name in args]), BAD_INPUT, error)
+        return _fail(args, as_options(str(error), [name for name in SPELLED if name in args]), BAD_INPUT, error)
     except Exception as error:
         return _fail(args, f"{type(error).__name__}: {error}", FAILED, error)
     return 0

@@ -1,29 +1,33 @@
-"""``hks-jax demo``: the heat kernel signature of a brain slice, or of a phantom where no brain is installed."""
+"""Compute and draw the signature of a brain slice.
+
+Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The brain comes with the PyPI wheel
+mdt==1.2.7 (install it with --no-deps), the fit needs "hks-jax[dti]"; without them, or with --phantom, an analytic
+phantom takes the brain's place.
+
+examples:
+  hks-jax demo
+  hks-jax demo --phantom -o phantom
+"""
 
 import argparse
 import importlib.util
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import Times
-from hks_jax.cli.inputs import add_command, add_json_argument, add_view_argument
-from hks_jax.cli.job import Settings, compute
-from hks_jax.cli.outputs import check_folder, show_files, write_outputs
+from hks_jax.cli.job import Settings, compute_pairs
+from hks_jax.cli.noise import signature_of
+from hks_jax.cli.options import Times
+from hks_jax.cli.outputs import Done, write_outputs
 from hks_jax.cli.progress import Progress
+from hks_jax.domain import examples
 from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
 
-DESCRIPTION = """\
-Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The brain comes with the PyPI wheel
-mdt==1.2.7 (install it with --no-deps), the fit needs "hks-jax[dti]"; without them, or with --phantom, an analytic
-phantom takes the brain's place.
-"""
-
-EPILOG = """\
-examples:
-  hks-jax demo
-  hks-jax demo --phantom -o phantom
+OPTIONS = """
+-o,--output OUT = demo  folder for the results
+--phantom  use the phantom in any case
+@view
 """
 
 B_MAX = 1000.0
@@ -37,75 +41,29 @@ N_PAIRS = 600
 PHANTOM_SHAPE = (72, 80)
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand's parser."""
-    parser = add_command(subparsers, "demo", "compute and draw the signature of a brain slice", DESCRIPTION, EPILOG)
-    add = parser.add_argument
-    add("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="folder for the results (demo)")
-    add("--phantom", action="store_true", help="use the phantom in any case")
-    add_view_argument(parser)
-    add_json_argument(parser)
-    return parser
+def run(args: argparse.Namespace, progress: Progress) -> Done:
+    """Run the command."""
+    from hks_jax.plot import number_text, signature_panels
 
-
-def run(args: argparse.Namespace) -> None:
-    """Run the subcommand."""
-    from hks_jax.cli.picture import draw
-    from hks_jax.plot import number_text
-
-    check_folder(args.output)
-    progress = Progress(args.quiet)
-    with progress.catching_warnings():
-        brain = None if args.phantom else _installed_brain(progress)
-        volume = phantom_volume() if brain is None else _brain_slice(brain, progress)
-        mean = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
-        lengths = min(volume.spacing) * SPREADS
-        times = lengths**2 / np.median(mean[volume.mask])
-        settings = Settings(
-            metric="inverse",
-            components="largest",
-            k=N_PAIRS,
-            times=Times(tuple(times.tolist()), 0),
-            normalisation="flat",
-        )
-        result = compute(volume, settings, progress)
-        titles = [
-            rf"$t$ = {number_text(t)} s  ($\sqrt{{Dt}}$ ≈ {length:.2g} mm)"
-            for t, length in zip(times, lengths, strict=True)
-        ]
-        files = write_outputs(
-            args.output,
-            result,
-            progress,
-            draw=lambda path: draw(
-                result,
-                path,
-                titles=titles,
-                first=("mean diffusivity, mm²/s", mean),
-                title=rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹: "
-                "1 is flat, above is positive curvature, that of the rim included",
-                view=args.view,
-            ),
-            image="" if brain is None else ".nii.gz",
-        )
-    if args.json:
-        show_files(files, args.quiet, as_json=True)
-    elif not args.quiet:
-        print(f"The picture is {next(file for file in files if file.suffix == '.png')}")
-
-
-def phantom_volume() -> TensorVolume:
-    """Return the phantom as a slice."""
-    from hks_jax.domain.examples import phantom
-
-    tensors, mask, spacing = phantom(PHANTOM_SHAPE)
-    return TensorVolume(
-        np.asarray(tensors),
-        tuple(np.broadcast_to(np.asarray(spacing, float), (2,)).tolist()),
-        (0.0, 0.0),
-        np.asarray(mask, bool),
-        source="phantom",
+    brain = None if args.phantom else _installed_brain(progress)
+    volume = _volume(brain, progress)
+    mean = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
+    lengths = min(volume.spacing) * SPREADS
+    times = lengths**2 / np.median(mean[volume.mask])
+    chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
+    settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
+    result = signature_of(args, volume, *compute_pairs(volume, settings, progress), progress)
+    spread = (rf"($\sqrt{{Dt}}$ ≈ {length:.2g} mm)" for length in lengths)
+    titles = [f"$t$ = {number_text(t)} s  {text}" for t, text in zip(times, spread, strict=True)]
+    title = (
+        rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹: 1 is flat, above is "
+        "positive curvature, that of the rim included"
     )
+    first = "mean diffusivity, mm²/s", mean
+    drawing = partial(signature_panels, result, titles=titles, first=first, title=title, view=args.view)
+    done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")
+    picture = next(file for file in done.files if file.suffix == ".png")
+    return done._replace(text=f"The picture is {picture}")
 
 
 def _installed_brain(progress: Progress) -> ExampleBrain | None:
@@ -118,9 +76,12 @@ def _installed_brain(progress: Progress) -> ExampleBrain | None:
     return brain
 
 
-def _brain_slice(brain: ExampleBrain, progress: Progress) -> TensorVolume:
+def _volume(brain: ExampleBrain | None, progress: Progress) -> TensorVolume:
+    """Return a slice of the brain, or the phantom."""
+    if brain is None:
+        tensors, mask, spacing = examples.phantom(PHANTOM_SHAPE)
+        h: tuple[float, ...] = tuple(np.broadcast_to(np.asarray(spacing, float), (2,)).tolist())
+        return TensorVolume(np.asarray(tensors), h, (0.0, 0.0), np.asarray(mask, bool), source="phantom")
     with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
-        volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX)
-        plane = volume.slice("z", 0)
-        assert plane.mask is not None
-        return plane.with_mask(erode(plane.mask, RIM))
+        plane = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
+        return plane.with_mask(erode(plane.inside, RIM))

@@ -1,37 +1,5 @@
-"""``hks-jax hks FILE -o OUT``: the heat kernel signature of a tensor field in a file."""
+"""Compute the signature of a tensor field in a file.
 
-import argparse
-from collections.abc import Callable
-from dataclasses import fields
-from functools import partial
-from pathlib import Path
-from typing import Any
-
-import numpy as np
-
-from hks_jax.cli import saved_pairs
-from hks_jax.cli.arguments import Times, parse_times, parse_voxel
-from hks_jax.cli.inputs import (
-    add_clean_argument,
-    add_command,
-    add_eigenpair_arguments,
-    add_json_argument,
-    add_tensor_arguments,
-    add_view_argument,
-    read_volume,
-    require_metric,
-    require_spectral,
-)
-from hks_jax.cli.job import Settings, compute_on_mesh, compute_pairs, signature_of
-from hks_jax.cli.noise import error_bars, noise_of, with_error_bars
-from hks_jax.cli.outputs import PAIRS, check_folder, of_earlier, show_files, write_outputs
-from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import image_suffix
-from hks_jax.domain.tensor_checks import MetricChoice
-from hks_jax.io import TensorVolume
-from hks_jax.io.mesh import is_mesh
-
-DESCRIPTION = """\
 Compute the heat kernel signature of a field of diffusion tensors. FILE holds one of
 
   tensors                    of a volume, which is computed whole unless --slice cuts it; pass --metric
@@ -41,9 +9,7 @@ Compute the heat kernel signature of a field of diffusion tensors. FILE holds on
   eigenpairs                 which --save-pairs has kept: for other times, or another normalisation or method
 
 The folder OUT gets hks.npz, an image or a mesh in FILE's format (times along the fourth axis), hks.png and report.json.
-"""
 
-EPILOG = """\
 examples:
   hks-jax hks tensor.nii.gz -o out --metric inverse
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 100 --times auto:8
@@ -53,146 +19,85 @@ examples:
   hks-jax hks dwi.nii.gz --bval dwi.bval --bvec dwi.bvec -o out --slice z=10 --metric inverse --components largest
 """
 
+import argparse
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand's parser."""
-    parser = add_command(
-        subparsers, "hks", "compute the signature of a tensor field in a file", DESCRIPTION, EPILOG, "FILE -o OUT"
-    )
-    add = parser.add_argument
-    add_tensor_arguments(parser)
-    add_eigenpair_arguments(parser, "mean where the domain has a mask, else neumann; of a mesh neumann")
-    add(
-        "--through",
-        type=parse_voxel,
-        metavar="I,J,K",
-        help="the voxel that the slices in the picture of a volume run through (default: one in the middle)",
-    )
-    add_clean_argument(parser)
-    add(
-        "--tensors",
-        type=Path,
-        metavar="FILE",
-        help="of a mesh that lies in a volume, such as a cortex: the tensors, sampled at its vertices in the "
-        "coordinates of the scanner (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation); "
-        "options on voxels and numbers are about this file",
-    )
-    add_signature_arguments(parser)
-    add_noise_arguments(parser)
-    add_view_argument(parser)
-    add(
-        "--save-pairs",
-        action="store_true",
-        help="keep the eigenpairs, in OUT as pairs.npz: 'hks-jax hks OUT/pairs.npz --times …' solves nothing again",
-    )
-    add_json_argument(parser)
-    return parser
+import numpy as np
+from jaxtyping import Float
 
+from hks_jax import SurfaceMesh, TetMesh, assemble
+from hks_jax.cli import pairs as saved_pairs
+from hks_jax.cli.info import describe_mesh
+from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
+from hks_jax.cli.noise import require_spectral, signature_of
+from hks_jax.cli.options import READING, SOLVING, options_in, parse_times, refuse
+from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
+from hks_jax.fem.assembly import MESH_BOUNDARIES
+from hks_jax.io import TensorVolume, read_mesh, read_mesh_arrays, sample_tensors
+from hks_jax.io.mesh import WRITTEN, is_mesh
+from hks_jax.io.repair import require_valid
+from hks_jax.io.result import Result
+from hks_jax.io.tensor_order import unpack
 
-def add_signature_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that say which signature is computed of the eigenpairs."""
-    add = parser.add_argument_group("the signature").add_argument
-    add(
-        "--times",
-        nargs="+",
-        metavar="T",
-        help="positive numbers, in s for --metric inverse, or auto, or auto:N for N times that suit the eigenvalues "
-        "(default auto:6); 'hks-jax info FILE' says which suit a file",
-    )
-    add(
-        "--normalisation",
-        choices=("raw", "heat-trace", "volume", "flat"),
-        default="raw",
-        help="of the signature (default raw)",
-    )
-    add(
-        "--method",
-        choices=("spectral", "spectrum-free", "auto"),
-        default="spectral",
-        help="sum over eigenpairs (default), do without them, or choose by t, k and the spacing: auto reports which "
-        "times came from where and how the two agree",
-    )
+OPTIONS = f"""
+@file @metric {READING} @output {SOLVING}
+--through I,J,K  the voxel that the slices in the picture of a volume run through (default: one in the middle)
+@clean
+--tensors FILE
+    of a mesh that lies in a volume, such as a cortex: the tensors, sampled at its vertices in the coordinates of the
+    scanner (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation); options on voxels and numbers
+    are about this file
+@signature @noise @view
+--save-pairs  keep the eigenpairs, in OUT as pairs.npz: 'hks-jax hks OUT/pairs.npz --times …' solves nothing again
+"""
+
+_OF_TENSORS = ("metric", "order", "interpolation")
+"""Options that are about the tensors at a mesh's vertices."""
+_NO_NOISE = "it is for tensors on a grid; leave it out for meshes and for eigenpairs"
 
 
-def add_noise_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that ask for error bars."""
-    add = parser.add_argument_group("error bars").add_argument
-    add(
-        "--noise",
-        metavar="N",
-        help="of the tensors, for error bars: a number, relative to the mean diffusivity, such as 0.1; residuals, what "
-        "the fit to diffusion-weighted images leaves; a second FILE of tensors, from another scan of the subject; or "
-        "roughness, what neighbours differ by. Adds deviation and bias to the .npz, signal to noise at each t to the "
-        "report, the column error to tables of regions, and fades in the picture what noise could make; automatic "
-        "times of one subject begin where signal is",
-    )
-    add("--draws", type=int, default=16, metavar="N", help="noisy maps that error bars are made of (default 16)")
-
-
-def settings_of(args: argparse.Namespace, times: Times, metric: MetricChoice | None) -> Settings:
-    """Return what the arguments ask for."""
-
-    given = {field.name: getattr(args, field.name) for field in fields(Settings) if field.name in args}
-    return Settings(**given | {"metric": metric, "times": times})
-
-
-def run(args: argparse.Namespace) -> None:
-    """Run the subcommand."""
+def run(args: argparse.Namespace, progress: Progress) -> Done:
+    """Run the command."""
     times = parse_times(args.times)
+    if is_mesh(args.file):
+        return _on_mesh(args, Settings.of(args, metric=args.metric, times=times), progress)
+    refuse(args, ("clean",), "it is for meshes; leave it out for tensors on a grid, and see --repair")
+    refuse(args, ("tensors",), "it is for a mesh that lies in a volume; leave it out for the volume itself")
+    return _on_grid(args, Settings.of(args, times=times), progress)
 
-    on_mesh, saved = is_mesh(args.file), saved_pairs.is_saved_pairs(args.file)
-    if args.clean and not on_mesh:
-        raise ValueError("--clean: it is for meshes; leave it out for tensors on a grid, and see --repair")
-    if args.noise is not None and (on_mesh or saved):
-        raise ValueError("--noise: it is for tensors on a grid; leave it out for meshes and for eigenpairs")
-    if args.tensors and not on_mesh:
-        raise ValueError("--tensors: it is for a mesh that lies in a volume; leave it out for the volume itself")
+
+def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
     require_spectral(args)
-    if not (on_mesh or saved):
-        require_metric(args)
-    from hks_jax.cli import mesh as meshes
-    from hks_jax.cli.picture import draw, draw_volume
-
-    if on_mesh:
-        meshes.check_options(args)
-    if saved:
+    if saved := saved_pairs.is_saved_pairs(args.file):
+        refuse(args, ("noise",), _NO_NOISE)
         saved_pairs.check_options(args)
-    check_folder(args.output)
-    settings = settings_of(args, times, args.metric if on_mesh else args.metric or "tensor")
-    progress = Progress(args.quiet)
-    with progress.catching_warnings():
-        draw_to: Callable[[Path], None]
-        if on_mesh:
-            with progress.stage("reading", str(args.file)):
-                mesh = meshes.read_domain(args, progress)
-            result = compute_on_mesh(mesh, meshes.describe_mesh(args.file, mesh), settings, progress)
-            image, draw_to = meshes.mesh_suffix(args.file, mesh), partial(meshes.draw, result)
-        else:
-            if saved:
-                volume, field, pairs, settings, image = saved_pairs.read_pairs(args.file, settings, progress)
-            else:
-                with progress.stage("reading", str(args.file)):
-                    volume, image = read_volume(args, progress), image_suffix(args.file)
-            if args.through is not None:
-                _check_voxel(args.through, volume)
-            if not saved:
-                field, pairs, settings = compute_pairs(volume, settings, progress)
-            if args.save_pairs:  # at once: what comes after may fail, or be interrupted
-                with progress.stage("writing", str(args.output / PAIRS)):
-                    for file in of_earlier(args.output, np.asarray(pairs.eigenvalues), progress):
-                        file.unlink(missing_ok=True)
-                    domain = volume.with_mask(field.grid.mask)
-                    saved_pairs.write_pairs(args.output / PAIRS, domain, pairs, settings, image, progress.warnings)
-            if args.noise is not None:
-                noise = noise_of(args, volume, field.grid, progress)
-                bars, settings = error_bars(volume, noise, pairs, settings, args.draws, progress)
-            result = signature_of(volume, field, pairs, settings, progress)
-            if args.noise is not None:
-                result = with_error_bars(result, bars, args.noise)
-            flat = volume.dimension == 2
-            draw_to = partial(draw if flat else partial(draw_volume, through=args.through), result, view=args.view)
-        files = write_outputs(args.output, result, progress, draw=draw_to, image=image)
-    show_files(files, args.quiet, args.json)
+    else:
+        require_metric(args)
+    from hks_jax.plot import signature_panels
+
+    if saved:
+        volume, field, pairs, settings, image = saved_pairs.read_pairs(args.file, settings, progress)
+    else:
+        volume, image = read_volume(args, progress), image_suffix(args.file)
+    if args.through is not None:
+        _check_voxel(args.through, volume)
+    if not saved:
+        field, pairs, settings = compute_pairs(volume, settings, progress)
+    if args.save_pairs:  # at once: what comes after may fail, or be interrupted
+        with progress.stage("writing", str(args.output / PAIRS)):
+            for file in of_earlier(args.output, np.asarray(pairs.eigenvalues), progress):
+                file.unlink(missing_ok=True)
+            domain = volume.with_mask(field.grid.mask)
+            saved_pairs.write_pairs(args.output / PAIRS, domain, pairs, settings, image, progress.warnings)
+    result = signature_of(args, volume, field, pairs, settings, progress)
+    drawing = partial(signature_panels, result, view=args.view, through=args.through)
+    return write_outputs(args.output, result, progress, drawing, image)
 
 
 def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
@@ -202,6 +107,89 @@ def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
         raise ValueError(f"--through: got {text}; only the picture of a volume has slices, not that of one slice")
     if not all(i < n for i, n in zip(voxel, volume.shape, strict=True)):
         raise ValueError(f"--through: got {text}; expected a voxel of the volume, whose shape is {volume.shape}")
-    if volume.mask is not None and not volume.mask[voxel]:
-        middle = ",".join(map(str, np.argwhere(volume.mask)[volume.mask.sum() // 2]))
+    if not volume.inside[voxel]:
+        middle = ",".join(map(str, np.argwhere(volume.inside)[volume.inside.sum() // 2]))
         raise ValueError(f"--through: voxel {text} is outside the mask; {middle}, for one, is inside")
+
+
+def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
+    _check_mesh_options(args)
+    with progress.stage("reading", str(args.file)):
+        mesh = _read_domain(args, progress)
+    boundary = settings.boundary or "neumann"
+    settings = replace(settings, boundary=boundary)
+    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
+        pencil = assemble(mesh, boundary)
+    pairs = solve(pencil, settings, progress)
+    described = {"source": str(args.file), **describe_mesh(args.file, mesh)}
+    result = result_of(mesh, described, pairs, settings, progress)
+    image = args.file.suffix.lower()
+    if image not in WRITTEN or (image == ".ply" and isinstance(mesh, TetMesh)):  # no room for values at the vertices
+        image = ".vtu"
+    return write_outputs(args.output, result, progress, partial(_draw_mesh, result), image)
+
+
+def _check_mesh_options(args: argparse.Namespace) -> None:
+    """Raise ValueError for options that are for grids alone, and for tensors of which the metric is open."""
+    refuse(args, ("noise",), _NO_NOISE)
+    if args.tensors and args.array:
+        raise ValueError("--tensors, --array: got both; tensors come from a volume, or from the mesh's own vertices")
+    of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
+    if not args.tensors:  # they are about the volume in which the mesh lies
+        of_grids += [o.name for o in options_in(READING) if o.name not in (*_OF_TENSORS, "array")]
+    refuse(args, of_grids, "it is for tensors on a grid; leave it out for a mesh")
+    if args.boundary not in (None, *MESH_BOUNDARIES):
+        raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes one of {', '.join(MESH_BOUNDARIES)}")
+    if not (args.array or args.tensors):
+        why = "a mesh has the metric of space unless --array names tensors at its vertices, or --tensors a volume"
+        refuse(args, _OF_TENSORS, f"{why} of them; pass both, or neither")
+    elif args.metric is None:
+        raise ValueError("--metric: choose what the tensors at the vertices stand for: inverse, tensor or adjugate")
+
+
+def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:
+    """Read the mesh in the precision asked for, with the metric of the tensors at its vertices if asked to."""
+    use_dtype(args.dtype)
+    mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))
+    vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
+    kind: Any = type(mesh)
+    if args.tensors:
+        volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
+        require_valid(volume, "--repair")
+        tensors = sample_tensors(volume, mesh.vertices).astype(args.dtype)
+    elif args.array:
+        tensors = _tensors(args).astype(args.dtype)
+    else:
+        return kind(vertices, cells)
+    return kind.from_tensors(vertices, cells, tensors, args.metric, at="vertices", interpolation=args.interpolation)
+
+
+def _tensors(args: argparse.Namespace) -> Float[np.ndarray, "V 3 3"]:
+    arrays = read_mesh_arrays(args.file, clean=args.clean)
+    if args.array not in arrays:
+        raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {', '.join(arrays) or 'none'}")
+    values = arrays[args.array].reshape(len(arrays[args.array]), -1)
+    if values.shape[1] == 6 and args.order is not None:
+        return unpack(values, args.order)
+    if values.shape[1] != 9 or args.order is not None:
+        raise ValueError(
+            f"--array: {args.array!r} has {values.shape[1]} components; expected nine, or six with their --order"
+        )
+    return values.reshape(-1, 3, 3)
+
+
+def _draw_mesh(result: Result, path: Path) -> None:
+    """Draw the signature on the surface, or on the solid's boundary, once for each time with its own colours."""
+    from hks_jax.plot import new_figure, number_text, save_figure, surface
+
+    mesh, n = result.place, len(result.times)
+    assert isinstance(mesh, SurfaceMesh | TetMesh)
+    columns = min(n, 4)
+    rows = math.ceil(n / columns)
+    figure = new_figure(3.4 * columns, 3.0 * rows)
+    for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
+        ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
+        mappable = surface(ax, mesh, values)
+        ax.set_title(f"t = {number_text(float(time))}", fontsize="medium")
+        figure.colorbar(mappable, ax=ax, shrink=0.6)
+    save_figure(figure, path)

@@ -1,4 +1,14 @@
-"""``hks-jax info FILE``: what is in a file of tensors, or a mesh, and which k and t would suit it."""
+"""Say what is in a file, and which k and t would suit it.
+
+Say what is in a file of tensors: shape, order of components and how it was determined, frame, units, mask and its
+pieces, eigenvalues, tensors that are not positive definite, and the k and t that would suit; and ask where frame or
+unit seem wrong. Of a mesh of triangles or tetrahedra ({meshes}, or a surface of
+FreeSurfer's): size, boundary, pieces, and the same.
+
+examples:
+  hks-jax info tensor.nii.gz --mask mask.nii.gz
+  hks-jax info dti.nrrd --slice z=14 --json
+"""
 
 import argparse
 import json
@@ -8,61 +18,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 
-from hks_jax.cli.arguments import DEFAULT_K, LAST, MEAN, RESOLVED, default_boundary, n_problems
-from hks_jax.cli.inputs import add_clean_argument, add_command
-from hks_jax.cli.progress import READING, Progress, as_options
-from hks_jax.cli.reading import add_arguments, read
+from hks_jax.cli.options import READING, as_options
+from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import read
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import MANY
-from hks_jax.eigen.weyl import weyl, weyl_number
-from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
-from hks_jax.io.mesh import READ as MESHES
 from hks_jax.io.mesh import is_mesh
 from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
 from hks_jax.io.volume import digest
+from hks_jax.signatures.suitable import suitable, suitable_times
 
-DESCRIPTION = f"""\
-Say what is in a file of tensors: shape, order of components and how it was determined, frame, units, mask and its
-pieces, eigenvalues, tensors that are not positive definite, and the k and t that would suit; and ask where frame or
-unit seem wrong. Of a mesh of triangles or
-tetrahedra ({", ".join(MESHES)}, or a surface of FreeSurfer's): size, boundary, pieces, and the same.
-"""
-
-EPILOG = """\
-examples:
-  hks-jax info tensor.nii.gz --mask mask.nii.gz
-  hks-jax info dti.nrrd --slice z=14 --json
-"""
-
-COARSE = 6.0
-"""t/h² from which the grid's spacing h biases it by at most 1 %."""
+OPTIONS = f"@file {READING} @clean"
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand's parser."""
-    parser = add_command(
-        subparsers, "info", "say what is in a file, and which k and t would suit it", DESCRIPTION, EPILOG, "FILE"
-    )
-    add_arguments(parser)
-    add_clean_argument(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    return parser
-
-
-def run(args: argparse.Namespace) -> None:
-    """Run the subcommand."""
-    progress, questions = Progress(quiet=True), list[str]()
-    with progress.catching_warnings():
-        if is_mesh(args.file):
-            description = describe_mesh(args.file, args.clean)
-        else:
-            description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
+def run(args: argparse.Namespace, progress: Progress) -> None:
+    """Run the command."""
+    progress.quiet, questions = True, list[str]()
+    if is_mesh(args.file):
+        description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
+    else:
+        description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
     if args.json:
         print(json.dumps(description, indent=2, ensure_ascii=False))
     else:
@@ -80,14 +61,9 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "sha256": volume.digest,
         "format": "".join(path.suffixes[-2:] if path.suffix == ".gz" else path.suffixes[-1:]),
         "dtype": volume.tensors.dtype.name,
-        "shape": list(volume.shape),
-        "spacing": list(volume.spacing),
-        "length_unit": volume.length_unit,
-        "unit": volume.unit,
-        "order": volume.order,
-        "frame": volume.frame,
+        **{name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit", "order", "frame")},
         "affine": None if volume.affine is None else volume.affine.tolist(),
-        "notes": list(volume.notes),
+        "notes": volume.notes,
         "inside": int(inside.sum()),
         "masked": volume.mask is not None,
         "components": count,
@@ -99,88 +75,37 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
     }
     wrong = volume.invalid_by_order
     if bad.any() and wrong is not None and wrong.fewer:
-        description["invalid_by_order"] = wrong.counts
-        description["question"] = wrong.question
+        description |= {"invalid_by_order": wrong.counts, "question": wrong.question}
     if good.any():
         tensors = volume.tensors[good].astype(np.float64)
         values = np.linalg.eigvalsh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)))
-        description["eigenvalues"] = {"least": float(values.min()), "median": float(np.median(values))}
-        description["eigenvalues"]["largest"] = float(values.max())
+        ends = {"least": values.min(), "median": np.median(values), "largest": values.max()}
+        description["eigenvalues"] = {name: float(value) for name, value in ends.items()}
         description["median_mean_diffusivity"] = float(np.median(values.mean(axis=-1)))
     # Of a few valid ones among indefinite tensors nothing can be told that suits.
     if count and good.any() and bad.sum() <= MANY * inside.sum():
         metrics = {"inverse": np.linalg.inv(tensors), "tensor": tensors}
-        problems, share = n_problems(boundary, volume.dimension), inside.sum() / good.sum()
-        steps = _steps(labels)
-        description["suits"] = {
-            name: _suits(g, np.array(volume.spacing), steps, share, problems) for name, g in metrics.items()
-        }
+        description["suits"] = {name: suitable(g, volume.spacing, inside, boundary) for name, g in metrics.items()}
     return description
 
 
-def describe_mesh(path: Path, clean: bool = False) -> dict[str, Any]:
-    """Return what there is to say of a mesh."""
-    mesh = read_mesh(path, clean=clean)
+def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
+    """Return what there is to say of a mesh in space."""
     vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
-    words = WORDS[d]
     measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
     sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
     edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     return {
-        "file": str(path),
         "sha256": digest(path),
         "format": path.suffix,
         "vertices": len(vertices),
-        words.simplices: len(cells),
+        WORDS[d].simplices: len(cells),
         "boundary_vertices": int(mesh.triangulation.boundary_vertices.sum()),
         "components": mesh.triangulation.labels[1],
-        words.measure: measure,
+        WORDS[d].measure: measure,
         "median_edge": edge,
-        "suits": {{2: "surface", 3: "solid"}[d]: _times(d, measure, edge**2, size, len(vertices))},
-    }
-
-
-def _steps(labels: Int[np.ndarray, "*shape"] | Bool[np.ndarray, "*shape"]) -> Int[np.ndarray, "components d"]:
-    """Return how many steps from voxel to voxel each component is long, per axis."""
-    boxes = ndimage.find_objects(labels.astype(int))
-    return np.array([[part.stop - part.start - 1 for part in box] for box in boxes])
-
-
-def _suits(
-    metric: Float[np.ndarray, "n d d"],
-    spacing: Float[np.ndarray, " d"],
-    steps: Int[np.ndarray, "components d"],
-    share: float,
-    problems: int,
-) -> dict[str, float]:
-    """Return the times and k for the metric at the valid voxels.
-
-    Args:
-        metric: at the valid voxels.
-        spacing: of the voxels.
-        steps: how long each component is.
-        share: how many times as large as the valid voxels the domain is.
-        problems: how many eigenproblems share the eigenpairs.
-    """
-    d = len(spacing)
-    along = np.einsum("naa->na", metric) * spacing**2  # squared distances of neighbours, per axis
-    volume = float(np.sqrt(np.linalg.det(metric)).sum() * np.prod(spacing) * share)
-    size = float(np.sqrt((np.median(along, axis=0) * steps**2).max()))
-    return _times(d, volume, float(np.median(along.max(axis=1))), size, round(len(metric) * share), problems)
-
-
-def _times(d: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1) -> dict[str, float]:
-    """Return the least time that the spacing allows, what k it takes, what the default k allows, and the largest."""
-    least, unknowns = COARSE * width2, problems * nodes
-    k = max(1, min(DEFAULT_K[d], unknowns // 4))
-    return {
-        "least_time": least,
-        "k_for_least_time": math.ceil(weyl_number(RESOLVED[d] / least, problems * volume, d)),
-        "k": k,
-        "unknowns": unknowns,
-        "least_time_of_k": RESOLVED[d] / weyl(k, problems * volume, d),
-        "largest_time": LAST * (size / np.pi) ** 2,  # λ₁ is that of an interval of this length
+        "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices))},
     }
 
 
@@ -204,11 +129,11 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"tensors         {by_axis(description['shape'])}, {description['dtype']}, {placed}",
             f"spacing         {by_axis(description['spacing'])}{length}",
             f"order, frame    {description['order']}, {description['frame']} axes",
-            *(f"                {as_options(note, READING)}" for note in description["notes"]),
+            *(f"                {as_options(note)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",
             f"components      {description['components']}{f' ({sizes} nodes)' if sizes else ': nothing to compute on'}",
             f"boundary        {description['boundary']} unless chosen"
-            f"{', whose two problems share the k pairs' * (description['boundary'] == MEAN)}",
+            f"{', whose two problems share the k pairs' * (description['boundary'] == 'mean')}",
         ]
         if description["without_element"]:
             lines.append(
@@ -217,7 +142,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
             )
         lines.append(f"invalid         {bad} tensors are not positive definite")
         if "question" in description:
-            lines.append(f"                {as_options(description['question'], READING)}")
+            lines.append(f"                {as_options(description['question'])}")
         elif bad > MANY * description["inside"]:
             lines.append("                so many are no noise: of tensors indefinite by nature see --positive")
         elif bad:
@@ -234,14 +159,13 @@ def _lines(description: dict[str, Any]) -> list[str]:
         ]
     lines += [f"question        {question}" for question in description.get("questions", ())]
     for name, s in description.get("suits", {}).items():
-        takes = f"takes k ≈ {s['k_for_least_time']}"
-        if s["k_for_least_time"] > s["unknowns"] / 4:
-            takes = "takes more pairs than are worth computing: see --method auto"
+        worth = s["k_for_least_time"] <= s["unknowns"] / 4
+        takes = f"k ≈ {s['k_for_least_time']}" if worth else "more pairs than are worth computing: see --method auto"
         of = time if name == "inverse" else ""
-        lines += [
-            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} by the spacing (to 1 %; {takes}); "
+        lines.append(
+            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} by the spacing (to 1 %; takes {takes}); "
             f"t ≥ {s['least_time_of_k']:.3g}{of} by k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the size"
-        ]
+        )
     return lines
 
 

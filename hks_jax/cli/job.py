@@ -1,30 +1,38 @@
 """The main job: from a tensor volume or a mesh to its heat kernel signature, and what is known about it."""
 
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, NamedTuple
+import argparse
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.cli.arguments import DEFAULT_K, DEFAULT_TIMES, LAST, NATURAL, Times, default_boundary, unreached_sides
+from hks_jax import (
+    Eigenpairs,
+    Grid,
+    MirrorPencil,
+    Pencil,
+    TensorField,
+    assemble,
+    default_times,
+    eigenpairs,
+    hks,
+    hks_auto,
+    truncation,
+    truncation_map,
+)
+from hks_jax.cli.options import DEFAULT_TIMES, SOLVING, Times, as_options, defaults
 from hks_jax.cli.progress import Progress
-from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.automatic import choose_solver
-from hks_jax.eigen.driver import eigenpairs
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.assembly import assemble
-from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.pencil import AnyPencil
+from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
+from hks_jax.io import TensorVolume
+from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
-from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.hks import HKSMethod, Normalisation, hks, hks_auto
-from hks_jax.signatures.times import default_times, positive_range
-from hks_jax.signatures.truncation import truncation, truncation_map
-from hks_jax.uncertainty import Uncertainty
+from hks_jax.signatures.hks import HKSMethod, Normalisation
+from hks_jax.signatures.suitable import SHOWN, default_k
 
 
 class ComputationError(RuntimeError):
@@ -33,153 +41,88 @@ class ComputationError(RuntimeError):
 
 @dataclass(frozen=True)
 class Settings:
-    """What to compute; see ``hks-jax hks --help``.
+    """What to compute: the options of the same names.
 
     Only on meshes, which have one of their own, is there no metric. Without a boundary the domain has the one that
-    suits it (`hks_jax.cli.arguments.default_boundary`), and a mesh the natural one.
+    suits it (`default_boundary`), and a mesh the natural one.
     """
 
     metric: MetricChoice | None
-    interpolation: Interpolation = "linear"
-    k: int | None = None
-    boundary: BoundarySpec | None = None
-    times: Times = DEFAULT_TIMES
-    components: Literal["raise", "largest", "all"] = "raise"
-    solver: str = "auto"
-    normalisation: Normalisation = "raw"
-    method: HKSMethod = "spectral"
-    dtype: Literal["float32", "float64"] = "float64"
+    interpolation: Interpolation
+    k: int | None
+    boundary: BoundarySpec | None
+    times: Times
+    components: Literal["raise", "largest", "all"]
+    solver: str
+    normalisation: Normalisation
+    method: HKSMethod
+    dtype: Literal["float32", "float64"]
 
-
-class Bars(NamedTuple):
-    """Error bars of a signature, the noise (n_draws, n_times, *shape) of which they are made, and the interior.
-
-    The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
-    few such nodes; else it is all of the domain.
-    """
-
-    uncertainty: Uncertainty
-    maps: np.ndarray
-    interior: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """The signature on the volume whose mask is the domain, or on a mesh; its report; its error bars, if asked for."""
-
-    volume: TensorVolume | SimplicialMesh
-    times: np.ndarray
-    values: np.ndarray
-    eigenvalues: np.ndarray
-    report: dict[str, Any]
-    bars: Bars | None = None
+    @classmethod
+    def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
+        """Return what the arguments ask for, or what is usual, but for the settings that are given."""
+        chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
+        given = {"metric": chosen["metric"] or "tensor", "times": DEFAULT_TIMES, **given}
+        return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
 
 def use_dtype(dtype: str) -> None:
     """Let JAX compute in float64 if asked to: the application's choice, made before any array is."""
     if dtype == "float64":
-        import jax
-
         jax.config.update("jax_enable_x64", True)
 
 
-def compute(volume: TensorVolume, settings: Settings, progress: Progress) -> Result:
-    """Compute the signature of a volume or slice.
-
-    Raises:
-        ValueError: tensors, mask or settings that cannot be computed with.
-        ComputationError: eigenpairs that did not converge.
-    """
-    return signature_of(volume, *compute_pairs(volume, settings, progress), progress)
-
-
-def signature_of(
-    volume: TensorVolume, field: TensorField, pairs: Eigenpairs, settings: Settings, progress: Progress
-) -> Result:
-    """Compute the signature of a volume or slice whose metric and eigenpairs are known.
-
-    Raises:
-        ValueError: settings that cannot be computed with.
-    """
-    mask = field.grid.mask
-    return _result(volume.with_mask(mask), describe_input(volume, mask), pairs, settings, progress)
-
-
-def compute_on_mesh(mesh: SimplicialMesh, described: dict[str, Any], settings: Settings, progress: Progress) -> Result:
-    """Compute the signature on a mesh, whose metric it has already; `described` is what the report says of it.
-
-    Raises:
-        ValueError: settings that cannot be computed with.
-        ComputationError: eigenpairs that did not converge.
-    """
-    boundary = NATURAL if settings.boundary is None else settings.boundary
-    settings = replace(settings, boundary=boundary)
-    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
-        pencil = assemble(mesh, boundary)
-    pairs = _solve(pencil, settings, progress)
-    return _result(mesh, described, pairs, settings, progress)
-
-
-def _result(
+def result_of(
     place: TensorVolume | SimplicialMesh,
     described: dict[str, Any],
     pairs: Eigenpairs,
     settings: Settings,
     progress: Progress,
 ) -> Result:
-    """Return the signature, and its report."""
+    """Compute the signature on a volume, whose mask is the domain, or a mesh, of which the report says `described`."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
         values, origin = _signature(pairs, times, settings)
     report = {"input": described, **_report(settings, pairs, times), **origin}
-    return Result(place, np.asarray(times), values, np.asarray(pairs.eigenvalues), report)
+    return Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report)
 
 
 def automatic_times(pairs: Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n times, log-spaced from the first of `default_times` to where all but the constant is 1 %."""
-    first, last = float(default_times(pairs, 1)[0]), LAST / float(positive_range(pairs)[0])
-    return tuple(np.geomspace(first, max(first, last), n).tolist())
+    """Return n of `default_times`, up to where all but the constant has decayed to `SHOWN`."""
+    return tuple(np.asarray(default_times(pairs, n, SHOWN), np.float64).tolist())
 
 
-def field_of(
-    volume: TensorVolume, grid: Grid, metric: MetricChoice, dtype: str, interpolation: Interpolation = "linear"
-) -> TensorField:
-    """Return the metric of a volume or slice on its grid, in the precision asked for.
-
-    Raises:
-        ValueError: tensors that make no metric.
-    """
-    use_dtype(dtype)
-    tensors = volume.tensors.astype(dtype)
-    return TensorField.from_diffusion(grid, tensors, metric, interpolation=interpolation, name="tensors")
+def field_of(volume: TensorVolume, grid: Grid, settings: Settings) -> TensorField:
+    """Return the metric of a volume or slice on its grid, in the precision asked for."""
+    use_dtype(settings.dtype)
+    assert settings.metric is not None
+    tensors = volume.tensors.astype(settings.dtype)
+    return TensorField.from_diffusion(
+        grid, tensors, settings.metric, interpolation=settings.interpolation, name="tensors"
+    )
 
 
 def compute_pairs(
     volume: TensorVolume, settings: Settings, progress: Progress
 ) -> tuple[TensorField, Eigenpairs, Settings]:
-    """Compute the eigenpairs of a volume or slice; return its metric, them, and the settings with their boundary.
-
-    Raises:
-        ValueError: tensors, mask or settings that cannot be computed with.
-        ComputationError: eigenpairs that did not converge.
-    """
+    """Compute the eigenpairs of a volume or slice; return its metric, them, and the settings with their boundary."""
     grid, boundary = volume.grid(settings.components), settings.boundary
-    assert settings.metric is not None
     if boundary is None:
         boundary, why = default_boundary(grid.inside)
-        progress.note(f"boundary {boundary} ({why})")
+        progress.note(as_options(f"boundary {boundary} ({why})"))
     with progress.stage("assembly", f"{int(grid.inside.sum())} of {grid.size} nodes"):
         for message in unreached_sides(grid.inside, boundary):
             progress.warn(message)
-        field = field_of(volume, grid, settings.metric, settings.dtype, settings.interpolation)
+        field = field_of(volume, grid, settings)
         pencil = assemble(field, boundary)
-    return field, _solve(pencil, settings, progress), replace(settings, boundary=boundary)
+    return field, solve(pencil, settings, progress), replace(settings, boundary=boundary)
 
 
-def _solve(pencil: AnyPencil, settings: Settings, progress: Progress) -> Eigenpairs:
+def solve(pencil: Pencil | MirrorPencil, settings: Settings, progress: Progress) -> Eigenpairs:
     """Compute eigenpairs; raise ComputationError unless all of them converged."""
-    unknowns = sum(part.space.n_dof for part in pencil.parts)
-    k = min(DEFAULT_K[pencil.space.dimension], max(1, unknowns // 4)) if settings.k is None else settings.k
+    unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
+    assert dimension is not None
+    k = default_k(dimension, unknowns) if settings.k is None else settings.k
     name = choose_solver(settings.solver, pencil.parts[0], k).name
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {name}"):
         pairs = eigenpairs(pencil, k, solver=settings.solver, progress=progress.update)
@@ -194,44 +137,29 @@ def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) 
     if settings.method != "auto":
         return np.asarray(hks(pairs, times, settings.normalisation, settings.method)), {}
     result = hks_auto(pairs, times, settings.normalisation)
-    agreement = None
+    origin: dict[str, Any] = {"eigenpairs": [], result.method: [], "agreement": None}
+    for t, spectral in zip(times, np.asarray(result.spectral), strict=True):
+        origin["eigenpairs" if spectral else result.method].append(t)
     if np.isfinite(float(result.overlap_time)):
-        agreement = {"t": float(result.overlap_time), "difference": float(result.overlap_difference)}
-    of_pairs = np.asarray(result.spectral)
-    origin = {
-        "eigenpairs": [t for t, yes in zip(times, of_pairs, strict=True) if yes],
-        result.method: [t for t, yes in zip(times, of_pairs, strict=True) if not yes],
-        "agreement": agreement,
-    }
+        origin["agreement"] = {"t": float(result.overlap_time), "difference": float(result.overlap_difference)}
     return np.asarray(result.values), {"method": {name: value for name, value in origin.items() if name != "none"}}
 
 
 def _report(settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]) -> dict[str, Any]:
     estimate = truncation(pairs, jnp.asarray(times))
     by_node = np.asarray(truncation_map(pairs, jnp.asarray(times))).reshape(len(times), -1)
-    chosen = replace(settings, times=Times(times, settings.times.automatic), k=pairs.k)
+    columns = {
+        "t": times,
+        "truncation": estimate.tail,
+        "truncation_worst_node": np.nanmax(by_node, axis=1),
+        **{name: getattr(estimate, name) for name in ("resolution_bias", "lasting_bias", "coarse_fraction")},
+    }
+    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
+    settings = replace(settings, times=Times(times, settings.times.automatic), k=pairs.k)
     return {
-        "settings": {**asdict(chosen), "times": "automatic" if settings.times.automatic else "explicit"},
+        "settings": {**asdict(settings), "times": "automatic" if settings.times.automatic else "explicit"},
         "eigenpairs": describe_pairs(pairs),
-        "times": [
-            {
-                "t": float(t),
-                "truncation": float(tail),
-                "truncation_worst_node": float(worst),
-                "resolution_bias": float(bias),
-                "lasting_bias": float(lasting),
-                "coarse_fraction": float(coarse),
-            }
-            for t, tail, worst, bias, lasting, coarse in zip(
-                times,
-                np.asarray(estimate.tail),
-                np.nanmax(by_node, axis=1),
-                np.asarray(estimate.resolution_bias),
-                np.asarray(estimate.lasting_bias),
-                np.asarray(estimate.coarse_fraction),
-                strict=True,
-            )
-        ],
+        "times": [dict(zip(columns, row, strict=True)) for row in rows],
     }
 
 

@@ -3,26 +3,30 @@
 import argparse
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from hks_jax.accuracy import AccuracyWarning
-from hks_jax.cli.arguments import Times
-from hks_jax.cli.inputs import read_volume, second_scan
-from hks_jax.cli.job import Bars, Result, Settings, automatic_times
+from hks_jax import (
+    AccuracyWarning,
+    Eigenpairs,
+    TensorField,
+    TensorNoise,
+    Uncertainty,
+    boundary_influence,
+    eigenpairs,
+    hks,
+    uncertainty,
+)
+from hks_jax.cli.job import Settings, automatic_times, describe_input, result_of
+from hks_jax.cli.options import Times
 from hks_jax.cli.progress import Progress
-from hks_jax.domain.grid import Grid
-from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.driver import eigenpairs
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.boundary import boundary_influence
-from hks_jax.signatures.hks import hks
-from hks_jax.uncertainty import TensorNoise, uncertainty
+from hks_jax.cli.reading import read_volume
+from hks_jax.io import TensorVolume
+from hks_jax.io.result import Result
 
 _CANDIDATES = 4
 """How many times as many times are looked at as automatic ones are asked for."""
@@ -36,51 +40,101 @@ _CLEAR = 2.0
 """The signal to noise that the report names the first time of."""
 
 
-def noise_of(args: argparse.Namespace, volume: TensorVolume, grid: Grid, progress: Progress) -> TensorNoise:
-    """Return the noise that the arguments name.
+def require_spectral(args: argparse.Namespace) -> None:
+    """Raise ValueError where error bars are asked for of a method that has none."""
+    if args.noise is not None and args.method != "spectral":
+        raise ValueError(f"--noise: with --method {args.method} there are no error bars; leave one of them out")
 
-    Raises:
-        FileNotFoundError: neither a number, nor a word that is known, nor a file.
-        ValueError: residuals of what was not fitted; a second scan that does not fit the first.
-    """
+
+def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
+    """Return the arguments that read the second scan that ``--noise`` names; None where it names a number or a word."""
+    if args.noise in (None, "residuals", "roughness"):
+        return None
+    try:
+        float(args.noise)
+    except ValueError:
+        return argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
+    return None
+
+
+def signature_of(
+    args: argparse.Namespace,
+    volume: TensorVolume,
+    field: TensorField,
+    pairs: Eigenpairs,
+    settings: Settings,
+    progress: Progress,
+) -> Result:
+    """Compute the signature of a volume or slice whose metric and eigenpairs are known, with error bars if asked to."""
+    mask = field.grid.mask
+    place, described = volume.with_mask(mask), describe_input(volume, mask)
+    if getattr(args, "noise", None) is None:
+        return result_of(place, described, pairs, settings, progress)
+    bars, maps, interior, times = _error_bars(args, volume, field, pairs, settings, progress)
+    settings = replace(settings, times=Times(times, settings.times.automatic))
+    result = result_of(place, described, pairs, settings, progress)
+    ratio = np.asarray(bars.signal_to_noise_at(interior))
+    nodes = np.isfinite(np.asarray(bars.value[0])).sum()
+    clear = np.flatnonzero(ratio > _CLEAR)
+    report = {
+        "source": args.noise,
+        "draws": bars.draws,
+        "sampling_error": bars.sampling_error,
+        "indefinite": float(bars.indefinite),
+        "signal_to_noise": ratio.tolist(),
+        "signal_to_noise_with_rim": np.asarray(bars.signal_to_noise).tolist(),
+        "interior": (interior.reshape(len(ratio), -1).sum(axis=1) / nodes).tolist(),
+        "claimed": np.asarray(bars.trusted).tolist(),
+        f"exceeds_{_CLEAR:g}_from_t": float(times[clear[0]]) if clear.size else None,
+    }
+    arrays = {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": maps}
+    return replace(result, arrays=arrays, report={**result.report, "noise": report})
+
+
+def _noise(args: argparse.Namespace, volume: TensorVolume, field: TensorField, progress: Progress) -> TensorNoise:
+    """Return the noise that the arguments name."""
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: residuals are those of a fit to diffusion-weighted images (--bval, --bvec)")
-        return TensorNoise(volume.covariance, grid)
+        return TensorNoise(volume.covariance, field.grid)
     if args.noise == "roughness":
-        return TensorNoise.from_roughness(volume.tensors, grid)
+        return TensorNoise.from_roughness(volume.tensors, field.grid)
     second = second_scan(args)
     if second is not None:
-        return TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, grid)
-    return TensorNoise.relative(volume.tensors, float(args.noise), grid)
+        return TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, field.grid)
+    return TensorNoise.relative(volume.tensors, float(args.noise), field.grid)
 
 
-def error_bars(
-    volume: TensorVolume, noise: TensorNoise, pairs: Eigenpairs, settings: Settings, draws: int, progress: Progress
-) -> tuple[Bars, Settings]:
-    """Compute error bars; return them, and the settings with the times, which begin where there is signal."""
-    wanted = settings.times.automatic
+def _error_bars(
+    args: argparse.Namespace,
+    volume: TensorVolume,
+    field: TensorField,
+    pairs: Eigenpairs,
+    settings: Settings,
+    progress: Progress,
+) -> tuple[Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
+    """Return error bars, the noise (n_draws, n_times, *shape) of which they are made, the interior, and the times.
+
+    The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
+    few such nodes; else it is all of the domain. Automatic times begin where there is signal.
+    """
+    noise, wanted = _noise(args, volume, field, progress), settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
-    grid = noise.grid
-    assert grid is not None
-    assert settings.metric is not None
-    boundary = settings.boundary or "neumann"
+    maps: list[np.ndarray] = []
 
     def signature(D: Any) -> Any:
-        field = TensorField.from_diffusion(grid, D, settings.metric, interpolation=settings.interpolation)
-        return hks(eigenpairs(field, pairs.k, boundary, settings.solver), times, settings.normalisation)
+        assert settings.metric is not None
+        assert settings.boundary is not None
+        metric = TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
+        return hks(eigenpairs(metric, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
 
-    with progress.stage("error bars", f"{draws} noisy maps"), warnings.catch_warnings():
+    def keep(one: Any) -> None:
+        maps.append(np.asarray(one, np.float32))
+
+    with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # of times that are not chosen, too
-        tensors = volume.tensors.astype(settings.dtype)
-        maps: list[np.ndarray] = []
-
-        def keep(one: Any) -> None:
-            maps.append(np.asarray(one, np.float32))
-
-        bars = uncertainty(
-            signature, tensors, noise, method="resample", draws=draws, progress=progress.update, each=keep
-        )
+        tensors, more = volume.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
+        bars = uncertainty(signature, tensors, noise, method="resample", progress=progress.update, **more)
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:
             nodes = interior[0].sum()
@@ -94,41 +148,6 @@ def error_bars(
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
         chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)
         bars = jax.tree.map(lambda leaf: leaf[chosen] if jnp.ndim(leaf) else leaf, bars)
-        times = tuple(times[i] for i in chosen)
     for message in bars.messages():
         progress.warn(message)
-    return Bars(bars, np.stack(maps)[:, chosen], interior[chosen]), replace(settings, times=Times(times, wanted))
-
-
-def with_error_bars(result: Result, found: Bars, source: str) -> Result:
-    """Return a result with error bars, and with what the report says of them."""
-    bars = found.uncertainty
-    ratio = np.asarray(bars.signal_to_noise_at(found.interior))
-    nodes = np.isfinite(np.asarray(bars.value[0])).sum()
-    clear = np.flatnonzero(ratio > _CLEAR)
-    report = {
-        "source": source,
-        "draws": bars.draws,
-        "sampling_error": bars.sampling_error,
-        "indefinite": float(bars.indefinite),
-        "signal_to_noise": ratio.tolist(),
-        "signal_to_noise_with_rim": np.asarray(bars.signal_to_noise).tolist(),
-        "interior": (found.interior.reshape(len(ratio), -1).sum(axis=1) / nodes).tolist(),
-        "claimed": np.asarray(bars.trusted).tolist(),
-        f"exceeds_{_CLEAR:g}_from_t": float(result.times[clear[0]]) if clear.size else None,
-    }
-    return replace(result, bars=found, report={**result.report, "noise": report})
-
-
-def z_of(result: Result) -> Float[np.ndarray, "n_times *shape"] | None:
-    """Return how many standard deviations the signature is from that of flat space, or from its median."""
-    if result.bars is None:
-        return None
-    values, normalisation = result.values, result.report["settings"]["normalisation"]
-    ones = (-1, *[1] * (values.ndim - 1))
-    if normalisation in ("raw", "flat"):
-        power = 0 if normalisation == "flat" else -(values.ndim - 1) / 2
-        reference = ((4 * np.pi * result.times) ** power).reshape(ones)
-    else:
-        reference = np.nanmedian(values.reshape(len(values), -1), axis=1).reshape(ones)
-    return (values - reference) / np.asarray(result.bars.uncertainty.deviation)
+    return bars, np.stack(maps)[:, chosen], interior[chosen], tuple(times[i] for i in chosen)

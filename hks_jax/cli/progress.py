@@ -1,42 +1,22 @@
-"""What goes to stderr: what is being done, since when, and messages of the library in the command line's words."""
+"""What goes to stderr: what is being done, since when, how long it will take, and messages of the library."""
 
-import re
+import io
 import shutil
 import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
-READING = ("order", "frame", "array", "spacing", "confidence", "mask", "components", "repair", "unit", "bvec_frame")
-"""The options of the commands that read tensors."""
-
-OPTIONS = (
-    *READING,
-    *("k", "boundary", "metric", "solver", "times", "through", "interpolation", "normalisation", "method"),
-    *("erode", "slice", "bval", "bvec", "b_max"),
-)
-"""Those that arguments of the library correspond to."""
-
-
-def as_options(message: str, names: Iterable[str]) -> str:
-    """Return a message in which the named arguments of the library are spelled as the options of a command.
-
-    ``Pass array`` becomes ``Pass --array``, ``pass frame "fsl"`` and ``pass frame="fsl"`` become ``pass --frame fsl``,
-    and ``k: got 0`` at the beginning becomes ``-k: got 0``.
-    """
-    for name in names:
-        option = ("-" if len(name) == 1 else "--") + name.replace("_", "-")
-        message = re.sub(rf"^{re.escape(name)}: ", f"{option}: ", message)
-        argument = rf"\b([Pp]ass|[Cc]hoose|or|try) {re.escape(name)}\b(?! [a-z])(?: \({option}\))?"
-        message = re.sub(rf'{argument}(?: |=|: )"([\w/-]+)"', rf"\1 {option} \2", message)
-        message = re.sub(argument, rf"\1 {option}", message)
-    return message.replace("clean=True puts right what it can: see read_mesh", "--clean puts right what it can")
-
+from hks_jax.cli.options import as_options
 
 WIDTH = 20
+INTERVAL = 5.0
+"""Seconds between updates within a stage where stderr is no terminal."""
+TICK = 0.5
+"""Seconds after which a terminal's line is drawn again, with the time that has passed."""
 
 
 def bar(done: float) -> str:
@@ -53,12 +33,6 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60 // 10 * 10} min"
 
 
-INTERVAL = 5.0
-"""Seconds between updates within a stage where stderr is no terminal."""
-TICK = 0.5
-"""Seconds after which a terminal's line is drawn again, with the time that has passed."""
-
-
 class Progress:
     """Prints stages and warnings as they come, and remembers them for the report.
 
@@ -67,13 +41,15 @@ class Progress:
         warnings: messages, each once.
     """
 
-    def __init__(self, quiet: bool = False, stream: TextIO | None = None) -> None:
+    _LINE_END = "\n"
+
+    def __init__(self, quiet: bool = False, stream: TextIO | io.StringIO | None = None) -> None:
         self.quiet = quiet
         self.stream = sys.stderr if stream is None else stream
         self.timings: dict[str, float] = {}
         self.warnings: list[str] = []
         self._start = self._last = self._begin = time.perf_counter()
-        self._stage = self._text = ""
+        self._subject = self._stage = self._text = ""
         self._end: float | None = None
         self._open_line = False
         self._lock = threading.RLock()
@@ -84,16 +60,16 @@ class Progress:
         begin = self._begin = self._last = time.perf_counter()
         self._stage, self._text, self._end = f"{name}: {detail}" if detail else name, "", None
         over = threading.Event()
-        if self.stream.isatty() and not self.quiet:
+        if self._on_terminal:
             self._draw()
             threading.Thread(target=self._tick, args=(over,), daemon=True).start()
         else:
-            self._print(self._stage)
+            self.note(self._stage)
         try:
             yield
         finally:
             over.set()
-            self.timings[name] = time.perf_counter() - begin
+            self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - begin
             self._close_line()
 
     def update(self, text: str) -> None:
@@ -102,17 +78,14 @@ class Progress:
         A text that comes with an estimate of what is left (`hks_jax.eigen.solver.Status`) is shown with it, and with a
         bar of the time that has passed in all.
         """
-        now = time.perf_counter()
-        left = getattr(text, "seconds_left", None)
+        now, left = time.perf_counter(), getattr(text, "seconds_left", None)
         with self._lock:
             self._text, self._end = str(text), None if left is None else now + left
-        if self.quiet:
-            return
-        if self.stream.isatty():
+        if self._on_terminal:
             self._draw()
         elif now - self._last >= INTERVAL:
             self._last = now
-            self._print(f"{self._stage}, {self._text}{'' if left is None else f', about {duration(left)} left'}")
+            self.note(f"{self._stage}, {self._text}{'' if left is None else f', about {duration(left)} left'}")
 
     def note(self, text: str) -> None:
         """Say something that is no warning."""
@@ -123,7 +96,7 @@ class Progress:
         if message not in self.warnings:
             self.warnings.append(message)
             self._close_line()
-            print(f"warning: {message}", file=self.stream)
+            print(f"warning: {self._subject}{': ' * bool(self._subject)}{message}", file=self.stream)
 
     @contextmanager
     def catching_warnings(self) -> Iterator[None]:
@@ -131,12 +104,16 @@ class Progress:
 
         def show(message: Warning | str, category: type[Warning], *_position: Any, **more: Any) -> None:
             if issubclass(category, UserWarning):
-                self.warn(as_options(str(message), READING))
+                self.warn(as_options(str(message)))
 
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show
             yield
+
+    @property
+    def _on_terminal(self) -> bool:
+        return self.stream.isatty() and not self.quiet
 
     def _tick(self, over: threading.Event) -> None:
         while not over.wait(TICK):
@@ -145,18 +122,21 @@ class Progress:
                     self._draw()
 
     def _draw(self) -> None:
-        """Draw the terminal's last line: the time, the stage, a bar, what is left, and the text."""
+        """Draw the terminal's last line again."""
         with self._lock:
-            now, shown = time.perf_counter(), f"{self._stage}, {self._text}" if self._text else self._stage
-            if self._end is not None:
-                left = max(self._end - now, 0.0)
-                done = (now - self._begin) / max(now - self._begin + left, 1e-9)
-                remaining = f"about {duration(left)} left" if left else "longer than estimated"
-                shown = f"{bar(done)} {remaining}, {self._text}, {self._stage}"
-            line = f"[{now - self._start:7.1f} s] {shown}"[: shutil.get_terminal_size().columns - 1]
-            self.stream.write(f"\r{line}\x1b[K")
+            self.stream.write(f"\r{self._line()[: shutil.get_terminal_size().columns - 1]}\x1b[K")
             self.stream.flush()
             self._open_line = True
+
+    def _line(self) -> str:
+        """Return the time, the stage, a bar, what is left, and the text."""
+        now, shown = time.perf_counter(), ", ".join(filter(None, (self._stage, self._text)))
+        if self._end is not None:
+            left = max(self._end - now, 0.0)
+            done = (now - self._begin) / max(now - self._begin + left, 1e-9)
+            remaining = f"about {duration(left)} left" if left else "longer than estimated"
+            shown = f"{bar(done)} {remaining}, {self._text}, {self._stage}"
+        return f"[{now - self._start:7.1f} s] {shown}"
 
     def _print(self, text: str) -> None:
         if not self.quiet:
@@ -166,5 +146,60 @@ class Progress:
     def _close_line(self) -> None:
         with self._lock:
             if self._open_line:
-                self.stream.write("\n")
+                self.stream.write(self._LINE_END)
                 self._open_line = False
+
+
+class StudyProgress(Progress):
+    """Progress over many subjects: how many are done, and how long the others will take.
+
+    On a terminal it is one line with a bar, in which the stages of a subject are shown too; elsewhere a line for each
+    subject that begins and ends. Warnings are shown with the subject's name and kept for its sidecar.
+    """
+
+    _LINE_END = "\r\x1b[K"
+
+    def __init__(self, total: int, quiet: bool = False, stream: TextIO | io.StringIO | None = None) -> None:
+        super().__init__(quiet, stream)
+        self.total, self.ended, self._spent = total, 0, 0.0
+
+    @contextmanager
+    def subject(self, name: str) -> Iterator[None]:
+        """Work on a subject: its warnings are those of the body, and its seconds tell how long the others take."""
+        begun = self._begun = time.perf_counter()
+        self._subject, self._stage, self._text, self.warnings = name, "", "", []
+        if self._on_terminal:
+            self._draw()
+        else:
+            self._print(f"{self.line()}: {name}")
+        try:
+            yield
+        finally:
+            self._spent += time.perf_counter() - begun
+            self.ended += 1
+            self._subject = ""
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the beginning."""
+        return time.perf_counter() - self._start
+
+    def line(self) -> str:
+        """Return the bar, how many of how many are done, and the time left where one was computed already."""
+        text = f"{bar(self.ended / max(1, self.total))} {self.ended} of {self.total}"
+        if not self.ended or self.ended == self.total:
+            return text
+        begun = time.perf_counter() - self._begun if self._subject else 0.0
+        left = self._spent / self.ended * (self.total - self.ended) - begun
+        return f"{text}, about {duration(max(left, 0.0))} left"
+
+    def note(self, text: str) -> None:
+        """Say nothing: what was decided in reading a subject's files is in its sidecar."""
+
+    def end(self, text: str) -> None:
+        """Say how a subject, or the study, ended."""
+        self._print(text)
+
+    def _line(self) -> str:
+        shown = ", ".join(filter(None, (self._stage, self._text)))
+        return ": ".join(filter(None, (self.line(), self._subject, shown)))

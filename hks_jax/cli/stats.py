@@ -1,23 +1,10 @@
-"""``hks-jax stats OUT --atlas LABELS``: the statistics of a signature over the regions of a label map."""
+"""Write a table of regions' means over the labels of an atlas.
 
-import argparse
-from pathlib import Path
-from typing import Any
-
-from hks_jax.cli.inputs import add_command, add_json_argument
-from hks_jax.cli.outputs import check_folder, show_summary, signature_file
-from hks_jax.cli.progress import Progress
-from hks_jax.cli.regions import region_table
-from hks_jax.io.tables import write_table
-
-DESCRIPTION = """\
 Write a table of regions: for each label of an image, and each t of the signature that 'hks-jax hks' has left in the
 folder OUT, the mean, the standard deviation and the median over the region's voxels; with the region's volume, and the
 share of it that is in the domain. The labels are in the image's own space: where their affine places them on other
 voxels they are refused.
-"""
 
-EPILOG = """\
 examples:
   hks-jax stats out --atlas sub-01_dseg.nii.gz
   hks-jax stats out --atlas aparc+aseg.nii.gz --names FreeSurferColorLUT.txt -o regions.tsv
@@ -25,54 +12,118 @@ examples:
 Of many subjects, 'hks-jax batch --atlas' writes all tables and joins them.
 """
 
+import argparse
+import math
+from pathlib import Path
+from typing import Any
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
-    """Add the subcommand's parser."""
-    parser = add_command(
-        subparsers, "stats", "write a table of regions' means over the labels of an atlas", DESCRIPTION, EPILOG
-    )
-    add = parser.add_argument
-    add("result", metavar="OUT", type=Path, help="the folder that 'hks-jax hks' wrote, or an .npz from there")
-    add("-o", "--output", metavar="TABLE", type=Path, help="the table (default: regions.tsv in OUT)")
-    add_atlas_arguments(parser, required=True)
-    add_json_argument(parser)
-    return parser
+import numpy as np
+
+from hks_jax import __version__
+from hks_jax.cli.outputs import Done
+from hks_jax.cli.progress import Progress
+from hks_jax.io.masks import names_beside, read_labels, read_names
+from hks_jax.io.result import Result, signature_file
+from hks_jax.io.tables import write_table
+from hks_jax.io.volume import digest
+from hks_jax.signatures.regions import region_statistics
+
+OPTIONS = """
+result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
+-o,--output TABLE  the table (default: regions.tsv in OUT)
+--atlas FILE!  labels on the voxels of the image, whole numbers, 0 for none: NIfTI, or .npy of the image's shape
+@names
+"""
+
+_SOME = ("lambda1_t", "error")
+"""Columns that only some tables have."""
+_SCALES = {
+    "raw": "the heat kernel signature, per (metric length)^d",
+    "heat-trace": "the heat kernel signature divided by the heat trace",
+    "volume": "the heat kernel signature times the domain's volume in the metric",
+    "flat": "(4πt)^(d/2) times the heat kernel signature: 1 where space is flat",
+}
 
 
-def add_atlas_arguments(parser: argparse.ArgumentParser, required: bool) -> None:
-    """Add the arguments that say which regions there are."""
-    add = parser.add_argument
-    add(
-        "--atlas",
-        metavar="FILE",
-        type=Path,
-        required=required,
-        help="labels on the voxels of the image, whole numbers, 0 for none: NIfTI, or .npy of the image's shape",
-    )
-    add(
-        "--names",
-        metavar="FILE",
-        type=Path,
-        help="names of the labels: a table with the columns index and name, or lines of a number and a name, such as "
-        "FreeSurfer's (default: the .tsv of the same name beside the labels, if it is there)",
-    )
-
-
-def run(args: argparse.Namespace) -> None:
-    """Run the subcommand.
-
-    Raises:
-        FileNotFoundError: no such result, labels or names.
-        ValueError: a result that has no regions, or labels that do not fit it.
-    """
-
+def run(args: argparse.Namespace, progress: Progress) -> Done:
+    """Run the command."""
     source = signature_file(args.result)
-    table = source.with_name("regions.tsv") if args.output is None else args.output
+    table = args.output or source.with_name("regions.tsv")
     if table.suffix.lower() != ".tsv":
         raise ValueError(f"--output: got {table}; expected a name that ends in .tsv")
-    check_folder(table.parent)
-    progress = Progress(args.quiet)
-    with progress.catching_warnings(), progress.stage("regions", f"{args.atlas} on {source}"):
+    with progress.stage("regions", f"{args.atlas} on {source}"):
         columns, rows, about = region_table(source, args.atlas, args.names, progress)
         files = write_table(table, columns, rows, about)
-    show_summary(args, files, {"source": str(source), "regions": list(dict.fromkeys(row[1] for row in rows))})
+    return Done(files, {"source": str(source), "regions": list(dict.fromkeys(row[1] for row in rows))})
+
+
+def names_of(labels: Path, names: Path | None) -> tuple[Path | None, dict[int, str]]:
+    """Return the file of the names of labels, which may be beside them, and the names."""
+    beside = names or names_beside(labels)
+    return (None, {}) if beside is None else (Path(beside), read_names(beside))
+
+
+def region_table(
+    source: Path, atlas: Path, names: Path | None, progress: Progress
+) -> tuple[tuple[str, ...], list[tuple[Any, ...]], dict[str, Any]]:
+    """Return the columns and rows of a result's table, a row for each region and time, and what its sidecar says."""
+    result = Result.read(source, "hks")
+    volume, values = result.volume, result.values
+    if not result.times.size:
+        raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
+    if volume.affine is None:
+        progress.warn(f"{source.name} has no place in space: the labels are taken voxel by voxel, and not checked")
+    labels = read_labels(atlas, volume.shape, volume.affine, volume.slice_axis)
+    names, called = names_of(atlas, names)
+    # A slice of a volume is one voxel thick.
+    of_one = math.prod(volume.spacing) if volume.affine is None else abs(np.linalg.det(volume.affine[:3, :3]))
+    regions = region_statistics(values, labels, float(of_one))
+    if not regions.nodes.any():
+        raise ValueError(f"{atlas}: none of its {regions.labels.size} regions has a voxel in the domain of {source}")
+    n_times, n_regions = regions.mean.shape
+    by_time = {"t": result.times, "lambda1_t": result.arrays.get("scaled_times")}  # of a study whose times are λ₁t
+    by_region = {
+        "index": regions.labels,
+        "voxels": regions.nodes,
+        "coverage": regions.coverage,
+        "volume": regions.volume,
+    }
+    by_region["region"] = np.array([called.get(int(label), f"label {label}") for label in regions.labels], object)
+    cells = {name: np.tile(of, n_regions) for name, of in by_time.items() if of is not None}
+    cells |= {name: np.repeat(of, n_times) for name, of in by_region.items()}
+    cells |= {"mean": regions.mean.T.ravel(), "std": regions.deviation.T.ravel(), "median": regions.median.T.ravel()}
+    if "noise_maps" in result.arrays:  # the means of draws of noise have the variance of the mean's
+        draws = [region_statistics(one, labels).mean for one in result.arrays["noise_maps"]]
+        cells["error"] = np.sqrt(np.mean(np.square(draws), axis=0)).T.ravel()
+    described = _about(result, atlas, names)
+    columns = tuple(name for name in described if name in cells)
+    rows = list(zip(*(cells[name].tolist() for name in columns), strict=True))
+    return columns, rows, {name: what for name, what in described.items() if name in columns or name not in _SOME}
+
+
+def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
+    """Return the sidecar: what the columns are, in their order, and where they came from."""
+    settings = result.settings
+    flat = result.volume.dimension == 2 and result.volume.affine is None
+    values = _SCALES.get(settings.get("normalisation", "raw"), "the heat kernel signature")
+    unit = {"Units": result.unit} if result.unit else {}
+    return {
+        "index": {"Description": "number of the region in the label map"},
+        "region": {"Description": "name of the region"},
+        "voxels": {"Description": "voxels of the region that are in the domain of the signature"},
+        "coverage": {"Description": "their share of all of the region's voxels"},
+        "volume": {
+            "Description": f"{'area' if flat else 'volume'} of the voxels counted, in the lengths of the image "
+            "(NIfTI: mm); a slice is one voxel thick"
+        },
+        "lambda1_t": {"Description": "t times the first positive eigenvalue: the same numbers for all subjects"},
+        "t": {"Description": "time of diffusion, (metric length)²: s for the metric D⁻¹ of mm²/s on mm", **unit},
+        "mean": {"Description": f"mean over these voxels of {values}"},
+        "std": {"Description": "standard deviation over these voxels (the root of the mean square deviation)"},
+        "median": {"Description": "median over these voxels"},
+        "error": {"Description": "standard deviation of the mean that the noise of the tensors gives it"},
+        "GeneratedBy": {"Name": "hks-jax", "Version": __version__},
+        "LabelMap": {"File": atlas.name, "SHA256": digest(atlas)},
+        "Names": None if names is None else {"File": names.name, "SHA256": digest(names)},
+        "Settings": {name: settings.get(name) for name in ("metric", "boundary", "normalisation", "k")},
+    }

@@ -10,10 +10,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import numpy_where_known
 from hks_jax.describe import describe_array
+from hks_jax.domain.tensor_checks import MANY
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
+
+_ROUNDED = 1e-3
+"""The relative error from which on it is told that eigenvalues have, as tensors are rounded to float32."""
+_SAMPLE = 20_000
+"""Tensors that are looked at."""
 
 
 class RESULTS(eqx.Enumeration):
@@ -208,6 +214,12 @@ class Eigenpairs(eqx.Module):
                 f"k = {kept} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = {last:.6g}, have equals "
                 f"beyond k, and which of them are among the k is arbitrary. {remedy}"
             )
+        stretch = _anisotropy(self.pencil) if values.dtype == np.float32 else 1.0
+        if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:
+            sentences.append(
+                f"the tensors stretch up to {stretch:.1e} times more along one axis than another: rounded to float32, "
+                f"their eigenvalues are others, by up to {rounding:.0e}, which residuals do not show. Use float64"
+            )
         return sentences
 
     def summary(self) -> str:
@@ -228,6 +240,19 @@ class Eigenpairs(eqx.Module):
         if kept < self.k:
             lines.append(f"{kept} of them kept, so that no multiple eigenvalue is cut")
         return "\n".join(lines + self.messages())
+
+
+def _anisotropy(pencil: AnyPencil | None) -> float:
+    """Return the ratio of eigenvalues that few tensors on a grid exceed, by a sample; 1 where none are known."""
+    metric = None if pencil is None else pencil.parts[0].metric
+    if metric is None or metric.spacing is None:
+        return 1.0
+    d = metric.tensors.shape[-1]
+    tensors = metric.tensors.reshape(-1, d, d)
+    sample = np.asarray(tensors[:: max(1, len(tensors) // _SAMPLE)], np.float64)
+    values = np.linalg.eigvalsh(sample[np.isfinite(sample).all(axis=(1, 2))])
+    values = values[values[:, 0] > 0]
+    return float(np.quantile(values[:, -1] / values[:, 0], 1 - MANY)) if len(values) else 1.0
 
 
 def multiplet_gap(xp: Any, values: Any, origin: Any, tolerance: Any) -> Any:

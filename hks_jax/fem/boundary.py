@@ -6,8 +6,9 @@ from typing import TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from hks_jax.domain.components import active_elements, element_nodes, rim_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 
@@ -68,6 +69,35 @@ def _pair(entry: str | Sides) -> Sides:
     if low != high and not {low, high} <= set(_SIDE_BY_SIDE):
         raise ValueError(f'boundary: got {entry!r} for one axis; "periodic" and "mirror" bind both sides of an axis')
     return low, high
+
+
+def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
+    """Return the boundary that suits a domain, and why: the mean where it has a mask, whose rim else covers all.
+
+    Args:
+        inside: the nodes of the domain.
+    """
+    if inside.all():
+        return "neumann", "the domain has no mask"
+    every_axis = (False,) * inside.ndim
+    elements = active_elements(inside, every_axis)
+    free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
+    if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet half leaves the grid's sides out, too
+        return "neumann", "the mask is so thin that all of it is rim, and the mean needs voxels off it"
+    return "mean", 'the domain has a mask; pass boundary="neumann" to leave its rim natural'
+
+
+def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
+    """Say which conditions have no effect, because the mask does not reach the side of the grid that they are for."""
+    *axes, (rim, _) = normalise_boundary(boundary, inside.ndim)
+    own = 'is natural (Neumann); "dirichlet-rim" and "mean" take it in' if rim == "neumann" else f'has "{rim}"'
+    return [
+        f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
+        f"the mask's own rim {own}"
+        for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False))
+        for side, index, condition in zip(("low", "high"), (0, -1), conditions, strict=True)
+        if condition not in ("neumann", rim) and not np.take(inside, index, axis).any()
+    ]
 
 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:

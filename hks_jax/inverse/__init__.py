@@ -5,9 +5,9 @@ from hks_jax.inverse.gauss_newton import GaussNewton as GaussNewton
 from hks_jax.inverse.identifiability import Identifiability as Identifiability
 from hks_jax.inverse.identifiability import identifiability as identifiability
 from hks_jax.inverse.metric_fit import MetricFit as MetricFit
+from hks_jax.inverse.metric_fit import Posterior as Posterior
 from hks_jax.inverse.metric_fit import Step as Step
 from hks_jax.inverse.parametrisation import Parametrisation as Parametrisation
-from hks_jax.inverse.posterior import Posterior as Posterior
 from hks_jax.inverse.regulariser import H1 as H1
 from hks_jax.inverse.regulariser import LogDeterminant as LogDeterminant
 from hks_jax.inverse.regulariser import Prior as Prior

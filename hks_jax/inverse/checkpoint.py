@@ -16,25 +16,15 @@ from hks_jax.npz import load_npz, write_npz
 
 
 class Checkpoint(NamedTuple):
-    """Where a fit stands.
+    """Where a fit stands."""
 
-    Attributes:
-        values: the unknowns.
-        history: the steps so far.
-        start: which of the starts.
-        stage: which stage of the continuation.
-        step_size: by which the damping is divided.
-        best: the unknowns of the best of the starts before, and their losses.
-        losses: of the starts before.
-    """
-
-    values: Any
-    history: list[Step]
-    start: int
-    stage: int
-    step_size: float
-    best: Any
-    losses: list[float]
+    values: Any  # the unknowns
+    history: list[Step]  # the steps so far
+    start: int  # which of the starts
+    stage: int  # which stage of the continuation
+    step_size: float  # by which the damping is divided
+    best: Any  # the unknowns of the best of the starts before, and their losses
+    losses: list[float]  # of the starts before
 
 
 def fingerprint(*parts: Any) -> str:
@@ -53,11 +43,7 @@ def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> Non
 
 
 def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
-    """Read a checkpoint.
-
-    Raises:
-        ValueError: it is of another fit, damaged, or no checkpoint.
-    """
+    """Read a checkpoint."""
     try:
         data = load_npz(path)
     except (OSError, ValueError) as error:
@@ -87,42 +73,22 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
 
 @dataclasses.dataclass
 class Log:
-    """What happened so far; called after each step, it tells and saves it.
+    """What happened so far; called after each step, it tells and saves it."""
 
-    Attributes:
-        progress: called with each step.
-        path: of the checkpoint.
-        mark: of what fit it is.
-        best: the best unknowns of the starts before.
-        clock: when the fit began, by `time.perf_counter`.
-        history: the steps.
-        losses: of the starts before.
-        start: which of the starts is under way,
-        stage: and which stage of it.
-    """
-
-    progress: Callable[[Step], None] | None
-    path: str | os.PathLike[str] | None
-    mark: str
-    best: Values
-    clock: float
-    history: list[Step] = dataclasses.field(default_factory=list)
-    losses: list[float] = dataclasses.field(default_factory=list)
-    start: int = 0
-    stage: int = 0
+    progress: Callable[[Step], None] | None  # called with each step
+    path: str | os.PathLike[str] | None  # of the checkpoint
+    mark: str  # of what fit it is
+    best: Values  # the best unknowns of the starts before
+    clock: float  # when the fit began, by `time.perf_counter`
+    history: list[Step] = dataclasses.field(default_factory=list)  # the steps
+    losses: list[float] = dataclasses.field(default_factory=list)  # of the starts before
+    start: int = 0  # which of the starts is under way,
+    stage: int = 0  # and which stage of it
 
     def __call__(
         self, number: int, told: tuple[float, float, float], accepted: bool, values: Values, step_size: float
     ) -> None:
-        """Take up a step.
-
-        Args:
-            number: of the step, within the stage.
-            told: loss, misfit, and the norm of the gradient.
-            accepted: whether the step was taken.
-            values: the unknowns.
-            step_size: the solver's.
-        """
+        """Take up a step by its number within the stage: loss, misfit and gradient, and whether it was taken."""
         seconds = time.perf_counter() - self.clock
         self.history.append(Step(number, *told, accepted, seconds, self.stage, self.start))
         if self.progress is not None:

@@ -61,18 +61,12 @@ class Smoothing(InnerProduct):
 
     With the mass and not the identity, because a node at the side stands for half a cell: where the same change of the
     field is a smaller one of the data.
-
-    Attributes:
-        pencil: stiffness and lumped mass of the flat metric.
-        factor: the factorisation of K + M/ℓ²; None for ℓ = 0.
-        length: ℓ, in coordinate units.
-        cell: the mean of the masses, by which they are divided.
     """
 
-    pencil: Pencil
-    factor: Factorisation | None
-    length: Float[Array, ""]
-    cell: Float[Array, ""]
+    pencil: Pencil  # stiffness and lumped mass of the flat metric
+    factor: Factorisation | None  # the factorisation of K + M/ℓ²; None for ℓ = 0
+    length: Float[Array, ""]  # ℓ, in coordinate units
+    cell: Float[Array, ""]  # the mean of the masses, by which they are divided
 
     def apply(self, values: Values) -> Values:
         """Return (M + ℓ²K) x over the cell's mass."""
@@ -119,20 +113,13 @@ class ConformalInformation(Preconditioner):
 
     Its inverse is a polynomial: it takes three products. Where JᵀJ is below μ, JᵀJ + μB falls off no further: λ₁ is so
     large that the preconditioner does not either.
-
-    Attributes:
-        unknowns: the factors at the nodes.
-        root: the square roots of the masses, relative to that of a cell.
-        weights: of the edges, axis by axis.
-        level: λ₁ without damping.
-        largest: a bound on the eigenvalues of L.
     """
 
-    unknowns: Nodal
-    root: Float[Array, "n 1"]
-    weights: list[Float[Array, "..."]]
-    level: Float[Array, ""]
-    largest: Float[Array, ""]
+    unknowns: Nodal  # the factors at the nodes
+    root: Float[Array, "n 1"]  # the square roots of the masses, relative to that of a cell
+    weights: list[Float[Array, "..."]]  # of the edges, axis by axis
+    level: Float[Array, ""]  # λ₁ without damping
+    largest: Float[Array, ""]  # a bound on the eigenvalues of L
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
         """Return the inverse's product."""
@@ -148,13 +135,7 @@ class ConformalInformation(Preconditioner):
 
 @jit_quickly(eqx.filter_jit)
 def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Array, " n_times"]) -> ConformalInformation:
-    """Return the preconditioner for signatures at these times.
-
-    Args:
-        unknowns: conformal factors of an initial field.
-        mass: the inner product, of smoothness 0.
-        times: of the signatures that count.
-    """
+    """Return the preconditioner for signatures at these times; `mass` is the inner product of smoothness 0."""
     grid, nodes = unknowns.init.grid, unknowns.nodes.value
     relative = mass.apply(unknowns.start() + 1)
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)

@@ -22,14 +22,12 @@ from hks_jax.inverse import checkpoint as files
 from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.conformal import InnerProduct
 from hks_jax.inverse.metric_fit import MetricFit, Step
-from hks_jax.inverse.observation import Loss, Observation, Signature, observe, weigh
+from hks_jax.inverse.observation import Function, Loss, Observation, observe, stages_of, weigh
 from hks_jax.inverse.optimise import Optimiser
-from hks_jax.inverse.outcome import more_pairs, truncation_shows
 from hks_jax.inverse.parametrisation import Parametrisation, choose_parametrisation
-from hks_jax.inverse.problem import Problem
+from hks_jax.inverse.problem import Problem, more_pairs, pairs_of_stage, truncation_shows
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.search import Search, choose_inner_product
-from hks_jax.inverse.stages import pairs_of_stage, stages_of
 from hks_jax.inverse.unknowns import Free, Nodal, Unknowns, nodes_of
 
 
@@ -40,7 +38,7 @@ def fit_metric(
     parametrisation: str | Parametrisation | Callable[[Any], Any] = "log-euclidean",
     *,
     parameters: Any = None,
-    signature: str | Signature = "hks",
+    signature: str | Function = "hks",
     loss: str | Loss = "log",
     sigma: Any = None,
     weights: Any = None,
@@ -152,19 +150,7 @@ def fit_metric(
     problems = [problem_of(each, pairs_of_stage(each, k, shape, pencil, init)) for each in stages]
     inner_product, first = choose_inner_product(unknowns, smoothness, noise), unknowns.start()
 
-    choices = (
-        parametrisation,
-        k,
-        boundary,
-        optimiser,
-        smoothness,
-        tolerance,
-        continuation,
-        starts,
-        spread,
-        seed,
-        noise,
-    )
+    choices = parametrisation, k, boundary, optimiser, smoothness, tolerance, continuation, starts, spread, seed, noise
     mark = files.fingerprint(whole, weights, init.domain_tensors, regularisers, repr(choices))
     resumed = files.load(checkpoint, mark) if checkpoint is not None and Path(checkpoint).exists() else None
     log = Log(progress, checkpoint, mark, first, clock)

@@ -31,25 +31,17 @@ def remaining_change(last: Array, before: Array) -> Array:
 
 
 class _State(eqx.Module):
-    """What is known at the last accepted unknowns.
+    """What is known at the last accepted unknowns."""
 
-    Attributes:
-        values: the unknowns.
-        gradient: the gradient.
-        promised: by how much the last step from there changes half the sum of squares, by the linearisation.
-        change: the size of the step that led there, in tolerances.
-        damped: B in the direction of that step over the curvature that it saw: times μ, the part of damping.
-        tight: whether the linear systems are solved more exactly.
-        done: whether no step is needed any more.
-    """
-
-    values: Values
-    gradient: Values
+    values: Values  # the unknowns
+    gradient: Values  # the gradient
+    # by how much the last step from there changes half the sum of squares, by the linearisation
     promised: Float[Array, ""]
-    change: Float[Array, ""]
+    change: Float[Array, ""]  # the size of the step that led there, in tolerances
+    # B in the direction of that step over the curvature that it saw: times μ, the part of damping
     damped: Float[Array, ""]
-    tight: Bool[Array, ""]
-    done: Bool[Array, ""]
+    tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
+    done: Bool[Array, ""]  # whether no step is needed any more
 
 
 class DampedDescent(eqx.Module):
@@ -57,22 +49,15 @@ class DampedDescent(eqx.Module):
 
     The conjugate gradients stop early: far from the solution more digits would be lost on the linearisation. Their
     result is a descent direction whenever they stop.
-
-    Attributes:
-        tolerance: what the unknowns still change, relative and absolute, when no further step is computed.
-        damping: μ at step size 1.
-        inner_product: B.
-        inner_tolerance: reduction of the residual, in the norm of the preconditioner's inverse.
-        inner_steps: at most so many products with JᵀJ.
-        preconditioner: of the conjugate gradients.
     """
 
+    # what the unknowns still change, relative and absolute, when no further step is computed
     tolerance: Float[Array, ""]
-    damping: Float[Array, ""]
-    inner_product: InnerProduct
-    inner_tolerance: Float[Array, ""]
-    inner_steps: Int[Array, ""]
-    preconditioner: Preconditioner
+    damping: Float[Array, ""]  # μ at step size 1
+    inner_product: InnerProduct  # B
+    inner_tolerance: Float[Array, ""]  # reduction of the residual, in the norm of the preconditioner's inverse
+    inner_steps: Int[Array, ""]  # at most so many products with JᵀJ
+    preconditioner: Preconditioner  # of the conjugate gradients
 
     def init(self, y: Values) -> _State:
         """Return the state before any unknowns were accepted."""
@@ -127,25 +112,15 @@ class DampedDescent(eqx.Module):
 
 
 class _Progress(eqx.Module):
-    """The state of the solver.
+    """The state of the solver."""
 
-    Attributes:
-        first: whether no step was taken yet.
-        trial: the unknowns to be looked at next.
-        step_size: 1/μ, relative to the first.
-        linearised: residuals and Jacobian at the last accepted unknowns.
-        aux: what the residuals tell beside, there.
-        descent: what the descent knows, there.
-        finite: whether the last step is.
-    """
-
-    first: Bool[Array, ""]
-    trial: Values
-    step_size: Float[Array, ""]
-    linearised: Any
-    aux: Any
-    descent: _State
-    finite: Bool[Array, ""]
+    first: Bool[Array, ""]  # whether no step was taken yet
+    trial: Values  # the unknowns to be looked at next
+    step_size: Float[Array, ""]  # 1/μ, relative to the first
+    linearised: Any  # residuals and Jacobian at the last accepted unknowns
+    aux: Any  # what the residuals tell beside, there
+    descent: _State  # what the descent knows, there
+    finite: Bool[Array, ""]  # whether the last step is
 
 
 def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:

@@ -141,19 +141,13 @@ def _information(problem: Problem, values: Values) -> Any:
 @jit_quickly(eqx.filter_jit)
 def _strongest(problem: Problem, values: Values, start: Array, iterations: int) -> tuple[Array, Array]:
     product = _information(problem, values)
-    shape = start.shape
-
-    def iterate(_: Any, block: Array) -> Array:
-        return _orthonormal(product(block).reshape(shape[0], -1)).reshape(shape)
-
-    block = jax.lax.fori_loop(0, iterations, iterate, _orthonormal(start.reshape(shape[0], -1)).reshape(shape))
+    block = jax.lax.fori_loop(0, iterations, lambda _, block: _orthonormal(product(block)), _orthonormal(start))
     return _ritz(block, product(block), largest=True)
 
 
 @jit_quickly(eqx.filter_jit)
 def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, ""], degree: int) -> tuple[Array, Array]:
     product = _information(problem, values)
-    shape = start.shape
 
     def improve(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
         values, block = state
@@ -165,15 +159,14 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
             return (product(x) - centre * x) / half
 
         block, _, _ = chebyshev_recurrence(scaled, block, degree)
-        block = _orthonormal(block.reshape(shape[0], -1)).reshape(shape)
+        block = _orthonormal(block)
         return _ritz(block, product(block), largest=False)
 
-    block = _orthonormal(start.reshape(shape[0], -1)).reshape(shape)
-    return jax.lax.fori_loop(0, _ROUNDS, improve, (jnp.full(shape[0], 0.2 * top), block))
+    return jax.lax.fori_loop(0, _ROUNDS, improve, (jnp.full(len(start), 0.2 * top), _orthonormal(start)))
 
 
-def _orthonormal(rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    return lapack.orthonormal_columns(rows.T).T
+def _orthonormal(block: Float[Array, "n *values"]) -> Float[Array, "n *values"]:
+    return lapack.orthonormal_columns(block.reshape(len(block), -1).T).T.reshape(block.shape)
 
 
 def _ritz(block: Array, image: Array, largest: bool) -> tuple[Array, Array]:

@@ -1,13 +1,23 @@
-"""The result of a fit."""
+"""The result of a fit, and its error bars: draws from the posterior that its linearisation has."""
 
 import dataclasses
+import math
+from typing import Any
 
-from jaxtyping import Array
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
+from hks_jax.checks import require_count, require_number
+from hks_jax.compilation import jit_quickly
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.inverse.posterior import Posterior, posterior
 from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
+
+_TOLERANCE, _STEPS = 1e-6, 1000
+"""Of the residuals of conjugate gradients, relative, and their number at most."""
 
 RESULTS = {
     "converged": "the unknowns no longer change by more than the tolerance",
@@ -50,6 +60,22 @@ class Step:
         return (
             f"{where}step {self.step}: loss {self.loss:.3e}, gradient {self.gradient:.1e}, {self.seconds:.1f} s{mark}"
         )
+
+
+class Posterior(eqx.Module):
+    """What noise and prior leave open of a fitted metric, to first order.
+
+    Attributes:
+        values: (*values) the standard deviations of the unknowns, in the parametrisation's units.
+        tensors: (*shape, d, d) those of the tensors' components.
+        unsolved: the largest relative residual of the linear systems of the draws.
+        sampling_error: the relative standard deviation of all of these deviations.
+    """
+
+    values: Float[Array, "*values"]
+    tensors: Float[Array, "*shape d d"]
+    unsolved: Float[Array, ""]
+    sampling_error: float = eqx.field(static=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +142,42 @@ class MetricFit:
         noise = self.noise if noise is None else noise
         if noise is None:
             raise ValueError("noise: the fit has none; give the standard deviation of its residuals, or fit with one")
-        return posterior(self.problem, self.values, noise, prior, draws, seed)
+        require_number("noise", noise)
+        require_number("prior", prior)
+        require_count("draws", draws)
+        # The weights add up to one over m entries: a residual of deviation σ has σ²/m after weighting, in the mean.
+        scale = math.sqrt(self.problem.observation.target.size) / noise
+        dtype, keys = self.values.dtype, jax.random.split(jax.random.key(seed), draws)
+        numbers = jnp.asarray(scale, dtype), jnp.asarray(prior, dtype)
+        return Posterior(*_deviations(self.problem, self.values, *numbers, keys), 1 / math.sqrt(2 * draws))
 
     def __repr__(self) -> str:
         return f"MetricFit({self.result}: loss {self.loss:.3e} after {self.steps} steps)"
+
+
+# With independent standard normal numbers ξ the right-hand side Aᵀξ + ξ₀/τ has the covariance H = AᵀA + 1/τ², so that
+# H⁻¹ times it has H⁻¹ (Papandreou and Yuille 2010).
+@jit_quickly(eqx.filter_jit)
+def _deviations(
+    problem: Problem, values: Values, scale: Float[Array, ""], prior: Float[Array, ""], keys: Array
+) -> tuple[Array, Array, Array]:
+    def residuals(values: Values) -> Array:
+        return scale * ravel_pytree(problem.residuals(values))[0]
+
+    at, product = jax.linearize(residuals, values)
+    transposed = jax.linear_transpose(product, values)
+    _, to_tensors = jax.linearize(lambda values: problem.unknowns.field(values).tensors, values)
+
+    def information(x: Values) -> Values:
+        return transposed(product(x))[0] + x / prior**2
+
+    def draw(key: Array) -> tuple[Any, Any, Any]:
+        of_data, of_prior = jax.random.split(key)
+        noise = jax.random.normal(of_data, at.shape, at.dtype)
+        rhs = transposed(noise)[0] + jax.random.normal(of_prior, values.shape, values.dtype) / prior
+        x, _ = jax.scipy.sparse.linalg.cg(information, rhs, tol=_TOLERANCE, maxiter=_STEPS)
+        left = jnp.linalg.norm((information(x) - rhs).ravel()) / jnp.linalg.norm(rhs.ravel())
+        return x**2, to_tensors(x) ** 2, left
+
+    squares, of_tensors, left = jax.lax.map(draw, keys)
+    return jnp.sqrt(jnp.mean(squares, axis=0)), jnp.sqrt(jnp.mean(of_tensors, axis=0)), jnp.max(left)

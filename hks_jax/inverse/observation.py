@@ -1,5 +1,7 @@
 """What is observed: a target signature, where and when, and how a prediction is compared with it."""
 
+import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +17,7 @@ from hks_jax.signatures.hks import hks_of_pairs
 from hks_jax.signatures.kernels import heat_trace, wks
 from hks_jax.static_array import StaticArray
 
-Signature = Callable[[Eigenpairs], Array]
+Function = Callable[[Eigenpairs], Array]
 Loss = Callable[[Array, Array], Array]
 
 LOSSES: dict[str, Loss] = {
@@ -23,43 +25,50 @@ LOSSES: dict[str, Loss] = {
     "relative": lambda predicted, target: predicted / target - 1,
     "absolute": lambda predicted, target: predicted - target,
 }
-SIGNATURES = ("hks", "wks", "heat-trace", "eigenvalues")
+
+
+@dataclasses.dataclass(frozen=True)
+class Signature:
+    """A kind of signature."""
+
+    name: str  # what `fit_metric` calls it; empty for a function of the user's
+    # takes eigenpairs, times, the width of a wave kernel and how many entries there are; a user's takes the
+    # eigenpairs alone
+    function: Callable[..., Array]
+    # of what it depends on beside the eigenpairs: ``"t"`` for times of the flow of heat, ``"e"`` for energies, empty
+    # for nothing
+    symbol: str = ""
+    at_nodes: bool = False  # whether it has a value for each node
+
+
+SIGNATURES = {
+    each.name: each
+    for each in (
+        Signature("hks", lambda pairs, times, *_: hks_of_pairs(pairs, times), "t", at_nodes=True),
+        Signature("wks", lambda pairs, energies, sigma, _: wks(pairs, energies, sigma), "e", at_nodes=True),
+        Signature("heat-trace", lambda pairs, times, *_: heat_trace(pairs, times), "t"),
+        Signature("eigenvalues", lambda pairs, _, __, count: pairs.eigenvalues[:count]),  # there may be spare ones
+    )
+}
 
 
 class Observation(eqx.Module):
-    """The observed entries of a target.
+    """The observed entries of a target."""
 
-    Attributes:
-        target: (m,) their values.
-        root_weights: (m,) the square roots of their weights, which add up to one.
-        times: the times, energies, or None.
-        sigma: the width of a wave kernel signature, or None.
-        shape: of the whole target.
-        entries: which of the flat target's entries they are.
-        signature: one of `SIGNATURES`, or a function of the eigenpairs.
-        loss: one of `LOSSES`, or a function of predicted and target (m,) to residuals (m,).
-    """
-
-    target: Float[Array, " m"]
-    root_weights: Float[Array, " m"]
-    times: Float[Array, " n_times"] | None
-    sigma: Float[Array, ""] | None
-    shape: tuple[int, ...] = eqx.field(static=True)
-    entries: StaticArray = eqx.field(static=True)
-    signature: str | Signature = eqx.field(static=True)
+    target: Float[Array, " m"]  # (m,) their values
+    root_weights: Float[Array, " m"]  # (m,) the square roots of their weights, which add up to one
+    times: Float[Array, " n_times"] | None  # the times, energies, or None
+    sigma: Float[Array, ""] | None  # the width of a wave kernel signature, or None
+    shape: tuple[int, ...] = eqx.field(static=True)  # of the whole target
+    entries: StaticArray = eqx.field(static=True)  # which of the flat target's entries they are
+    signature: Signature = eqx.field(static=True)  # its kind
+    # one of `LOSSES`, or a function of predicted and target (m,) to residuals (m,)
     loss: str | Loss = eqx.field(static=True)
 
     def predict(self, pairs: Eigenpairs) -> Array:
         """Return the whole signature."""
-        if callable(self.signature):
-            return self.signature(pairs)
-        if self.signature == "hks":
-            return hks_of_pairs(pairs, self.times)
-        if self.signature == "wks":
-            return wks(pairs, self.times, self.sigma)
-        if self.signature == "heat-trace":
-            return heat_trace(pairs, self.times)
-        return pairs.eigenvalues[: self.shape[0]]  # there may be spare ones
+        beside = (self.times, self.sigma, self.shape[0]) if self.signature.name else ()
+        return self.signature.function(pairs, *beside)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
         """Return the residuals, half of whose sum of squares is the misfit."""
@@ -75,47 +84,39 @@ def observe(
     target: Any,
     times: Any,
     weights: Any,
-    signature: str | Signature,
+    signature: str | Function,
     loss: str | Loss,
     sigma: Any,
     space: FunctionSpace,
     dtype: Any,
 ) -> Observation:
-    """Check what is given and return the observation; see `hks_jax.fit_metric` for the arguments.
-
-    Raises:
-        ValueError: an unknown signature or loss; a target, times or weights of the wrong shape; values that are NaN or,
-            for a loss that needs it, not positive, at observed entries; nothing observed.
-    """
+    """Check what is given and return the observation; see `hks_jax.fit_metric` for the arguments."""
     if not callable(signature) and signature not in SIGNATURES:
         names = ", ".join(map(repr, SIGNATURES))
         raise ValueError(f"signature: got {signature!r}; expected {names}, or a function of eigenpairs")
+    kind = Signature("", signature) if callable(signature) else SIGNATURES[signature]
     if not callable(loss) and loss not in LOSSES:
         names = ", ".join(map(repr, LOSSES))
         raise ValueError(f"loss: got {loss!r}; expected {names}, or a function of predicted and target values")
     for name, given in (("target", target), ("times", times), ("weights", weights)):
         require_real(name, given)
     values = np.asarray(target, np.float64)
-    nodal = (signature in ("hks", "wks")) if not callable(signature) else False
-    if signature in ("hks", "heat-trace"):
-        times = checked_times("times", times, dtype)
-    elif signature == "wks":
+    if kind.symbol == "e":
         if sigma is None:
             raise ValueError("sigma: got None; expected the width of the wave kernel signature, as for `wks`")
         require_number("sigma", sigma)
         times, sigma = jnp.asarray(times, dtype), jnp.asarray(sigma, dtype)
     else:
-        times = None
-    expected: tuple[int, ...] | None = None
-    if times is not None:
-        expected = (times.size, *space.node_shape) if nodal else (times.size,)
-    if (expected is not None and values.shape != expected) or (signature == "eigenvalues" and values.ndim != 1):
-        what = {"eigenvalues": "(m,), the lowest ones ascending", "heat-trace": f"(n_times,) = {expected}"}
-        wanted = what.get(str(signature), f"(n_times, *grid.shape) = {expected}")
+        times, sigma = checked_times("times", times, dtype) if kind.symbol else None, None
+    nodes = space.node_shape if kind.at_nodes else ()
+    expected = None if times is None else (times.size, *nodes)
+    if (expected is not None and values.shape != expected) or (kind.name == "eigenvalues" and values.ndim != 1):
+        what = "(n_times, *grid.shape)" if kind.at_nodes else "(n_times,)"
+        wanted = "(m,), the lowest ones ascending" if expected is None else f"{what} = {expected}"
         raise ValueError(f"target: got shape {values.shape}; expected {wanted}")
 
-    observed = np.broadcast_to(space.free, values.shape) if nodal else np.ones(values.shape, dtype=bool)
-    if signature == "eigenvalues":
+    observed = np.broadcast_to(space.free, values.shape) if kind.at_nodes else np.ones(values.shape, dtype=bool)
+    if kind.name == "eigenvalues":
         observed = observed & (np.arange(values.size) >= space.n_null)  # zero whatever the metric is
     share = _checked_weights(weights, values.shape) * observed
     used = share > 0
@@ -128,31 +129,39 @@ def observe(
         target=jnp.asarray(values.ravel()[entries], dtype),
         root_weights=jnp.asarray(np.sqrt(share / share.sum()), dtype),
         times=times,
-        sigma=sigma if signature == "wks" else None,
+        sigma=sigma,
         shape=values.shape,
         entries=StaticArray(entries),
-        signature=signature,
+        signature=kind,
         loss=loss,
     )
 
 
-def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[np.ndarray, float]:
-    """Return the weights that a stated deviation of the target makes, and the deviation of a residual in their mean.
+def stages_of(
+    whole: Observation, weights: Any, shape: tuple[int, ...], count: int, build: Callable[[Any], Observation]
+) -> list[Observation]:
+    """Return the observation of each stage: the largest times first."""
+    if count == 1 or whole.signature.symbol != "t":
+        return [whole]
+    assert whole.times is not None
+    order = np.argsort(-np.asarray(whole.times))
+    base = np.broadcast_to(np.ones(()) if weights is None else np.asarray(weights, float), shape)
+    stages = []
+    for stage in range(1, count):
+        used = np.zeros(shape[0], dtype=bool)
+        used[order[: math.ceil(shape[0] * stage / count)]] = True
+        stages.append(build(base * used.reshape(-1, *[1] * (len(shape) - 1))))
+    return [*stages, whole]
 
-    Raises:
-        ValueError: deviations of another shape, or not positive where the target is known; a loss that is a function.
-    """
+
+def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[np.ndarray, float]:
+    """Return the weights that a stated deviation of the target makes, and the deviation of a residual in their mean."""
     if callable(loss):
         raise ValueError("deviation: it cannot be taken through a loss that is a function; give weights and noise")
     require_real("deviation", deviation)
     values = np.asarray(target, np.float64)
     given = _checked_weights(weights, values.shape)
-    try:
-        size = np.broadcast_to(np.asarray(deviation, np.float64), values.shape)
-    except ValueError:
-        raise ValueError(
-            f"deviation: got shape {np.shape(deviation)}; expected one that broadcasts to the target's {values.shape}"
-        ) from None
+    size = _broadcast("deviation", deviation, values.shape)
     used = (given > 0) & np.isfinite(values)
     if (bad := used & ~(np.isfinite(size) & (size > 0))).any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
@@ -166,17 +175,20 @@ def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[
 
 
 def _checked_weights(weights: Any, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.ones(shape) if weights is None else np.asarray(weights, np.float64)
-    try:
-        array = np.broadcast_to(array, shape)
-    except ValueError:
-        raise ValueError(
-            f"weights: got shape {array.shape}; expected one that broadcasts to the target's {shape}, such as "
-            "(*grid.shape) for nodes or (n_times, 1, 1) for times"
-        ) from None
+    array = np.ones(shape) if weights is None else _broadcast("weights", weights, shape)
     if not (np.isfinite(array) & (array >= 0)).all():
         raise ValueError("weights: got negative, infinite or NaN ones; expected numbers ≥ 0 (0: not observed)")
     return array
+
+
+def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        return np.broadcast_to(np.asarray(values, np.float64), shape)
+    except ValueError:
+        raise ValueError(
+            f"{name}: got shape {np.shape(values)}; expected one that broadcasts to the target's {shape}, such as "
+            "(*grid.shape) for nodes or (n_times, 1, 1) for times"
+        ) from None
 
 
 def _check_values(values: np.ndarray, used: np.ndarray, positive: bool) -> None:

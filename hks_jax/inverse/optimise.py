@@ -13,8 +13,7 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.outcome import Outcome, residuals_and_outcome
-from hks_jax.inverse.problem import Problem
+from hks_jax.inverse.problem import Outcome, Problem, residuals_and_outcome
 from hks_jax.inverse.unknowns import Values
 
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -23,17 +22,11 @@ _REJECTIONS = 12
 
 
 class _Told(eqx.Module):
-    """What residuals and objective tell a solver beside their value, with the unknowns to which it belongs.
+    """What residuals and objective tell a solver beside their value, with the unknowns to which it belongs."""
 
-    Attributes:
-        values: the unknowns.
-        outcome: what a fit has come to with them.
-        gradient: the norm of the objective's gradient; NaN where it was not computed.
-    """
-
-    values: Values
-    outcome: Outcome
-    gradient: Float[Array, ""]
+    values: Values  # the unknowns
+    outcome: Outcome  # what a fit has come to with them
+    gradient: Float[Array, ""]  # the norm of the objective's gradient; NaN where it was not computed
 
 
 def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
@@ -107,17 +100,8 @@ def optimise(
 ) -> tuple[Values, Outcome | None, str]:
     """Run until the solver, the noise level or the number of steps says stop.
 
-    Args:
-        problem: the residuals.
-        values: where to begin.
-        optimiser: the solver.
-        noise: standard deviation of the residuals that noise explains; None runs to convergence.
-        max_steps: steps after which to give up.
-        log: called after each step.
-
-    Returns:
-        The best unknowns seen, their outcome (None where none was computed), and one of the keys of
-        `metric_fit.RESULTS`.
+    Returns the best unknowns seen, their outcome (None where none was computed), and one of the keys of
+    `metric_fit.RESULTS`.
     """
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
     best, least, seen = values, np.inf, None

@@ -162,11 +162,7 @@ def _rotation_3d(vector: Float[Array, "n 3"]) -> Tensors:
 
 
 def choose_parametrisation(given: Any) -> Parametrisation:
-    """Return the parametrisation that a name stands for.
-
-    Raises:
-        ValueError: an unknown one.
-    """
+    """Return the parametrisation that a name stands for."""
     if isinstance(given, Parametrisation):
         return given
     if isinstance(given, str) and given in PARAMETRISATIONS:

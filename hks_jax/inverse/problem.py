@@ -1,50 +1,48 @@
 """The least squares problem of a fit: from unknowns to a field, its eigenpairs, its signature, and the residuals."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.compilation import jit_quickly
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.eigen.weyl import weyl_count
+from hks_jax.fem.assembly import assemble
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
-from hks_jax.inverse.single_precision import residuals_of
 from hks_jax.inverse.unknowns import Unknowns, Values
-from hks_jax.signatures.truncation import resolving
+from hks_jax.signatures.truncation import resolving, truncation, truncation_map
 
 TAIL = 1e-6
 """What part of the heat trace at the smallest time may lie beyond the pairs that are computed."""
 _LOST = 0.05
 """What part makes a time unresolvable."""
+_NEAR = 0.1
+"""A misfit is near to what truncation leaves where that is more than this part of it: a third of the residuals."""
+_ENOUGH = 1e-5
+"""The accuracy of the solver's derivative for which single precision will do. Measured at 64² nodes, it costs 1e-6 in J
+and 1e-5 to 3e-5 in Jᵀ; solves to this tolerance cost 5e-6 and 5e-5, where nothing is smooth."""
 
 
 class Problem(eqx.Module):
-    """Residuals as a function of the unknowns.
+    """Residuals as a function of the unknowns."""
 
-    Attributes:
-        unknowns: what varies.
-        observation: what is to be matched.
-        regularisers: penalties.
-        k: eigenpairs.
-        boundary: boundary conditions.
-        solver: eigensolver.
-    """
-
-    unknowns: Unknowns
-    observation: Observation
-    regularisers: tuple[Regulariser, ...]
-    k: int = eqx.field(static=True)
-    boundary: Any = eqx.field(static=True)
-    solver: str | Eigensolver = eqx.field(static=True)
+    unknowns: Unknowns  # what varies
+    observation: Observation  # what is to be matched
+    regularisers: tuple[Regulariser, ...]  # penalties
+    k: int = eqx.field(static=True)  # eigenpairs
+    boundary: Any = eqx.field(static=True)  # boundary conditions
+    solver: str | Eigensolver = eqx.field(static=True)  # eigensolver
 
     def pairs(self, values: Values) -> Eigenpairs:
         """Return the eigenpairs of the field that the values stand for."""
@@ -62,7 +60,7 @@ class Problem(eqx.Module):
         """Return the residuals, and the eigenpairs from which they were computed."""
         field = self.unknowns.field(values)
         pairs = self._pairs_of(field)
-        data = residuals_of(self.observation, pairs, self.solver)
+        data = _residuals_of(self.observation, pairs, self.solver)
         penalties = [each.residuals(self.unknowns, values, field) for each in self.regularisers]
         return data, jnp.concatenate([jnp.zeros(0, data.dtype), *penalties]), pairs
 
@@ -96,11 +94,7 @@ def require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
 
 
 def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
-    """Return how many eigenpairs resolve the smallest time to `TAIL`: all, if that many are needed.
-
-    Raises:
-        ValueError: the grid does not resolve that time.
-    """
+    """Return how many eigenpairs resolve the smallest time to `TAIL`: all, if that many are needed."""
     smallest, n_dof, d = float(np.min(np.asarray(times))), unknowns_of(pencil), pencil.space.dimension
 
     def count(tail: float) -> int:
@@ -120,3 +114,109 @@ def _most_pairs(n_dof: int) -> int:
 def unknowns_of(pencil: AnyPencil) -> int:
     """Return how many eigenpairs there are."""
     return sum(part.space.n_dof for part in pencil.parts)
+
+
+# A heat signature is not below that of the constants. Others, and those where the constants are no eigenfunctions, may
+# be less than any number in single precision, which their logarithms are divided by.
+def _residuals_of(observation: Observation, pairs: Eigenpairs, solver: str | Eigensolver) -> Float[Array, " m"]:
+    """Return the residuals, whose derivative is in single precision where the solver's derivative needs no more."""
+    rough = isinstance(solver, Eigensolver) and solver.adjoint.tolerance >= _ENOUGH
+    bounded = observation.signature.symbol == "t" and pairs.n_null > 0
+    return (_rough if rough and bounded else Observation.residuals)(observation, pairs)
+
+
+@eqx.filter_custom_jvp
+def _rough(observation: Observation, pairs: Eigenpairs) -> Float[Array, " m"]:
+    return observation.residuals(pairs)
+
+
+@_rough.def_jvp
+def _rough_jvp(primals: tuple, tangents: tuple) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    residuals = _rough(*primals)
+    _, change = eqx.filter_jvp(Observation.residuals, _in_single(primals), _in_single(tangents))
+    return residuals, change.astype(residuals.dtype)
+
+
+def _in_single(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, tree)
+
+
+class Outcome(NamedTuple):
+    """What a fit has come to."""
+
+    loss: Float[Array, ""]  # half the weighted mean square of the residuals, plus the penalties
+    misfit: Float[Array, ""]  # the part of the data
+    truncation: Float[Array, ""]  # see `truncation_misfit`
+    pairs: Eigenpairs  # the eigenpairs, without their arrays at nodes and without their pencil
+
+
+def residuals_and_outcome(problem: Problem, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
+    """Return the residuals of the data and those of the penalties, and what a fit has come to with these unknowns."""
+    data, penalties, pairs = problem.residuals_and_pairs(values)
+    left = truncation_misfit(problem.observation, pairs)
+    pairs = eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), pairs, (None, None, None))
+    return data, penalties, jax.lax.stop_gradient(Outcome(*losses_of(data, penalties), left, pairs))
+
+
+@jit_quickly(eqx.filter_jit)
+def outcome_of(problem: Problem, values: Values) -> Outcome:
+    """Return what a fit has come to with these unknowns."""
+    return residuals_and_outcome(problem, values)[2]
+
+
+def truncation_misfit(observation: Observation, pairs: Eigenpairs) -> Float[Array, ""]:
+    """Estimate the misfit that the metric itself would have to a target of all pairs, as k are computed.
+
+    Half the weighted sum of squares of the changes of the residuals that the missing pairs make, by `truncation_map`
+    (heat traces: `truncation`). Zero for other signatures, whose residuals are defined by k pairs.
+    """
+    if observation.signature.symbol != "t":
+        return jnp.zeros(())
+    assert observation.times is not None
+    pairs, at_nodes = jax.lax.stop_gradient(pairs), observation.signature.at_nodes
+    predicted = observation.predict(pairs)
+    share = truncation_map(pairs, observation.times) if at_nodes else truncation(pairs, observation.times).tail
+    change = observation.compare(predicted / (1 - share)) - observation.compare(predicted)
+    return jnp.sum(change**2) / 2
+
+
+def truncation_shows(misfit: float, left: float) -> bool:
+    """Tell whether a misfit is near to what truncation leaves, and that is more than `TAIL`."""
+    return left > (2 * TAIL) ** 2 / 2 and left > _NEAR * misfit
+
+
+def more_pairs(problem: Problem, values: Values) -> int:
+    """Return how many pairs to go on with where those of a problem are too few for the field that it has come to."""
+    field = problem.unknowns.field(values)
+    pencil = assemble(field, problem.boundary)
+    smallest = float(np.min(observed_times(problem.observation)))
+    wanted = pairs_below(resolving(TAIL, pencil.space.dimension) / smallest, pencil, field)
+    return min(max(wanted, math.ceil(1.25 * problem.k)), unknowns_of(pencil))
+
+
+def observed_times(observation: Observation) -> Float[np.ndarray, " n"]:
+    """Return the times at which something is observed."""
+    assert observation.times is not None
+    per_time = math.prod(observation.shape[1:])
+    return np.asarray(observation.times)[np.unique(observation.entries.value // per_time)]
+
+
+def pairs_of_stage(
+    observation: Observation, k: int | None, shape: tuple[int, ...], pencil: AnyPencil, field: TensorField
+) -> int:
+    """Return how many eigenpairs to compute for what a stage observes."""
+    if observation.signature.name == "eigenvalues":
+        return shape[0]
+    if observation.times is None:
+        if k is None:
+            raise ValueError("k: got None; a signature of your own needs the number of eigenpairs")
+        return k
+    if observation.sigma is not None:
+        reach = float(jnp.max(observation.times) + 2 * observation.sigma)
+        wanted, unknowns = pairs_below(math.exp(reach), pencil, field), unknowns_of(pencil)
+        if k is None:
+            what = f"energies up to {float(jnp.max(observation.times)):.4g}, which take"
+            require_resolved(wanted, unknowns, what, "lower energies")
+    else:
+        wanted = pairs_for(observed_times(observation), pencil, field)  # those of this stage
+    return wanted if k is None else k

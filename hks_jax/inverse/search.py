@@ -19,9 +19,8 @@ from hks_jax.inverse.conformal import (
 )
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.optimise import Optimiser, optimise
-from hks_jax.inverse.outcome import Outcome, more_pairs, observed_times, outcome_of, truncation_shows
 from hks_jax.inverse.parametrisation import Conformal
-from hks_jax.inverse.problem import Problem
+from hks_jax.inverse.problem import Outcome, Problem, more_pairs, observed_times, outcome_of, truncation_shows
 from hks_jax.inverse.unknowns import Nodal, Unknowns, Values
 
 OPTIMISERS = ("gauss-newton", "lbfgs", "bfgs")
@@ -34,7 +33,7 @@ def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: fl
     grid = unknowns.init.grid
     if smoothness is None:
         extent = max(h * (n - 1) for h, n in zip(grid.spacing, grid.shape, strict=True))
-        smoothness = 0.1 * extent if unknowns.smooth or noise is not None else 0.0
+        smoothness = 0.1 * extent if unknowns.parametrisation.smooth or noise is not None else 0.0
     return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype)
 
 
@@ -46,19 +45,7 @@ def choose_optimiser(
     inner_product: InnerProduct,
     step_size: float = 1.0,
 ) -> Optimiser:
-    """Return the solver that a name stands for.
-
-    Args:
-        given: one of `OPTIMISERS`, or a solver.
-        problem: what it is for.
-        tolerance: see `hks_jax.fit_metric`.
-        noise: the same.
-        inner_product: in which steps are small.
-        step_size: where damping begins, relative to where it does by default.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """Return the solver that one of `OPTIMISERS` stands for; a step size below 1 begins with as much more damping."""
     if given == "gauss-newton":
         # Against noise small steps: the misfit must not fall far below what the noise explains.
         damping, growth = (1e-4, 10.0) if noise is None else (1e-2, 3.0)
@@ -81,7 +68,7 @@ def _preconditioner(problem: Problem, inner_product: InnerProduct) -> Preconditi
     unknowns, observation = problem.unknowns, problem.observation
     if isinstance(unknowns, Nodal) and isinstance(unknowns.parametrisation, Conformal):
         rough = isinstance(inner_product, Smoothing) and inner_product.factor is None
-        if rough and observation.signature == "hks" and not problem.regularisers:
+        if rough and observation.signature.name == "hks" and not problem.regularisers:
             return conformal_information(unknowns, inner_product, jnp.asarray(observed_times(observation)))
     return inner_product
 
@@ -91,17 +78,11 @@ _EARLY = 100.0
 
 
 class Reached(NamedTuple):
-    """Where a search has come to.
+    """Where a search has come to."""
 
-    Attributes:
-        values: the unknowns.
-        outcome: what a fit has come to with them; None where it is not known.
-        result: one of the keys of `metric_fit.RESULTS`.
-    """
-
-    values: Values
-    outcome: Outcome | None
-    result: str
+    values: Values  # the unknowns
+    outcome: Outcome | None  # what a fit has come to with them; None where it is not known
+    result: str  # one of the keys of `metric_fit.RESULTS`
 
     @property
     def stopped(self) -> bool:
@@ -111,23 +92,14 @@ class Reached(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """How to search; see `hks_jax.fit_metric`.
+    """How to search; see `hks_jax.fit_metric`."""
 
-    Attributes:
-        optimiser: a name or a solver.
-        tolerance: what the unknowns still change at the end.
-        noise: the standard deviation of the residuals that noise explains.
-        inner_product: in which steps are small.
-        max_steps: of each stage.
-        log: what happens is told to it.
-    """
-
-    optimiser: str | Optimiser
-    tolerance: float
-    noise: float | None
-    inner_product: InnerProduct
-    max_steps: int
-    log: Log
+    optimiser: str | Optimiser  # a name or a solver
+    tolerance: float  # what the unknowns still change at the end
+    noise: float | None  # the standard deviation of the residuals that noise explains
+    inner_product: InnerProduct  # in which steps are small
+    max_steps: int  # of each stage
+    log: Log  # what happens is told to it
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
         """Solve one problem, beginning at some unknowns, to so many tolerances."""
@@ -152,14 +124,7 @@ class Search:
     def from_starts(
         self, problems: Sequence[Problem], begin: Callable[[int], Values], starts: int, resumed: Checkpoint | None
     ) -> Reached:
-        """Return the best of several starts.
-
-        Args:
-            problems: of the stages.
-            begin: returns the unknowns at which a start begins.
-            starts: how many there are.
-            resumed: where to go on.
-        """
+        """Return the best of several starts, each at the unknowns that `begin` returns for its number."""
         if resumed and resumed.stage == len(problems):  # with more eigenpairs; no start is open any more
             return Reached(jnp.asarray(resumed.values), None, "converged")
         best = Reached(self.log.best, None, "interrupted")
@@ -183,13 +148,8 @@ class Search:
     ) -> tuple[Values, Outcome, str, Problem]:
         """Go on with more eigenpairs while what they leave out shows: they were chosen for the volume of the start.
 
-        Args:
-            reached: where the search has come to.
-            problem: the last problem.
-            renewed: returns it with another number of eigenpairs; None leaves that as it is.
-
-        Returns:
-            The unknowns, their outcome, how it ended, and the problem with as many eigenpairs as it took.
+        Returns the unknowns, their outcome, how it ended, and the problem with as many eigenpairs as it took.
+        `renewed` makes it, of their number; None leaves that as it is.
         """
         while True:
             outcome = reached.outcome or outcome_of(problem, reached.values)

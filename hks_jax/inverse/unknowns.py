@@ -21,11 +21,6 @@ Values = Float[Array, "..."]
 class Unknowns(eqx.Module):
     """What a fit varies."""
 
-    @property
-    @abstractmethod
-    def smooth(self) -> bool:
-        """Whether steps should be smooth over the nodes."""
-
     @abstractmethod
     def start(self) -> Values:
         """Return the values at the initial field."""
@@ -35,31 +30,16 @@ class Unknowns(eqx.Module):
         """Return the field that the values stand for."""
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the values' slopes along the grid's edges, axis by axis; zero where an end is outside the domain.
-
-        Raises:
-            ValueError: the values do not belong to nodes.
-        """
+        """Return the values' slopes along the grid's edges, axis by axis; zero where an end is outside the domain."""
         raise ValueError("regularisers: parameters of a function have no neighbours; use Prior or LogDeterminant")
 
 
 class Nodal(Unknowns):
-    """A few numbers at each node of the domain.
+    """A few numbers at each node of the domain."""
 
-    Attributes:
-        parametrisation: what they mean.
-        init: the initial field, which stays as it is outside the domain.
-        nodes: the flat indices of the domain's nodes.
-    """
-
-    parametrisation: Parametrisation
-    init: TensorField
-    nodes: StaticArray = eqx.field(static=True)
-
-    @property
-    def smooth(self) -> bool:
-        """Whether the parametrisation asks for it."""
-        return self.parametrisation.smooth
+    parametrisation: Parametrisation  # what they mean
+    init: TensorField  # the initial field, which stays as it is outside the domain
+    nodes: StaticArray = eqx.field(static=True)  # the flat indices of the domain's nodes
 
     @property
     def _base(self) -> Float[Array, "n d d"]:
@@ -93,34 +73,20 @@ class Nodal(Unknowns):
 
 
 class Free(Unknowns):
-    """The parameters of a function of the user's.
+    """The parameters of a function of the user's."""
 
-    Attributes:
-        function: maps them to a field, or to tensors on the grid of the initial field.
-        parameters: where to start, any pytree of floating point arrays.
-        init: the initial field, for its grid and interpolation.
-    """
-
+    # maps them to a field, or to tensors on the grid of the initial field
     function: Callable[[Any], Any] = eqx.field(static=True)
-    parameters: Any
-    init: TensorField
-
-    @property
-    def smooth(self) -> bool:
-        """Whether steps should be smooth: there are no nodes."""
-        return False
+    parameters: Any  # where to start, any pytree of floating point arrays
+    init: TensorField  # the initial field, for its grid and interpolation
 
     def start(self) -> Values:
         """Return the initial parameters, flat."""
         return ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[0]
 
-    def unravel(self, values: Values) -> Any:
-        """Return the parameters as the function takes them."""
-        return ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values)
-
     def field(self, values: Values) -> TensorField:
         """Return the field with these parameters."""
-        tensors = self.function(self.unravel(values))
+        tensors = self.function(ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values))
         if isinstance(tensors, TensorField):
             return tensors
         return TensorField(self.init.grid, tensors, self.init.interpolation)

@@ -18,6 +18,7 @@ from hks_jax.io.repair import find_background as find_background
 from hks_jax.io.repair import find_invalid as find_invalid
 from hks_jax.io.repair import positive_tensors as positive_tensors
 from hks_jax.io.repair import repair_tensors as repair_tensors
+from hks_jax.io.result import Result as Result
 from hks_jax.io.sampling import sample_tensors as sample_tensors
 from hks_jax.io.save import save as save
 from hks_jax.io.save import save_tensors as save_tensors

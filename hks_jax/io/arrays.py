@@ -9,13 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.io.tensor_order import choices, invalid_by_order, to_voxel_axes, unpack
-from hks_jax.io.volume import TensorVolume, as_mask, describe_tensors
+from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
 from hks_jax.npz import load_npy, load_npz, write_npz
-
-SUFFIXES = (".npz", ".npy")
-WRITTEN = (".npz",)
-IMAGE = ""
-OPTIONS = ("array", "spacing")
 
 
 def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
@@ -124,3 +119,6 @@ def _real(name: str, value: Any) -> Float[np.ndarray, "..."]:
 def _per_axis(name: str, value: Any, d: int) -> tuple[float, ...]:
     array = _real(name, value)
     return tuple((np.full(d, array) if array.ndim == 0 else array.ravel()).tolist())
+
+
+FORMAT = Format((".npz", ".npy"), read_tensors, ("array", "spacing"), read_image, (".npz",), write, write_tensors)

@@ -24,12 +24,7 @@ def component_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def siblings(path: str | os.PathLike[str]) -> list[str]:
-    """Return the six files of which one is given: their names differ in the component alone.
-
-    Raises:
-        ValueError: the name has no component.
-        FileNotFoundError: some of them are missing.
-    """
+    """Return the six files of which one is given: their names differ in the component alone."""
     folder, name = os.path.split(os.fspath(path))
     matches = list(_NAME.finditer(name))
     if not matches:
@@ -56,11 +51,8 @@ def read_tensors(
 ) -> TensorVolume:
     """Read tensors from six NIfTI images, whose names say which component each has, in any sequence.
 
-    Args:
-        paths: the six files.
-        order: must be None; for the error.
-        frame: the axes of the components; None: what the BIDS sidecar beside an image says (``Reference`` of
-            ``OrientationEncoding``), or those of the voxels.
+    The axes of the components are those asked for, or those that the BIDS sidecar beside an image says
+    (``Reference`` of ``OrientationEncoding``), or the voxels'. An order is refused.
 
     Raises:
         FileNotFoundError: no such file.

@@ -132,7 +132,9 @@ def fit_dwi(
     if bvec_frame != "fsl":
         notes.append(f"gradient directions along the {bvec_frame} axes, as asked; tensors taken to the voxel axes")
     if noise is not None:
-        notes.append(f"covariances of the tensors from {_noise_text(noise, int(used.sum()))}")
+        left = f"the fit's residuals, of {int(used.sum()) - 7} degrees of freedom in each voxel"
+        known = left if noise == "residuals" else f"the images' noise, stated as {noise:g}"
+        notes.append(f"covariances of the tensors from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
     return TensorVolume(
@@ -194,12 +196,6 @@ def _covariance(
     covariance = np.zeros((*inside.shape, 6, 6))
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     return covariance
-
-
-def _noise_text(noise: float | Literal["residuals"], images: int) -> str:
-    if noise == "residuals":
-        return f"the fit's residuals, of {images - 7} degrees of freedom in each voxel"
-    return f"the images' noise, stated as {noise:g}"
 
 
 def _of_length_one(

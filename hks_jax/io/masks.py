@@ -83,11 +83,6 @@ def read_labels(
         shape: that of the image.
         affine: voxel indices of the image to world coordinates, (4, 4); for a slice, those of a volume one voxel thick.
         slice_axis: for a slice, the axis that it cuts.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: an unknown kind of file, numbers with a fraction, or labels on other voxels.
-        ImportError: NIfTI without nibabel.
     """
     name = os.fspath(path)
     values, place = _image(path, affine, (*nifti.SUFFIXES, ".npy"))
@@ -105,10 +100,6 @@ def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
 
     Of a line without such a table, the name is what follows the number: up to the next tab if there is one before it,
     and without the four numbers of a colour that FreeSurfer's tables end in.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no text in UTF-8; no line begins with a number.
     """
     file = existing(path)
     with reading(file, "a text in UTF-8"):
@@ -141,7 +132,9 @@ def _image(
     path: str | os.PathLike[str], affine: np.ndarray | None, suffixes: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the voxel values, without a fourth axis of one entry, and the affine where the file has one."""
-    values, place = format_of(path, suffixes).read_image(path, affine)
+    read = format_of(path, suffixes).read_image
+    assert read is not None
+    values, place = read(path, affine)
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     return values, place

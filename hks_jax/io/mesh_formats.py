@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hks_jax.io.mesh_checks import MeshChecks
-from hks_jax.io.vtk_checks import check_legacy, check_xml
+from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
 from hks_jax.reading import reading
 
@@ -54,48 +54,13 @@ def through_meshio(path: Path) -> Loaded:
 
 def polygonal(path: Path) -> Loaded:
     """Load polygonal data through VTK, its polygons cut into triangles."""
-    optional("vtkmodules.vtkIOXML")
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
-    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    legacy = path.suffix.lower() == ".vtk"
-    errors: list[str] = []
     with reading(path, "readable polygonal data"):
-        if legacy:
-            check_legacy(path)
-        else:
-            check_xml(path, "PolyData")
-        reader = vtkPolyDataReader() if legacy else vtkXMLPolyDataReader()
-        reader.AddObserver("ErrorEvent", lambda source, event: errors.append(event))
-        reader.SetFileName(str(path))
-        reader.Update()
-        whole = reader.GetOutput()
-        if errors:
-            raise ValueError("VTK finds errors in it")
-        # VTK reads what lies at an index without a look at whether it is one.
-        for cells in (whole.GetPolys(), whole.GetStrips()):
-            corners = np.asarray(vtk_to_numpy(cells.GetConnectivityArray()), np.int64)
-            ends = np.asarray(vtk_to_numpy(cells.GetOffsetsArray()), np.int64)
-            if corners.size and not 0 <= corners.min() <= corners.max() < whole.GetNumberOfPoints():
-                raise ValueError(f"a polygon has the corner {corners.max()} of {whole.GetNumberOfPoints()} points")
-            if ends.size and (ends[0] != 0 or ends[-1] != corners.size or (np.diff(ends) < 3).any()):
-                raise ValueError("the polygons' offsets do not ascend from none to all corners, three or more each")
-    triangles = vtkTriangleFilter()
-    triangles.PassLinesOff()
-    triangles.PassVertsOff()
-    triangles.SetInputData(whole)
-    triangles.Update()
-    surface = triangles.GetOutput()
-    if not surface.GetNumberOfPolys():
-        raise ValueError(f"{path}: VTK finds no triangles in it; expected polygonal data, whole")
-    points = np.asarray(vtk_to_numpy(surface.GetPoints().GetData()), np.float64)
-    faces = np.asarray(vtk_to_numpy(surface.GetPolys().GetConnectivityArray()), np.int64)
-    data = whole.GetPointData()
-    named = {data.GetArrayName(i): data.GetArray(i) for i in range(data.GetNumberOfArrays())}
-    arrays = {key: vtk_to_numpy(values) for key, values in named.items() if key and values is not None}
-    return Loaded(points, faces.reshape(-1, 3), _real_arrays(arrays, len(points)))
+        data = through_vtk(path)
+        if "faces" not in data:
+            raise ValueError(f"it holds {data['kind']}")
+        points = data["points"].astype(np.float64)
+    arrays = {key.removeprefix("point:"): values for key, values in data.items() if key.startswith("point:")}
+    return Loaded(points, data["faces"].astype(np.int64), _real_arrays(arrays, len(points)))
 
 
 def _real_arrays(named: dict[str, Any], n_points: int) -> dict[str, Float[np.ndarray, "V *components"]]:

@@ -13,13 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.io.tensor_order import FRAMES, invalid_by_order, to_voxel_axes, unpack
-from hks_jax.io.volume import TensorVolume
+from hks_jax.io.volume import Format, TensorVolume
 from hks_jax.reading import existing, reading
 
-SUFFIXES = (".mif", ".mif.gz")
-WRITTEN: tuple[str, ...] = ()
-IMAGE = ".nii.gz"
-OPTIONS = ()
 _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
@@ -31,13 +27,8 @@ class Image(NamedTuple):
     affine: Float[np.ndarray, "4 4"]
 
 
-def load(path: str | os.PathLike[str]) -> Image:
-    """Read an image. A compressed one is read to its end, where its checksum is compared.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not MRtrix's format, or a damaged file; complex numbers.
-    """
+def load(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Image:
+    """Read an image, whatever lies beside it. A compressed one is read to its end, where its checksum is compared."""
     file = existing(path)
     with reading(file, "a readable image of MRtrix (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
@@ -61,11 +52,6 @@ def load(path: str | os.PathLike[str]) -> Image:
         if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
             raise ValueError("transform and vox place the voxels nowhere")
     return Image(values, affine)
-
-
-def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Image:
-    """Return the voxel values of an image, and its affine."""
-    return load(path)
 
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
@@ -126,3 +112,6 @@ def _in_order(flat: np.ndarray, shape: tuple[int, ...], layout: str) -> np.ndarr
     stored = flat.reshape([shape[axis] for axis in slowest_first])
     values = stored.transpose(np.argsort(slowest_first))
     return values[tuple(slice(None, None, -1 if word.startswith("-") else 1) for word in words)]
+
+
+FORMAT = Format((".mif", ".mif.gz"), read_tensors, read_image=load, image=".nii.gz")

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,14 +17,11 @@ from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
 from hks_jax.io.units import by_axis, scaled_beside
-from hks_jax.io.volume import TensorVolume, describe_tensors, images_of, own_record
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
-WRITTEN = (".nii.gz", ".nii")
-IMAGE = ".nii.gz"
-OPTIONS = ()
 SYMMETRIC_MATRIX = 1005
 """NIfTI's intent code for symmetric matrices."""
 COMMENT = 6
@@ -41,46 +38,29 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
 
 
 def load(path: str | os.PathLike[str]) -> Any:
-    """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a NIfTI image, or a damaged one.
-    """
+    """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared."""
     nib, file = optional("nibabel"), existing(path)
     with reading(file, "a readable NIfTI image"):
         if file.name.lower().endswith(".gz"):
             with gzip.open(file) as stream:
                 content = stream.read()
             kinds = {348: nib.Nifti1Image, 540: nib.Nifti2Image}
-            kind = next((kind for size, kind in kinds.items() if size in _either_order(content[:4])), None)
+            orders: tuple[Literal["little", "big"], ...] = ("little", "big")
+            kind = next((kinds[n] for order in orders if (n := int.from_bytes(content[:4], order)) in kinds), None)
             if kind is None:
                 raise ValueError("it does not begin with the size of NIfTI's header")
             image, length = kind.from_bytes(content), len(content)
         else:
             image, length = nib.load(file), file.stat().st_size
-        _check_length(image, length)
+        data = image.dataobj
+        declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
+        if declared != length:
+            raise ValueError(f"{data.dtype} of shape {image.shape} end at byte {declared}, the file at {length}")
     return image
 
 
-def _either_order(head: bytes) -> tuple[int, int]:
-    return int.from_bytes(head, "little"), int.from_bytes(head, "big")
-
-
-def _check_length(image: Any, length: int) -> None:
-    """Raise ValueError where the header contradicts the length of the file."""
-    data = image.dataobj
-    declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
-    if declared != length:
-        raise ValueError(f"{data.dtype} of shape {image.shape} end at byte {declared}, the file at {length}")
-
-
 def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
-    """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64.
-
-    Raises:
-        ValueError: a damaged file; values that are not real numbers.
-    """
+    """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64."""
     with reading(path, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
     require_real(os.fspath(path), data)
@@ -91,11 +71,7 @@ def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
 
 
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
-    """Return the affine with lengths in mm, and the unit that the file declares; the empty text if none.
-
-    Raises:
-        ValueError: a code for a unit that NIfTI does not have.
-    """
+    """Return the affine with lengths in mm, and the unit that the file declares; the empty text if none."""
     code = int(image.header["xyzt_units"]) & 7
     if code not in _LENGTHS:
         raise ValueError(f"{name}: its unit of space has the code {code}; expected one of NIfTI's, 0 to 3")
@@ -280,3 +256,6 @@ def _write(path: Path, image: Any, record: str) -> None:
     image.header.extensions.append(nib.nifti1.Nifti1Extension("comment", record.encode()))
     with atomic_path(path) as temporary:
         nib.save(image, temporary)
+
+
+FORMAT = Format(SUFFIXES, read_tensors, (), read_image, (".nii.gz", ".nii"), write, write_tensors, image=".nii.gz")

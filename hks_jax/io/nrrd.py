@@ -14,14 +14,9 @@ from hks_jax.io.nrrd_checks import check_data, check_header
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
 from hks_jax.io.units import millimetres, scaled_beside
-from hks_jax.io.volume import TensorVolume, describe_tensors, images_of, own_record
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
-
-SUFFIXES = (".nrrd", ".nhdr")
-WRITTEN = (".nrrd",)
-IMAGE = ".nrrd"
-OPTIONS = ("confidence",)
 
 TO_RAS = {
     "right-anterior-superior": (1.0, 1.0, 1.0),
@@ -51,21 +46,14 @@ KINDS = {
 
 
 class Placement(NamedTuple):
-    """Where the voxels lie, in mm where the file declares a unit.
+    """Where the voxels lie, in mm where the file declares a unit."""
 
-    Attributes:
-        directions: (d, d), the step along each voxel axis as a column, in the file's space.
-        origin: (d,), in the file's space.
-        signs: (d,), what takes the file's space to right, anterior, superior; None where it is not patient-based.
-        placed: whether the file gives directions at all, and not spacings alone.
-        unit: of length in the file; empty if it declares none.
-    """
-
-    directions: Float[np.ndarray, "d d"]
-    origin: Float[np.ndarray, " d"]
+    directions: Float[np.ndarray, "d d"]  # (d, d), the step along each voxel axis as a column, in the file's space
+    origin: Float[np.ndarray, " d"]  # (d,), in the file's space
+    # (d,), what takes the file's space to right, anterior, superior; None where it is not patient-based
     signs: Float[np.ndarray, " d"] | None
-    placed: bool
-    unit: str = ""
+    placed: bool  # whether the file gives directions at all, and not spacings alone
+    unit: str = ""  # of length in the file; empty if it declares none
 
     @property
     def affine(self) -> Float[np.ndarray, "4 4"] | None:
@@ -81,12 +69,7 @@ class Placement(NamedTuple):
 
 
 def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the array, first axis fastest in the file, in native floating point or as it is; and the header.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an NRRD file, or a damaged one.
-    """
+    """Return the array, first axis fastest in the file, in native floating point or as it is; and the header."""
     nrrd, file = optional("nrrd"), existing(path)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not
@@ -205,13 +188,8 @@ def _write(
 ) -> None:
     """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
 
-    Args:
-        path: ``.nrrd``.
-        array: (*shape,), or with one more axis: first for tensor components of a `kind`, last for times.
-        volume: where the voxels lie; a slice that has an affine must come one voxel thick.
-        record: the provenance.
-        kind: of the components' axis; None: scalars.
-        more: arrays for the header, as text.
+    It has one more axis for tensor components, of some `kind`, first, or for times last. A slice that has an affine
+    must come one voxel thick. More arrays go as text into the header.
     """
     nrrd = optional("nrrd")
     placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
@@ -344,3 +322,7 @@ def _to_voxel_axes(
     if frame == "fsl" and place.signs is not None:  # FSL's rule is about the axes right, anterior, superior
         affine[:d, :d] = place.signs[:, None] * place.directions
     return to_voxel_axes(tensors, frame, affine), frame
+
+
+_NAMES = (".nrrd", ".nhdr")
+FORMAT = Format(_NAMES, read_tensors, ("confidence",), read_image, (".nrrd",), write, write_tensors, image=".nrrd")

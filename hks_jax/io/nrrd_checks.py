@@ -62,14 +62,7 @@ def check_header(text: bytes, header: Mapping[str, Any]) -> None:
 
 
 def check_data(file: Path, header: Mapping[str, Any], stream: BufferedReader, start: int) -> None:
-    """Raise ValueError where compressed data do not end as they should, checksum included, or raw ones do not fit.
-
-    Args:
-        file: the header's file.
-        header: its fields.
-        stream: the file, open.
-        start: where the header ends.
-    """
+    """Raise ValueError where compressed data do not end as they should, checksum included, or raw ones do not fit."""
     beside = header.get("data file", header.get("datafile"))
     encoding = str(header["encoding"]).lower()
     with ExitStack() as opened:

@@ -28,33 +28,22 @@ _SAID = "Principal directions and those of the two neighbours along them differ 
 
 
 class Alternative(NamedTuple):
-    """Other axes that a file's components may be along.
+    """Other axes that a file's components may be along."""
 
-    Attributes:
-        name: a frame, or an axis of the voxels or of the scanner that is reversed.
-        is_frame: whether it is a frame.
-        angle: the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it.
-        errors: by how many standard errors that is less than with the axes in which the file was read.
-    """
-
-    name: str
-    is_frame: bool
+    name: str  # a frame, or an axis of the voxels or of the scanner that is reversed
+    is_frame: bool  # whether it is a frame
+    # the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it
     angle: float
-    errors: float
+    errors: float  # by how many standard errors that is less than with the axes in which the file was read
 
 
 class Coherence(NamedTuple):
-    """How well the fibres of neighbours continue each other, as the file was read, and along other axes.
+    """How well the fibres of neighbours continue each other, as the file was read, and along other axes."""
 
-    Attributes:
-        frame: in which the file was read.
-        angle: the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it.
-        others: the same along other axes.
-    """
-
-    frame: str
+    frame: str  # in which the file was read
+    # the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it
     angle: float
-    others: tuple[Alternative, ...]
+    others: tuple[Alternative, ...]  # the same along other axes
 
     @property
     def better(self) -> Alternative | None:
@@ -88,8 +77,7 @@ def coherence(volume: TensorVolume) -> Coherence | None:
     anisotropic, too. Tensors along the right axes agree best. The axes compared are the frames of
     `hks_jax.io.read_tensors`, and the file's own with one axis reversed, of the voxels or of the scanner.
 
-    Returns:
-        The angles; None for a slice, and where fewer than a thousand voxels have such neighbours.
+    Returns None for a slice, and where fewer than a thousand voxels have such neighbours.
     """
     if volume.dimension != 3:
         return None
@@ -118,12 +106,7 @@ def coherence(volume: TensorVolume) -> Coherence | None:
 
 
 def frame_question(found: Coherence | None, option: str = "frame") -> str:
-    """Ask whether the frame is wrong; the empty text where no other axes are clearly better.
-
-    Args:
-        found: from `coherence`.
-        option: the argument that says which frame it is.
-    """
+    """Ask whether the frame, which `option` says, is wrong; the empty text where no other axes are clearly better."""
     if found is None or found.better is None:
         return ""
     best = found.better

@@ -87,25 +87,19 @@ def read_tensors(
         if array is not None or spacing is not None:
             raise ValueError("array, spacing: they are for NumPy's and VTK's files; leave them out for six images")
         volume = components.read_tensors(list(path), order, frame)
-        return _finished(volume, mask, repair, unit)
-    name, reader = os.fspath(path), format_of(path)
-    if array is not None and "array" not in reader.OPTIONS:
-        raise ValueError(f"array: got {array!r}; only npz and VTK files have arrays by name")
-    if spacing is not None and "spacing" not in reader.OPTIONS:
-        raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
-    if reader is nifti and components.is_one_of_six(path):
-        return _finished(components.read_tensors(components.siblings(path), order, frame), mask, repair, unit)
-    given = {"array": array, "spacing": spacing, "confidence": confidence}
-    volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.OPTIONS})
-    if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
-        volume = replace(volume, digest=digest(name))
-    return _finished(volume, mask, repair, unit)
-
-
-def _finished(
-    volume: TensorVolume, mask: str | os.PathLike[str] | np.ndarray | None, repair: Repair | None, unit: Unit | None
-) -> TensorVolume:
-    """Return the volume with the mask, in mm²/s if its unit is told, and repaired if asked to."""
+    else:
+        name, reader = os.fspath(path), format_of(path)
+        if array is not None and "array" not in reader.options:
+            raise ValueError(f"array: got {array!r}; only npz and VTK files have arrays by name")
+        if spacing is not None and "spacing" not in reader.options:
+            raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
+        if reader is nifti.FORMAT and components.is_one_of_six(path):
+            volume = components.read_tensors(components.siblings(path), order, frame)
+        else:
+            given = {"array": array, "spacing": spacing, "confidence": confidence}
+            volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
+            if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
+                volume = replace(volume, digest=digest(name))
     if unit is not None:
         volume = in_mm2_per_s(volume, unit)
     if mask is not None:

@@ -154,12 +154,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
 
 
 def _why_so_many(volume: TensorVolume, finite: Bool[np.ndarray, "*shape"]) -> str:
-    """Ask what is wrong where more than a few tensors are: the order, or that they are no diffusion tensors.
-
-    Args:
-        volume: the tensors.
-        finite: those that are finite, and yet not positive definite.
-    """
+    """Ask why more than a few tensors, finite ones among them, are invalid: a wrong order, or no diffusion tensors."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if question or not finite.any():
         return question or "So many are no noise: NaN is often what lies outside a mask"

@@ -70,7 +70,9 @@ def save(
         raise ValueError(f"values: got shape {array.shape}; expected {shape}, or n_times before it")
     extra = dict(extra or {})
     if not isinstance(volume, SimplicialMesh):
-        format_of(file, WRITTEN).write(file, array, volume, name, extra, describe(volume, provenance))
+        write = format_of(file, WRITTEN).write
+        assert write is not None
+        write(file, array, volume, name, extra, describe(volume, provenance))
     elif file.name.lower().endswith(".npz"):
         cells = {WORDS[volume.triangulation.dimension].argument: volume.triangulation.cells}
         place = {"vertices": np.asarray(volume.vertices), **cells}
@@ -102,5 +104,7 @@ def save_tensors(
         ImportError: an optional library is missing; says what to install.
     """
     file = Path(path)
-    format_of(file, WRITTEN).write_tensors(file, volume, provenance)
+    write = format_of(file, WRITTEN).write_tensors
+    assert write is not None
+    write(file, volume, provenance)
     return file

@@ -57,14 +57,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_table(path: str | os.PathLike[str]) -> list[dict[str, str]]:
-    """Read a table with a header: tab-separated, or separated by commas if its name ends in ``.csv``.
+    """Return the rows of a table with a header, tab-separated, or separated by commas if its name ends in ``.csv``.
 
-    Returns:
-        One dictionary for each row that is not empty, without the cells that are empty or ``n/a``.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a table in UTF-8, columns without a name or of the same name, or rows longer than the header.
+    Cells that are empty or ``n/a`` are left out, and rows of nothing else.
     """
     file = existing(path)
     separator = "," if file.name.lower().endswith(".csv") else "\t"

@@ -57,11 +57,9 @@ def to_voxel_axes(
 ) -> Float[np.ndarray, "*shape d d"]:
     """Return the tensors with components along the voxel axes, from components along those of `frame`.
 
-    Args:
-        tensors: (*shape, d, d).
-        frame: ``"voxel"``: unchanged; ``"fsl"``: the first axis is reversed where det(affine) > 0; ``"world"``: along
-            the axes that the affine maps to, D_voxel = RᵀDR with R the rotation (or reflection) nearest to the affine.
-        affine: voxel indices to world coordinates.
+    The affine maps voxel indices to world coordinates. ``"voxel"``: unchanged; ``"fsl"``: the first axis is reversed
+    where det(affine) > 0; ``"world"``: along the axes that the affine maps to, D_voxel = RᵀDR with R the rotation (or
+    reflection) nearest to the affine.
     """
     if frame == "voxel":
         return tensors
@@ -106,17 +104,11 @@ _SAMPLE = 20_000
 
 
 class InvalidByOrder(NamedTuple):
-    """How many tensors of a file are not positive definite under each order of components.
+    """How many tensors of a file are not positive definite under each order of components."""
 
-    Attributes:
-        order: in which they were read.
-        counts: how many are invalid, by order.
-        of: how many there are, those that are exactly zero aside.
-    """
-
-    order: str
-    counts: dict[str, int]
-    of: int
+    order: str  # in which they were read
+    counts: dict[str, int]  # how many are invalid, by order
+    of: int  # how many there are, those that are exactly zero aside
 
     @property
     def fewer(self) -> list[str]:
@@ -137,18 +129,11 @@ class InvalidByOrder(NamedTuple):
 
 
 def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> InvalidByOrder | None:
-    """Count the tensors that are not positive definite under each order, where many are under their own.
+    """Count the tensors that are not positive definite under each order; None where few are under their own.
 
     Validity does not depend on the axes that components are along, only on their order. It tells ``"nifti"``,
     ``"fsl"`` and the orders with the diagonal first apart, but hardly ``"mrtrix"`` and ``"vtk"``, which exchange two
     components beside the diagonal.
-
-    Args:
-        components: six of 3×3 matrices, or three of 2×2, in any order.
-        order: in which they were read.
-
-    Returns:
-        The counts; None where few are invalid.
     """
     rows = components.reshape(-1, components.shape[-1])
     rows = rows[np.any(rows != 0, axis=-1)]

@@ -41,15 +41,7 @@ _NONE = ("", "???", "none", "unknown", "n/a")
 
 
 def millimetres(where: str, text: str) -> float | None:
-    """Return how many mm a header's unit of length is, None where it names none.
-
-    Args:
-        where: the file and the field, for the error.
-        text: such as ``"mm"``, ``"microns"``, ``"µm"``, ``"meters"``.
-
-    Raises:
-        ValueError: a unit that is not known.
-    """
+    """Return how many mm a header's unit of length is, such as "microns" or "µm"; None where it names none."""
     word = text.strip().lower()
     if word in _NONE:
         return None
@@ -75,11 +67,7 @@ def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"
 
 
 def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
-    """Return the volume with its tensors, which are in `unit`, in mm²/s.
-
-    Raises:
-        ValueError: an unknown unit, or a volume that has one already.
-    """
+    """Return the volume with its tensors, which are in `unit`, in mm²/s."""
     if unit not in get_args(Unit):
         raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
     if volume.unit:

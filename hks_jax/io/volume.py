@@ -3,8 +3,9 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,22 @@ from hks_jax.domain.grid import Grid
 from hks_jax.io.tensor_order import InvalidByOrder
 
 AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format of images on grids. A new one is a module with a `Format`, which `hks_jax.io.formats` lists."""
+
+    names: tuple[str, ...]  # how the names of its files end
+    read_tensors: Callable[..., "TensorVolume"]  # of a name, the order and the frame asked for, and the `options`
+    options: tuple[str, ...] = ()  # what of the arguments of `hks_jax.io.read_tensors` it takes
+    # Masks, labels: of a path, and the affine of the image beside which it belongs, to values and their own affine.
+    read_image: Callable[..., tuple[np.ndarray, np.ndarray | None]] | None = None
+    written: tuple[str, ...] = ()  # which of the names it writes
+    # Results: of a path, an array, the volume, the array's name, more arrays, and the provenance.
+    write: Callable[[Path, np.ndarray, "TensorVolume", str, Mapping[str, Any], str], None] | None = None
+    write_tensors: Callable[[Path, "TensorVolume", Mapping[str, Any] | None], None] | None = None
+    image: str = ""  # the suffix of results beside tensors in this format; empty where an npz is enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +229,9 @@ def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str
     if volume is not None:
         record |= {"source": volume.source, "sha256": volume.digest, "order": volume.order, "frame": volume.frame}
         record |= {"notes": list(volume.notes)}
-    return json.dumps({**record, **(more or {})}, default=_plain)  # in ASCII, which NRRD's header needs
+    return json.dumps(
+        {**record, **(more or {})}, default=lambda value: value.tolist() if hasattr(value, "tolist") else str(value)
+    )  # in ASCII, which NRRD's header needs
 
 
 def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:
@@ -233,7 +252,3 @@ def own_record(text: str | bytes) -> dict[str, Any]:
         return {}
     ours = isinstance(record, dict) and str(record.get("software", "")).startswith("hks-jax ")
     return record if ours and "source_frame" in record else {}
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

@@ -1,7 +1,11 @@
 """VTK's image data (.vti, and structured points in .vtk) through VTK, which is optional."""
 
+import math
 import os
 import re
+import subprocess
+import sys
+import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,19 +13,18 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from jaxtyping import Bool
 
 from hks_jax.atomic import atomic_path
 from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, to_voxel_axes, unpack
-from hks_jax.io.volume import TensorVolume, as_mask, describe_tensors
-from hks_jax.io.vtk_checks import check_legacy, check_xml
+from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
+from hks_jax.npz import load_npz
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
-SUFFIXES = (".vti", ".vtk")
-WRITTEN = (".vti",)
-IMAGE = ".vti"
-OPTIONS = ("array",)
+_ROOM, _RATIO = 8 << 30, 200
+"""Bytes of memory that VTK may take in reading a file, and how many more for each byte of the file."""
+_PATIENCE, _SPEED = 60.0, 1e6
+"""Seconds that it may take, and bytes a second beyond them."""
 
 
 def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
@@ -31,55 +34,42 @@ def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
     return head.startswith(b"# vtk DataFile") and kind.encode() in head.upper()
 
 
-def load(path: str | os.PathLike[str]) -> Any:
-    """Return the vtkImageData of a file.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not image data, or a damaged file.
-    """
+def load(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays that `vtk_child` finds in a file, in a process of its own."""
+    size = existing(path).stat().st_size
+    with tempfile.TemporaryDirectory() as folder:
+        arrays = Path(folder) / "arrays.npz"
+        script = Path(__file__).with_name("vtk_child.py")
+        child = subprocess.run(
+            [sys.executable, "-P", str(script), str(path), str(arrays), str(_ROOM + _RATIO * size)],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OPENBLAS_NUM_THREADS": "1"},
+            capture_output=True,
+            timeout=_PATIENCE + size / _SPEED,
+            check=False,
+        )
+        if child.returncode == 0:
+            return load_npz(arrays)
     optional("vtkmodules.vtkIOXML")
-    from vtkmodules.vtkIOLegacy import vtkStructuredPointsReader
-    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
-
-    file = existing(path)
-    name, errors = str(file), list[str]()
-
-    def remember(source: Any, event: str, message: str) -> None:
-        errors.append(message.split("): ")[-1].strip())
-
-    remember.CallDataType = "string0"  # type: ignore[attr-defined]
-    # VTK prints what its parts find wrong, and ends the process for want of memory: what it would stumble over is
-    # looked at first.
-    with reading(file, "readable VTK image data (.vti, or structured points in .vtk)"):
-        if name.lower().endswith(".vti"):
-            check_xml(file, "ImageData")
-            reader: Any = vtkXMLImageDataReader()
-        else:
-            if not holds_dataset(name, "STRUCTURED_POINTS"):
-                raise ValueError("no dataset STRUCTURED_POINTS in the first kilobyte")
-            check_legacy(file)
-            reader = vtkStructuredPointsReader()
-        for event in ("ErrorEvent", "WarningEvent"):
-            reader.AddObserver(event, remember)
-        reader.SetFileName(name)
-        reader.Update()
-        if errors:
-            raise ValueError(errors[0])
-    return reader.GetOutput()
+    said = child.stderr.decode(errors="replace").splitlines()
+    raise ValueError(said[-1] if said and child.returncode > 0 else f"VTK died over it: {child.returncode}")
 
 
 def read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
     """Read tensors; see `hks_jax.io.read_tensors`."""
-    image = load(name)
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    at_points = _has_candidates(image.GetPointData(), array) or not _has_candidates(image.GetCellData(), array)
-    attributes = image.GetPointData() if at_points else image.GetCellData()
-    chosen, declared = _tensor_array(name, attributes, array)
-    if name.lower().endswith(".vtk"):
-        _check_length(name, chosen)
-    components = np.asarray(vtk_to_numpy(chosen))
+    file = existing(name)
+    with reading(file, "readable VTK image data (.vti, or structured points in .vtk)"):
+        content, xml = file.read_bytes(), name.lower().endswith(".vti")
+        if xml:
+            _check_pieces(content)
+        image = load(file)
+        if "extent" not in image:
+            raise ValueError(f"it holds {image['kind']}, and neither image data nor structured points")
+        if np.abs(image["direction"].T @ image["direction"] - np.eye(3)).max() > 1e-3:
+            raise ValueError(f"Direction: {image['direction'].tolist()}; expected orthogonal columns of length one")
+    place = "point" if _tensors_at(image, "point", array) or not _tensors_at(image, "cell", array) else "cell"
+    chosen, declared = _tensor_array(name, image, place, array)
+    components = image[f"{place}:{chosen}"]
+    (_check_range if xml else _check_length)(name, content, chosen, components)
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
     if components.shape[-1] == 9:
         if order is not None:
@@ -87,35 +77,33 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
         tensors, order = components.reshape(-1, 3, 3), "matrix"
     elif order is None and not declared:
         raise ValueError(
-            f"{name}: six components in {chosen.GetName()!r}, which the file does not declare as tensors, and programs "
+            f"{name}: six components in {chosen!r}, which the file does not declare as tensors, and programs "
             f"differ in their order. Pass order (--order), one of {choices()}"
         )
     else:
         order = order or "vtk"
         tensors = unpack(components, order)
-    lower, upper = np.array(image.GetExtent()).reshape(3, 2).T
+    lower, upper = image["extent"].reshape(3, 2).T
     thick = upper > lower
-    shape = tuple((upper - lower + np.where(thick & (not at_points), 0, 1)).tolist())
-    first = lower + np.where(thick & (not at_points), 0.5, 0.0)  # a cell's value is at its centre
-    steps = np.array(image.GetSpacing())
-    steps[(steps == 0) & ~thick] = 1.0  # as some programs write what has no thickness
+    of_cells = thick & (place == "cell")  # a cell's value is at its centre
+    shape = tuple((upper - lower + np.where(of_cells, 0, 1)).tolist())
+    steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # 0 is what has no thickness
     affine = np.eye(4)
-    affine[:3, :3] = np.array([[image.GetDirectionMatrix().GetElement(i, j) for j in range(3)] for i in range(3)])
-    affine[:3, :3] *= steps
+    affine[:3, :3] = image["direction"] * steps
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not (np.isfinite(affine).all() and spacing.min() > 0):
-        raise ValueError(f"{name}: got spacing {image.GetSpacing()}; expected finite numbers, none of them zero")
-    affine[:3, 3] = np.array(image.GetOrigin()) + affine[:3, :3] @ first
+        raise ValueError(f"{name}: got spacing {image['spacing']}; expected finite numbers, none of them zero")
+    affine[:3, 3] = image["origin"] + affine[:3, :3] @ (lower + np.where(of_cells, 0.5, 0.0))
     frame = frame or "world"
-    place = "points" if at_points else "cells"
     what = "whole matrices" if order == "matrix" else f'components in order "{order}"'
-    note = f"{what} from {chosen.GetName()!r} at the {place}, given along the {frame} axes, taken to the voxel axes"
+    note = f"{what} from {chosen!r} at the {place}s, given along the {frame} axes, taken to the voxel axes"
     straight = np.array_equal(affine[:3, :3], np.diag(spacing))
+    mask = image.get(f"{place}:mask")
     volume = TensorVolume(
         np.ascontiguousarray(to_voxel_axes(_on_grid(tensors, shape), frame, affine)),
         tuple(spacing.tolist()),
         tuple(affine[:3, 3].tolist()) if straight else (0.0,) * 3,
-        _mask(attributes, shape),
+        None if mask is None else as_mask("mask", np.ascontiguousarray(_on_grid(mask, shape))),
         None if straight else affine,
         order=order,
         frame=frame,
@@ -205,57 +193,72 @@ def _write(
             raise OSError(f"{path}: VTK could not write it")
 
 
-def _check_length(name: str, array: Any) -> None:
+def _check_pieces(content: bytes) -> None:
+    """Raise ValueError unless the pieces of an image fill its whole extent: VTK makes up what is not there."""
+    head = content.partition(b"<AppendedData")[0]
+
+    def cells(extent: bytes) -> int:
+        ends = [int(word) for word in extent.split()]
+        steps = [high - low for low, high in zip(ends[::2], ends[1::2], strict=True)]
+        return 0 if min(steps) < 0 else math.prod(max(n, 1) for n in steps)
+
+    whole, there = (
+        sum(map(cells, re.findall(rb"\b" + name + rb"\s*=\s*[\"']([^\"']*)", head)))
+        for name in (b"WholeExtent", b"Extent")
+    )
+    if whole != there:
+        raise ValueError(f"its pieces have {there} cells; expected the {whole} of the whole extent")
+
+
+def _check_range(name: str, content: bytes, array: str, values: np.ndarray) -> None:
+    """Raise ValueError unless an array's rows have lengths in the range that its file gives, where it gives one."""
+    tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
+    told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
+    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # which do not count
+        return
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(values, axis=-1)
+    if not any(np.allclose([each.min(), each.max()], told, rtol=1e-4) for each in (lengths, values)):
+        raise ValueError(
+            f"{name}: not readable VTK image data, or damaged: array {array!r} has rows of lengths {lengths.min():.4g} "
+            f"to {lengths.max():.4g}, and its file says {told[0]:.4g} to {told[1]:.4g}"
+        )
+
+
+def _check_length(name: str, content: bytes, array: str, values: np.ndarray) -> None:
     """Raise ValueError where a legacy file ends before an array does, which VTK hardly notices."""
-    content = Path(name).read_bytes()
-    key = re.escape(quote(array.GetName()).encode())
+    key = re.escape(quote(array).encode())
     line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
     if line is None:
         return  # a name that is written otherwise: nothing to measure from
-    values = content[line.end() :]
-    count = array.GetNumberOfTuples() * array.GetNumberOfComponents()
-    text = b"ASCII" in content.split(maxsplit=40)[:40]
-    if len(values.split(maxsplit=count)) < count if text else len(values) < count * array.GetDataTypeSize():
-        raise ValueError(f"{name}: incomplete; it ends before the {count} values of {array.GetName()!r} do")
+    rest, text = content[line.end() :], b"ASCII" in content.split(maxsplit=40)[:40]
+    if len(rest.split(maxsplit=values.size)) < values.size if text else len(rest) < values.nbytes:
+        raise ValueError(f"{name}: incomplete; it ends before the {values.size} values of {array!r} do")
 
 
-def _arrays(attributes: Any) -> dict[str, Any]:
-    arrays = [attributes.GetArray(i) for i in range(attributes.GetNumberOfArrays())]
-    return {array.GetName(): array for array in arrays if array is not None}
+def _tensors_at(image: Mapping[str, np.ndarray], place: str, name: str | None) -> list[str]:
+    """Return the names of the arrays that may be tensors."""
+    keys = [key for key, a in image.items() if key.startswith(f"{place}:") and a.ndim == 2 and a.shape[1] in (6, 9)]
+    return [key.partition(":")[2] for key in keys if name in (None, key.partition(":")[2])]
 
 
-def _has_candidates(attributes: Any, name: str | None) -> bool:
-    return any(a.GetNumberOfComponents() in (6, 9) for key, a in _arrays(attributes).items() if name in (None, key))
-
-
-def _tensor_array(name: str, attributes: Any, wanted: str | None) -> tuple[Any, bool]:
-    """Return the array of tensors, and whether the file declares it as such."""
-    declared = attributes.GetTensors()
-    candidates = {key: a for key, a in _arrays(attributes).items() if a.GetNumberOfComponents() in (6, 9)}
-    if wanted is None and declared is not None:
-        return declared, True
-    if wanted is not None:
-        candidates = {key: a for key, a in candidates.items() if key == wanted}
+def _tensor_array(name: str, image: Mapping[str, np.ndarray], place: str, wanted: str | None) -> tuple[str, bool]:
+    """Return the name of the array of tensors, and whether the file declares it as such."""
+    declared = str(image.get(f"{place}s declared", ""))
+    candidates = _tensors_at(image, place, wanted or declared or None)
     if len(candidates) != 1:
-        had = ", ".join(f"{key!r} ({a.GetNumberOfComponents()})" for key, a in _arrays(attributes).items()) or "none"
+        had = {key.partition(":")[2]: a.shape[1:] for key, a in image.items() if key.startswith(f"{place}:")}
+        listed = ", ".join(f"{key!r} ({n[0] if n else 1})" for key, n in had.items()) or "none"
         asked = "" if wanted is None else f" named {wanted!r}"
         raise ValueError(
-            f"{name}: expected one array of 6 or 9 components{asked}; it has (with components) {had}. Pass array"
+            f"{name}: expected one array of 6 or 9 components{asked}; it has (with components) {listed}. Pass array"
         )
-    array = next(iter(candidates.values()))
-    return array, declared is not None and array.GetName() == declared.GetName()
+    return candidates[0], candidates[0] == declared
 
 
 def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return values (n, …) as (*shape, …): the first axis runs fastest in VTK."""
     return np.moveaxis(values.reshape(*shape[::-1], *values.shape[1:]), (0, 1, 2), (2, 1, 0))
-
-
-def _mask(attributes: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "nx ny nz"] | None:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    array = _arrays(attributes).get("mask")
-    return None if array is None else as_mask("mask", np.ascontiguousarray(_on_grid(vtk_to_numpy(array), shape)))
 
 
 def _as_plane(volume: TensorVolume) -> TensorVolume:
@@ -268,3 +271,6 @@ def _as_plane(volume: TensorVolume) -> TensorVolume:
             affine = volume.volume_affine if volume.origin[axis] else volume.affine
             return replace(plane, affine=affine, notes=(*volume.notes, "a field in the plane: no components across it"))
     return volume
+
+
+FORMAT = Format((".vti", ".vtk"), read_tensors, ("array",), None, (".vti",), write, write_tensors, image=".vti")

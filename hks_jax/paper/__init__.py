@@ -4,4 +4,53 @@ V. Zobel, J. Reininghaus, I. Hotz: “Visualization of Two-Dimensional Symmetric
 Heat Kernel Signature”, Topological Methods in Data Analysis and Visualization III, 2014.
 """
 
-from hks_jax.paper.reproduce import run as run
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, table1, triangles
+
+Echo = Callable[[str], None]
+
+ITEMS: dict[str, Callable[[Path, bool, Echo], list[Path]]] = {
+    "table1": table1.table1,
+    "figure1": figure1.figure1,
+    "figure2": figure2.figure2,
+    "figure3": figure3.figure3,
+    "figure4": figure4.figure4,
+    "figure5": figure5.figure5,
+    "figure6": figure6.figure6,
+    "triangles": triangles.triangles,
+}
+
+
+def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:
+    """Write the paper's table and figures, and a check of a remark, to a directory; return the files written.
+
+    Args:
+        output: the directory; made if it does not exist.
+        full: the paper's sizes (many minutes) instead of quick ones (a minute or two).
+        only: some of ``"table1"``, ``"figure1"`` … ``"figure6"``, ``"triangles"``; None: all.
+        echo: called with a line of text as each step begins, and as each item is written.
+
+    Raises:
+        ValueError: a name in `only` that does not exist.
+    """
+    names = list(ITEMS) if only is None else list(only)
+    unknown = [name for name in names if name not in ITEMS]
+    if unknown:
+        raise ValueError(f"only: got {', '.join(map(repr, unknown))}; expected some of {', '.join(ITEMS)}")
+    output = Path(output)
+    output.mkdir(parents=True, exist_ok=True)
+    written = []
+    for number, name in enumerate(names, 1):
+
+        def say(text: str, place: str = f"[{number}/{len(names)}]") -> None:
+            echo(f"{place} {text}")
+
+        start = time.perf_counter()
+        paths = ITEMS[name](output, full, say)
+        seconds = time.perf_counter() - start
+        say(f"{name}: {', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
+        written += paths
+    return written

@@ -20,7 +20,10 @@ SLICE = 0
 
 def figure6(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
     """Write ``figure6.png``: of the brain in the PyPI wheel ``mdt`` where that is installed, else of a phantom."""
-    volume, name = _brain(echo) or _phantom(echo)
+    volume, name = _brain(echo), "brain"
+    if volume is None:
+        tensors, mask, spacing = phantom()
+        volume, name = TensorVolume(tensors, spacing, (0.0, 0.0), mask), "phantom"
     volume = _cropped(volume)
     grid = volume.grid("largest")
     orientation = None if volume.affine is None else plot.Orientation.of(volume.affine, 2)
@@ -75,7 +78,7 @@ def _cropped(volume: TensorVolume) -> TensorVolume:
     return TensorVolume(volume.tensors[box], volume.spacing, (0.0, 0.0), volume.mask[box], affine)
 
 
-def _brain(echo: Callable[[str], None]) -> tuple[TensorVolume, str] | None:
+def _brain(echo: Callable[[str], None]) -> TensorVolume | None:
     brain = find_example_brain()
     if brain is None:
         echo("figure6: no brain here (the wheel mdt==1.2.7 carries one); drawing a phantom")
@@ -86,9 +89,4 @@ def _brain(echo: Callable[[str], None]) -> tuple[TensorVolume, str] | None:
         echo(f"figure6: {error}; drawing a phantom")
         return None
     assert volume.mask is not None
-    return volume.with_mask(erode(volume.mask, 2)).slice("z", SLICE), "brain"
-
-
-def _phantom(echo: Callable[[str], None]) -> tuple[TensorVolume, str]:
-    tensors, mask, spacing = phantom()
-    return TensorVolume(tensors, spacing, (0.0, 0.0), mask), "phantom"
+    return volume.with_mask(erode(volume.mask, 2)).slice("z", SLICE)

@@ -43,19 +43,12 @@ LENGTHS: dict[str, Callable[[Tensors, Tensors, Vectors], Float[np.ndarray, " n"]
 
 
 class Count(NamedTuple):
-    """What is wrong with the edge lengths of a triangulated grid.
+    """What is wrong with the edge lengths of a triangulated grid."""
 
-    Attributes:
-        triangles: how many triangles there are.
-        violating: how many have a side longer than the other two together.
-        vertices: how many vertices there are.
-        no_area: how many have a dual cell, by circumcentres, of no positive area; violating triangles left out.
-    """
-
-    triangles: int
-    violating: int
-    vertices: int
-    no_area: int
+    triangles: int  # how many triangles there are
+    violating: int  # how many have a side longer than the other two together
+    vertices: int  # how many vertices there are
+    no_area: int  # how many have a dual cell, by circumcentres, of no positive area; violating triangles left out
 
 
 def count(field: TensorField, rule: str, periodic: bool = False) -> Count:

@@ -74,7 +74,9 @@ def lic_texture(
             alive, position, heading = alive[onwards], position[onwards], heading[onwards]
             total[alive] += weight * values[_pixel(position)]
             squares[alive] += weight**2
-    return np.where(_inside(field, points), ndtr(total / np.sqrt(squares)), np.nan).reshape(shape)
+    cell = np.clip(np.floor(centres * size / field.grid.spacing).astype(int), 0, np.array(field.grid.shape) - 2)
+    inside = active_elements(field.grid.inside, (False, False))[tuple(cell.T)]
+    return np.where(inside, ndtr(total / np.sqrt(squares)), np.nan).reshape(shape)
 
 
 def line_integral_convolution(
@@ -151,10 +153,3 @@ def _onwards(
     product = (there * heading.conj()).real
     straight = np.abs(product) > LEAST_COSINE * np.abs(there) * np.abs(heading)  # False for NaN
     return np.where(product < 0, -there, there), straight
-
-
-def _inside(field: TensorField, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Tell which points lie in a cell of the domain."""
-    grid = field.grid
-    cell = np.floor((points - grid.origin) / grid.spacing).astype(int)
-    return active_elements(grid.inside, (False, False))[tuple(np.clip(cell, 0, np.array(grid.shape) - 2).T)]

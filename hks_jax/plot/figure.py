@@ -49,6 +49,15 @@ def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) 
     return target
 
 
+def finished(fig: Figure, suptitle: str, path: str | os.PathLike[str] | None = None) -> Figure:
+    """Return the figure with its title, saved if there is a path."""
+    if suptitle:
+        fig.suptitle(suptitle)
+    if path is not None:
+        save_figure(fig, path)
+    return fig
+
+
 def require_plane(name: str, grid: Grid) -> None:
     """Raise ValueError unless the grid is two-dimensional."""
     if grid.dimension != 2:
@@ -84,12 +93,7 @@ def frame(ax: Axes, grid: Grid) -> None:
 
 
 def side_in_inches(ax: Axes, extent: tuple[float, float]) -> float:
-    """Return how long the longer side of something will be, in equal aspect on the axes as they are before layout.
-
-    Args:
-        ax: the axes.
-        extent: width and height of what is drawn, in coordinates.
-    """
+    """Return how long the longer side of an extent will be, in equal aspect on the axes as they are before layout."""
     scale = min(room / size for room, size in zip(_inches(ax), extent, strict=True))
     return scale * max(extent)
 

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Real
+from jaxtyping import Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.ellipses import ellipses
-from hks_jax.plot.figure import SMALL, new_figure, number_text, panel_size, require_plane
+from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
+from hks_jax.plot.glyphs import ellipses
 from hks_jax.plot.images import scalar_image
 from hks_jax.plot.orientation import Orientation
 
@@ -82,7 +82,7 @@ def fit_panels(
     # Apart, because the last row's labels would else widen the columns above.
     halves = figure.add_gridspec(2, 1, height_ratios=[sum(heights[:-1]), heights[-1]])
     panels, last = halves[0].subgridspec(len(rows), 3), halves[1].subgridspec(1, 2, width_ratios=(1, 1.7))
-    symbol = "e" if fit.problem.observation.signature == "wks" else "t"
+    symbol = fit.problem.observation.signature.symbol or "t"
     for row, index in enumerate(rows):
         first, second, third = (figure.add_subplot(panels[row, column]) for column in range(3))
         both = np.stack([wanted[index], fitted[index]])[:, grid.inside]
@@ -105,9 +105,7 @@ def fit_panels(
         orientation.letter(ax)
     ax.set_title("fitted metric, unit circles", fontsize="medium")
     _draw_loss(figure.add_subplot(last[1]), fit)
-    if title:
-        figure.suptitle(title)
-    return figure
+    return finished(figure, title or "")
 
 
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
@@ -122,13 +120,11 @@ def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
         color = f"C{starts.index(before.start) % 10}"
         first = offset == 0
         label = "loss" if len(starts) == 1 else f"start {before.start}"
-        losses = [step.loss for step in piece]
-        ax.plot(steps, _positive(losses), ".-", color=color, label=label if first else None)
+        ax.plot(steps, [step.loss for step in piece], ".-", color=color, label=label if first else None)
         if fit.problem.regularisers:
             label = "misfit" if before.start == starts[0] else ""
-            misfits = _positive([step.misfit for step in piece])
-            ax.plot(steps, misfits, ":", color=color, label=label if first and label else None)
-    ax.set_yscale("log")
+            ax.plot(steps, [step.misfit for step in piece], ":", color=color, label=label if first and label else None)
+    ax.set_yscale("log", nonpositive="mask")
     ax.yaxis.set_major_locator(LogLocator(numticks=6))
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
@@ -150,9 +146,3 @@ def _pieces(history: Sequence["Step"]) -> list[list["Step"]]:
             pieces.append([])
         pieces[-1].append(step)
     return pieces
-
-
-def _positive(values: Sequence[float]) -> Float[np.ndarray, " n"]:
-    """Return values for a logarithmic axis: NaN where there is no logarithm."""
-    array = np.asarray(values, dtype=np.float64)
-    return np.where(array > 0, array, np.nan)

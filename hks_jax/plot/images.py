@@ -17,12 +17,12 @@ from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import (
     cell_extent,
     colour_bar,
+    finished,
     frame,
     new_figure,
     number_text,
     panel_size,
     require_plane,
-    save_figure,
 )
 from hks_jax.plot.orientation import Orientation
 
@@ -81,7 +81,7 @@ def scalar_image(
         array = orientation.array(array)
         opacity = None if opacity is None else orientation.array(opacity)
         grid = orientation.grid(grid)
-    low, high, own = colours_of(array.compressed(), quantiles, least_range, centre, (vmin, vmax))
+    low, high, own = colours_of(array.compressed(), quantiles, least_range, centre, vmin, vmax)
     image = ax.imshow(
         array.T,
         origin="lower",
@@ -111,16 +111,10 @@ def hks_panels(
     unit: str = "",
     shared_range: bool = False,
     path: str | os.PathLike[str] | None = None,
-    cmap: str | Colormap | None = None,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    centre: float | None = None,
-    quantiles: tuple[float, float] = (0.0, 1.0),
-    least_range: float = 1e-6,
-    label: str = "",
     suptitle: str = "",
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "n_times nx ny"] | None = None,
+    **kwargs: Any,
 ) -> Figure:
     """Return a figure with one image of the HKS per time, each with its own colour map unless `shared_range`.
 
@@ -132,16 +126,11 @@ def hks_panels(
         unit: the unit of t, written after it.
         shared_range: whether all images use the colours of one range.
         path: where to save the figure; None: nowhere.
-        cmap: colour map; None: as for `scalar_image`.
-        vmin: value of the first colour of all images; None: see `shared_range`.
-        vmax: value of the last colour of all images; likewise.
-        centre: value of the middle colour, as for `scalar_image`.
-        quantiles: as for `scalar_image`.
-        least_range: as for `scalar_image`.
-        label: the colour bars' label.
         suptitle: the figure's title.
         orientation: as for `scalar_image`.
         z: (n_times, *shape), as for `scalar_image`: what noise could make fades.
+        **kwargs: passed to `scalar_image`, for all images, such as its cmap, vmin, vmax, centre, quantiles, least_range
+            and label.
 
     Raises:
         ValueError: shapes that do not agree; no time at all.
@@ -149,10 +138,12 @@ def hks_panels(
     require_plane("grid", grid)
     t, titles = panel_titles(values, times, grid, titles, unit)
     images = [masked("values", v, grid) for v in np.asarray(values)]
-    everything = np.concatenate([image.compressed() for image in images])
     if shared_range:
-        vmin, vmax, own = colours_of(everything, quantiles, least_range, centre, (vmin, vmax))
-        cmap = cmap or own
+        given = {
+            name: kwargs[name] for name in ("quantiles", "least_range", "centre", "vmin", "vmax") if name in kwargs
+        }
+        low, high, own = colours_of(np.concatenate([image.compressed() for image in images]), **given)
+        kwargs |= {"vmin": low, "vmax": high, "cmap": kwargs.get("cmap") or own}
 
     rows, columns = _layout(t.size)
     width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
@@ -162,17 +153,11 @@ def hks_panels(
         if index >= t.size:
             ax.remove()
             continue
-        colours: dict[str, Any] = {"cmap": cmap, "vmin": vmin, "vmax": vmax, "centre": centre}
-        colours |= {"quantiles": quantiles, "least_range": least_range}
         faded = None if z is None else np.asarray(z)[index]
-        scalar_image(ax, images[index], grid, label=label, orientation=orientation, z=faded, **colours)
+        scalar_image(ax, images[index], grid, orientation=orientation, z=faded, **kwargs)
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
-    if suptitle:
-        fig.suptitle(suptitle)
-    if path is not None:
-        save_figure(fig, path)
-    return fig
+    return finished(fig, suptitle, path)
 
 
 def panel_titles(
@@ -221,12 +206,13 @@ class Colours(NamedTuple):
 
 def colours_of(
     values: np.ndarray,
-    quantiles: tuple[float, float],
+    quantiles: tuple[float, float] = (0.0, 1.0),
     least_range: float = 1e-6,
     centre: float | None = None,
-    limits: tuple[float | None, float | None] = (None, None),
+    vmin: float | None = None,
+    vmax: float | None = None,
 ) -> Colours:
-    """Return the colours of values; see `scalar_image`, whose vmin and vmax are the limits."""
+    """Return the colours of values; see `scalar_image`."""
     low, high = (float(q) for q in np.quantile(values, quantiles))
     cmap = "viridis"
     if centre is not None:
@@ -237,7 +223,7 @@ def colours_of(
             low, high, cmap = centre - reach, centre + reach, "RdBu_r"
     lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
     low, high = low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
-    return Colours(low if limits[0] is None else limits[0], high if limits[1] is None else limits[1], cmap)
+    return Colours(low if vmin is None else vmin, high if vmax is None else vmax, cmap)
 
 
 def _layout(n: int) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import SMALL, new_figure, panel_size, require_plane
+from hks_jax.plot.figure import SMALL, finished, new_figure, panel_size, require_plane
 from hks_jax.plot.images import panel_titles, scalar_image
 
 
@@ -65,9 +65,7 @@ def time_rows(
         line[0].set_ylabel(name, fontsize=SMALL)
     for ax, title in zip(panels[0], titles, strict=True):
         ax.set_title(title, fontsize="medium")
-    if suptitle:
-        figure.suptitle(suptitle)
-    return figure
+    return finished(figure, suptitle)
 
 
 def influence_map(

@@ -130,7 +130,7 @@ def isosurfaces(
     """
     require_volume(grid)
     array = masked("values", values, grid)
-    low, high, _ = colours_of(array.compressed(), quantiles, limits=(vmin, vmax))
+    low, high, _ = colours_of(array.compressed(), quantiles, vmin=vmin, vmax=vmax)
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
         raise ValueError(f"levels: got {levels}; expected a number from 1, or finite values")
@@ -139,8 +139,10 @@ def isosurfaces(
     if not np.isfinite(view).all() or np.hypot(view[0], view[1]) == 0:
         raise ValueError(f"view: got {view}; expected a direction that is not along z")
     pyvista = optional("pyvista")
+    inches = ax.get_figure().get_size_inches() * ax.get_position().size  # type: ignore[union-attr]
     with _quiet_about_displays():
-        plotter = pyvista.Plotter(off_screen=True, window_size=_pixels(ax, resolution))
+        size = tuple(max(round(resolution * side), 64) for side in inches)
+        plotter = pyvista.Plotter(off_screen=True, window_size=size)
         try:
             domain = _domain(pyvista, array, grid)
             surfaces = domain.contour(heights, scalars="values")
@@ -187,12 +189,6 @@ def _rim(pyvista: ModuleType, domain: Any) -> Any:
     surface.SetInputData(domain)
     surface.Update()
     return pyvista.wrap(surface.GetOutput())
-
-
-def _pixels(ax: Axes, resolution: float) -> tuple[int, int]:
-    """Return the axes' size in pixels."""
-    width, height = ax.get_figure().get_size_inches() * ax.get_position().size  # type: ignore[union-attr]
-    return max(round(resolution * width), 64), max(round(resolution * height), 64)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
 from hks_jax.domain.tensor_field import TensorField
@@ -35,31 +36,18 @@ class DirectionField:
             raise ValueError(f'which: got {which!r}; expected "major" or "minor"')
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
-        self.origin, self.spacing = np.array(grid.origin), np.array(grid.spacing)
-        self.shape = np.array(grid.shape)
         self.which = which
         # (a, b) = λ₁ − λ₂ times cosine and sine of twice the major angle; the trace makes it dimensionless.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
-        self.components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
-        self.components[~grid.inside] = np.nan
+        components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
+        components[~grid.inside] = np.nan
+        self.interpolant = RegularGridInterpolator(grid.axes, components, bounds_error=False)
 
     def __call__(
         self, points: Float[np.ndarray, "n 2"], towards: Float[np.ndarray, "n 2"] | None = None
     ) -> Float[np.ndarray, "n 2"]:
         """Return unit vectors (n, 2), within 90° of `towards`; NaN outside and at degenerate points."""
-        position = (points - self.origin) / self.spacing
-        with np.errstate(invalid="ignore"):
-            cell = np.clip(np.nan_to_num(np.floor(position)), 0, self.shape - 2).astype(int)
-            w = position - cell
-            w[(w < -1e-9) | (w > 1 + 1e-9)] = np.nan
-        (i, j), (u, v) = cell.T, w.T
-        c = self.components
-        a, b, trace = (
-            ((1 - u) * (1 - v))[:, None] * c[i, j]
-            + (u * (1 - v))[:, None] * c[i + 1, j]
-            + ((1 - u) * v)[:, None] * c[i, j + 1]
-            + (u * v)[:, None] * c[i + 1, j + 1]
-        ).T
+        a, b, trace = self.interpolant(points).T
         with np.errstate(invalid="ignore"):
             angle = 0.5 * np.arctan2(b, a)
             angle[~(np.hypot(a, b) > DEGENERATE * trace)] = np.nan

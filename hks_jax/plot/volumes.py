@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import SMALL, colour_bar_in, new_figure, save_figure
+from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
 from hks_jax.plot.images import beyond, colours_of, masked, panel_titles, scalar_image
 from hks_jax.plot.orientation import Orientation
 
@@ -77,10 +77,8 @@ def orthogonal_slices(
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
     array, grid, node = _turned(_volume(values, grid), grid, node, orientation)
-    low, high, _ = colours_of(array.compressed(), quantiles)
-    low, high = low if vmin is None else vmin, high if vmax is None else vmax
-    colours: dict[str, Any] = {"cmap": cmap, "vmin": low, "vmax": high}
-    return _slices(axes, array, grid, node, orientation, cross=cross, **colours, **kwargs)
+    low, high, _ = colours_of(array.compressed(), quantiles, vmin=vmin, vmax=vmax)
+    return _slices(axes, array, grid, node, orientation, cross=cross, cmap=cmap, vmin=low, vmax=high, **kwargs)
 
 
 def _slices(
@@ -183,17 +181,13 @@ def volume_panels(
                 continue
             low, high = limits[index]
             colours: dict[str, Any] = {"cmap": cmaps[index], "vmin": low, "vmax": high}
-            colours["z"] = None if noise is None else noise[index]
-            image = _slices(panels[:3, column], volumes[index], shown, chosen, orientation, **colours)
+            faded = None if noise is None else noise[index]
+            image = _slices(panels[:3, column], volumes[index], shown, chosen, orientation, z=faded, **colours)
             panels[0, column].set_title(titles[index], fontsize="medium")
             _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
             extend = beyond(volumes[index], low, high)
             colour_bar_in(panels[3, column], image, label, orientation="horizontal", extend=extend)
-    if suptitle:
-        fig.suptitle(suptitle)
-    if path is not None:
-        save_figure(fig, path)
-    return fig
+    return finished(fig, suptitle, path)
 
 
 def _label_slices(

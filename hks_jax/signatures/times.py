@@ -1,5 +1,6 @@
 """What signatures need of pairs, and the default times and energies of Sun et al. and of Aubry et al."""
 
+import math
 from typing import Any
 
 import jax
@@ -77,15 +78,17 @@ def _n_positive(pairs: Eigenpairs) -> int:
     return pairs.k - pairs.n_null if pairs.null_space_known else pairs.k
 
 
-def default_times(pairs: Eigenpairs, n: int = 16) -> Float[Array, " n"]:
+def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
-    At the first the last mode has decayed by 1e-4; at the last all but the constant have.
+    At the first the last mode has decayed by 1e-4; at the last all but the constant have, or by `decay`, but not before
+    the first. The command line takes 1e-2, where a picture still shows the variation.
     """
     if n < 1:
         raise ValueError(f"n: got {n}; expected at least 1")
     first, last = positive_range(pairs)
-    return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, first, n)
+    end = jnp.minimum(last, first * (math.log(1e-4) / math.log(decay)))
+    return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, end, n)
 
 
 def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"], Float[Array, ""]]:

@@ -8,18 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
-from hks_jax.cli.hks import add_noise_arguments
-from hks_jax.cli.inputs import second_scan
-from hks_jax.cli.reading import add_file_argument, add_options, defaults
-from hks_jax.cli.stats import add_atlas_arguments
+from hks_jax.cli.noise import second_scan
+from hks_jax.cli.options import COLUMNS, FILES, READING, add_options
 from hks_jax.io.tables import read_table
-
-FILES = ("mask", "bval", "bvec", "atlas", "names")
-"""Columns that are paths, beside `file`; relative ones begin where the table is."""
-
-NOISE = ("noise", "draws")
-OPTIONS = (*(name.replace("_", "-") for name in defaults() if name not in FILES), *NOISE)
-"""Columns that stand for the option of the same name: those of reading tensors, and of their noise."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +32,13 @@ class Subject:
     covariates: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def args(self) -> argparse.Namespace:
+        """The arguments; raises ValueError where they are wrong."""
+        if self.arguments is None:
+            raise ValueError(self.problem)
+        return self.arguments
+
+    @property
     def name(self) -> str:
         """The beginning of the names of its files: ``sub-01`` or ``sub-01_ses-2``."""
         return "_".join(filter(None, (self.participant, self.session)))
@@ -56,33 +54,30 @@ class _RowParser(argparse.ArgumentParser):
         raise ValueError(message)
 
 
-def _row_parser() -> argparse.ArgumentParser:
-    parser = _RowParser(add_help=False)
-    add_file_argument(parser)
-    add_options(parser)
-    add_noise_arguments(parser)
-    add_atlas_arguments(parser, required=False)
-    return parser
-
-
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     """Read the table, and join each row with the arguments that hold for all subjects.
 
-    A row with wrong options becomes a subject with a problem.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no table, no columns `participant_id` and `file`, labels that BIDS does not allow, or a subject
-            (and session) twice.
+    A row with wrong options becomes a subject with a problem. What is wrong for all raises ValueError: no table, no
+    columns `participant_id` and `file`, labels that BIDS does not allow, or a subject (and session) twice.
     """
-    rows, parser = read_table(path), _row_parser()
+    rows, parser = read_table(path), _RowParser(add_help=False)
+    add_options(parser, f"@file {READING} @noise @atlas @names")
     subjects: dict[str, Subject] = {}
     for number, row in enumerate(rows, 2):
         if "participant_id" not in row:
             raise ValueError(f"{path}: row {number} has no participant_id; expected one in every row")
         participant = _label(path, "sub", row.pop("participant_id"))
         session = _label(path, "ses", row.pop("session_id")) if "session_id" in row else ""
-        subject = _subject(parser, path.parent, participant, session, row, common)
+        words, covariates = _words(path.parent, row)
+        try:
+            if not words or words[0].startswith("--"):
+                raise ValueError("the row has no file")
+            arguments, problem = parser.parse_args(words, copy.copy(common)), ""
+            if second_scan(arguments) is not None:
+                arguments.noise = str(path.parent / arguments.noise)
+        except ValueError as error:
+            arguments, problem = None, str(error)
+        subject = Subject(participant, session, arguments, problem, covariates)
         if subject.name in subjects:
             raise ValueError(f"{path}: {subject.name} is there twice; tell the rows apart by a column session_id")
         subjects[subject.name] = subject
@@ -96,14 +91,8 @@ def _label(path: Path, entity: str, text: str) -> str:
     return f"{entity}-{label}"
 
 
-def _subject(
-    parser: argparse.ArgumentParser,
-    folder: Path,
-    participant: str,
-    session: str,
-    row: dict[str, str],
-    common: argparse.Namespace,
-) -> Subject:
+def _words(folder: Path, row: dict[str, str]) -> tuple[list[str], dict[str, str]]:
+    """Return what a row says as a command line does, and its other columns."""
     words, covariates = [], {}
     if "file" in row:
         words.append(str(folder / row.pop("file")))
@@ -111,16 +100,8 @@ def _subject(
         option = column.lower().replace("_", "-")
         if option in FILES:
             words += [f"--{option}", str(folder / text)]
-        elif option in OPTIONS:
+        elif option in COLUMNS:
             words += [f"--{option}", *(text.replace(",", " ").split() if option == "spacing" else [text])]
         else:
             covariates[column] = text
-    try:
-        if not words or words[0].startswith("--"):
-            raise ValueError("the row has no file")
-        arguments = parser.parse_args(words, copy.copy(common))
-        if second_scan(arguments) is not None:
-            arguments.noise = str(folder / arguments.noise)
-    except ValueError as error:
-        return Subject(participant, session, None, str(error), covariates)
-    return Subject(participant, session, arguments, "", covariates)
+    return words, covariates

@@ -3,31 +3,30 @@
 import argparse
 import json
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.arguments import recorded_boundary
-from hks_jax.cli.inputs import add_eigenpair_arguments, add_tensor_options
 from hks_jax.cli.job import Settings, field_of
-from hks_jax.cli.outputs import plain
+from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import defaults
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.assembly import assemble
 from hks_jax.io.arrays import place_of
 from hks_jax.io.pairs import pairs_of, save_pairs
+from hks_jax.io.result import plain, recorded_boundary
 from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npz
 
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that belong to the pairs."""
-_OPTIONS = {**defaults(add_tensor_options, lambda parser: add_eigenpair_arguments(parser, "")), "save_pairs": False}
-"""Options that were settled when the pairs were computed, and what they are unless given."""
+_ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit", "notes", "repair")
+"""What of a volume is kept as text beside its arrays."""
 
 
 def is_saved_pairs(path: Path) -> bool:
@@ -42,16 +41,9 @@ def check_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that come too late."""
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one of eigenpairs")
-    for name, default in _OPTIONS.items():
-        if getattr(args, name) != default:
-            option = "-k" if name == "k" else f"--{name.replace('_', '-')}"
-            raise ValueError(
-                f"{option}: {args.file} holds eigenpairs, of which all but the signature is settled; leave it out"
-            )
-
-
-_ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit")
-"""What of a volume is kept as text beside its arrays."""
+    settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
+    why = f"{args.file} holds eigenpairs, of which all but the signature is settled; leave it out"
+    refuse(args, (*settled, "save_pairs"), why)
 
 
 def write_pairs(
@@ -60,22 +52,16 @@ def write_pairs(
     pairs: Eigenpairs,
     settings: Settings,
     image: str,
-    warnings: list[str],
+    warnings: Sequence[str],
     fingerprint: str = "",
 ) -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with what was settled in computing them.
 
-    Args:
-        path: the file.
-        volume: the tensors.
-        pairs: the eigenpairs.
-        settings: of the computation.
-        image: the suffix of images in the format of the tensors' file.
-        warnings: what was said of the tensors and of the pairs, to be said again.
-        fingerprint: of a study's subject, what the pairs were computed from.
+    The suffix of images and the warnings come back with them; the fingerprint says what those of a study's subject were
+    computed from.
     """
-    record = {name: getattr(volume, name) for name in (*_ABOUT, "notes")}
-    record |= {"repair": dict(volume.repair), "image": image, "warnings": warnings, "fingerprint": fingerprint}
+    record = {name: getattr(volume, name) for name in _ABOUT}
+    record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: value for name, value in asdict(settings).items() if name in _SETTLED}
     save_pairs(path, pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
 
@@ -91,11 +77,7 @@ def are_of(path: Path, fingerprint: str) -> bool:
 def read_pairs(
     path: Path, settings: Settings, progress: Progress
 ) -> tuple[TensorVolume, TensorField, Eigenpairs, Settings, str]:
-    """Return the volume, its metric, the pairs, the settings with those that are settled, and the suffix of images.
-
-    Raises:
-        ValueError: a damaged file.
-    """
+    """Return the volume, its metric, the pairs, the settings with those that are settled, and the suffix of images."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     volume = TensorVolume(
@@ -104,16 +86,14 @@ def read_pairs(
         tuple(arrays["origin"].tolist()),
         arrays.get("mask"),
         arrays.get("affine"),
-        **{name: record[name] for name in (*_ABOUT, "repair") if name in record},
-        notes=tuple(record["notes"]),
+        **{name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])},
     )
     boundary = recorded_boundary(record["settings"])
-    settings = replace(settings, **{**record["settings"], "boundary": boundary})
-    assert settings.metric is not None
     assert boundary is not None
+    settings = replace(settings, **{**record["settings"], "boundary": boundary})
     for warning in record["warnings"]:
         progress.warn(warning)
     with progress.stage("assembly"):
-        field = field_of(volume, volume.grid("all"), settings.metric, settings.dtype, settings.interpolation)
+        field = field_of(volume, volume.grid("all"), settings)
         pairs = pairs_of(str(path), arrays, assemble(field, boundary))
     return volume, field, pairs, settings, record["image"]

@@ -1,0 +1,232 @@
+"""Compute the signatures of many subjects, and tables of their regions.
+
+Compute the signatures of many subjects, at the same times for all, and tables of their regions. SUBJECTS is a table
+(.tsv, or .csv) with a row for each subject and the columns
+
+  participant_id   sub-01 or 01
+  session_id       ses-1 or 1, optional
+  file             tensors, or diffusion-weighted images; of six images of components, one
+  {files}
+                   more files of the subject, optional; paths begin where the table is
+  {columns}
+                   options that differ between subjects, optional; a noise that is a file begins where the table is
+
+and any others, such as age and group, which are kept in participants.tsv. What an option says holds for all subjects
+whose row does not say otherwise.
+
+DIR becomes a BIDS derivative: for each subject an image with its sidecar, an .npz for hks-jax explore, plot and stats,
+a picture, and with --atlas a table of regions; for all of them group_summary.tsv and group_regions.tsv.
+
+Tensors whose mean diffusivity no living tissue has in mm2/s are refused unless --unit, or the column unit, says in
+which unit they are: subjects in different units cannot be compared.
+
+A subject that fails does not stop the others. The same command, given again, computes only what is not there yet, or
+was of other files.
+
+examples:
+  hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
+  hks-jax batch subjects.tsv -o study --metric inverse --times 20 40 80 160 --only sub-07 sub-08
+"""
+
+import argparse
+import io
+import json
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hks_jax.cli.info import describe
+from hks_jax.cli.job import ComputationError, Settings
+from hks_jax.cli.noise import require_spectral, second_scan
+from hks_jax.cli.options import READING, SOLVING, Times, parse_times, refuse
+from hks_jax.cli.outputs import Done, show
+from hks_jax.cli.progress import Progress, StudyProgress
+from hks_jax.cli.reading import read_volume, require_metric
+from hks_jax.cli.study.folder import MAP, Study, reading_options
+from hks_jax.cli.study.subjects import Subject, read_subjects
+from hks_jax.io import TensorVolume
+from hks_jax.io.result import recorded_boundary
+from hks_jax.io.tables import read_json
+from hks_jax.io.units import LIVING_TISSUE
+from hks_jax.signatures.suitable import LAST
+
+OPTIONS = f"""
+subjects SUBJECTS  the table of subjects
+-o,--output DIR!  the study's folder
+@metric {READING} {SOLVING} @signature @noise @view
+--time-unit scanner|lambda1 = scanner
+    of --times: scanner, the same t for all subjects, in seconds for D⁻¹ of mm²/s (default); or lambda1, the same λ₁t,
+    each subject's t being divided by its own first positive eigenvalue. Automatic times are log-spaced over what suits
+    all, and remain those of the study
+@atlas @names
+--save-pairs
+    keep each subject's eigenpairs: with other --times, --normalisation or --method nothing is solved again
+--replace  compute a study in DIR again that had other settings or times
+--only SUBJECT...  compute only these, such as sub-07 or sub-07_ses-2
+"""
+
+
+def run(args: argparse.Namespace, _: Progress) -> None:
+    """Run the command; where some subjects fail, raise ComputationError when the others are done."""
+    from hks_jax.cli.study.tasks import run_all
+
+    if second_scan(args) is not None:
+        raise ValueError(
+            f"--noise: {args.noise} is a scan of one subject; expected a number, residuals or roughness. Second scans "
+            "belong into a column noise of the table"
+        )
+    args.strict_unit = True
+    times, settle = parse_times(args.times), args.boundary is None
+    if settle:  # subjects are compared, and so have the same boundary, with or without a mask
+        before = {} if args.replace else read_json(args.output / "study.json")
+        args.boundary = recorded_boundary(before.get("settings", {})) or "mean"
+    subjects = read_subjects(args.subjects, args)
+    chosen = _only(subjects, args.only)
+    for subject in chosen:
+        if subject.arguments is not None:
+            require_metric(subject.arguments)
+            require_spectral(subject.arguments)
+    with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
+    if not with_regions:
+        refuse(args, ("names",), "it names labels; pass --atlas too, or a column atlas in the table")
+    progress = StudyProgress(len(chosen), args.quiet)
+    if settle:
+        progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
+    with progress.catching_warnings():
+        study = _open(args, times, subjects, progress)
+        problems = {subject.name: "" for subject in subjects if subject not in chosen}
+        problems |= run_all(study, chosen, progress, args.debug)
+        if args.only:  # what others have done in the meantime
+            there = {s.name for s in subjects if problems.get(s.name) == "" and _is_there(study, s)}
+            problems = {name: why for name, why in problems.items() if name not in there}
+        problems |= _other_units(study, [subject for subject in subjects if subject.name not in problems])
+        files = study.write_group(subjects, problems, with_regions)
+    failed = [subject.name for subject in chosen if problems.get(subject.name)]
+    tables = "\n".join(str(file) for file in files if file.suffix == ".tsv")
+    show(args, Done(files, {"failed": failed}, tables))
+    if failed:
+        raise ComputationError(
+            f"{len(failed)} of {len(chosen)} subjects failed ({', '.join(failed[:5])}{', …' * (len(failed) > 5)}); "
+            f"{args.output / 'group_summary.tsv'} says why. The others are done; the same command tries these again"
+        )
+
+
+def _is_there(study: Study, subject: Subject) -> bool:
+    try:
+        return study.has(subject, MAP, study.fingerprint(subject))
+    except Exception:
+        return False
+
+
+def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
+    """Return why subjects are refused whose diffusivities are so far from the others' that the unit must be another.
+
+    Files that declare no lengths in mm, such as NumPy's, can be compared with each other alone.
+    """
+    if study.settings.metric == "tensor":  # which need not be diffusion
+        return {}
+    inputs = {subject.name: read_json(study.path(subject, f"{MAP}.json")).get("Input", {}) for subject in done}
+    medians = {name: value for name, about in inputs.items() if (value := about.get("median_mean_diffusivity"))}
+    middle = math.exp(np.median(np.log(list(medians.values())))) if medians else 1.0
+    span = LIVING_TISSUE[1] / LIVING_TISSUE[0]
+    return {
+        name: f"--unit: the median mean diffusivity is {value:.3g}, and {middle:.3g} in the middle of the study; "
+        "expected the same unit of all subjects. Say by --unit, or a column unit, which it is in each"
+        for name, value in medians.items()
+        if not 1 / span <= value / middle <= span
+    }
+
+
+def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> Study:
+    """Return the study, described in its folder, its times settled: as given, or as it has them, or as they suit all.
+
+    A folder of a study of other settings, which is not to be replaced, is refused.
+    """
+    study = Study(args.output, Settings.of(args, times=times), args.time_unit, reading_options(args), args.save_pairs)
+    before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
+    now, then = study.record, dict(before)
+    if times.automatic:  # they remain what they were
+        now["times"], then["times"] = chosen, before.get("chosen")
+    for part in ("settings", "reading"):
+        now |= now.pop(part)
+        then |= then.pop(part, {})
+    pairs = [(name, then.get(name), value) for name, value in now.items() if then.get(name) != value]
+    changed = "; ".join(f"--{name}: {json.dumps(old)}, now {json.dumps(new)}" for name, old, new in pairs)
+    if before and changed and not args.replace:
+        raise ValueError(
+            f"--output: {args.output} is a study that differs in {changed}. Choose another folder, or pass --replace "
+            "to compute its subjects again"
+        )
+    if times.automatic:
+        explicit = _suitable(args, times.automatic, subjects, progress) if changed else tuple(before["times"])
+        study = replace(study, settings=replace(study.settings, times=Times(explicit, 0)))
+    study.write_description(subjects, chosen)
+    return study
+
+
+def _suitable(
+    args: argparse.Namespace, count: int, subjects: list[Subject], progress: StudyProgress
+) -> tuple[float, ...]:
+    """Read all subjects, and return times that suit them; those that cannot be read have no say."""
+    if args.metric == "adjugate":
+        raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
+    ranges: dict[str, Range] = {}
+    silent = StudyProgress(1, True, io.StringIO())  # what is to be warned of is, when the subject's turn comes
+    for number, subject in enumerate(subjects, 1):
+        progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
+        with suppress(Exception):  # said when its turn comes
+            ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
+    if not ranges:
+        raise ValueError("--times: none of the subjects can be read; pass --times to see why of each")
+    times = common_times(ranges, count, args.time_unit)
+    progress.end(f"times that suit all subjects ({len(ranges)}): {', '.join(f'{t:g}' for t in times)}")
+    return times
+
+
+class Range(NamedTuple):
+    """The times that suit one subject: those that its voxels and its eigenpairs resolve, and its size ends."""
+
+    least: float
+    largest: float
+
+
+def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
+    """Return the range of times that suits a subject, from its metric and its size, before anything is computed."""
+    of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][args.metric or "tensor"]
+    by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
+    return Range(max(of["least_time"], by_pairs), of["largest_time"])
+
+
+def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
+    """Return n times, log-spaced over what suits all subjects, rounded to three digits.
+
+    They go from the largest of the least times to the least of the largest; of the unit ``"lambda1"`` they are λ₁t,
+    whose largest is `LAST`.
+    """
+    if unit == "lambda1":
+        ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}
+    late, flat = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
+    least, largest = ranges[late].least, ranges[flat].largest
+    if least >= largest:
+        raise ValueError(
+            f"--times: none suits all subjects: {late} resolves only t ≥ {least:.3g}, and {flat} is flat from "
+            f"t = {largest:.3g} on. Choose times, or more eigenpairs (-k); see what 'hks-jax info' says of {late}: "
+            "tensors with eigenvalues near zero take its pairs (--repair nearest:1e-4)"
+        )
+    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))
+
+
+def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
+    """Return the subjects that are to be computed."""
+    if names is None:
+        return subjects
+    wanted = {name if name.startswith("sub-") else f"sub-{name}" for name in names}
+    chosen = [subject for subject in subjects if {subject.name, subject.participant} & wanted]
+    missing = wanted - {name for subject in chosen for name in (subject.name, subject.participant)}
+    if missing:
+        raise ValueError(f"--only: got {', '.join(sorted(missing))}; expected subjects of the table")
+    return chosen

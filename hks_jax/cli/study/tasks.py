@@ -1,0 +1,170 @@
+"""The computations of a study: what is to be done of each subject, and doing it."""
+
+import io
+import sys
+import time
+import traceback
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from hks_jax import Eigenpairs, TensorField
+from hks_jax.atomic import claim
+from hks_jax.cli import INPUT_ERRORS
+from hks_jax.cli.job import ComputationError, compute_pairs
+from hks_jax.cli.noise import signature_of
+from hks_jax.cli.options import Times
+from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
+from hks_jax.cli.progress import StudyProgress, duration
+from hks_jax.cli.reading import image_suffix, read_volume
+from hks_jax.cli.stats import region_table
+from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
+from hks_jax.cli.study.subjects import Subject
+from hks_jax.io import TensorVolume
+from hks_jax.io.tables import write_table
+from hks_jax.plot import signature_panels
+from hks_jax.signatures.times import positive_range
+
+FORGETFUL = 8
+"""After so many subjects what was compiled is forgotten: domains differ, and each leaves 70 MiB that no other uses."""
+
+PATIENCE = 0.5
+"""Seconds between two looks at what other processes compute."""
+
+
+def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> dict[str, str]:
+    """Compute what is not there yet; return why some subjects failed, by their names.
+
+    Other processes with the same study share the work: each subject is computed by the one that comes to it first. One
+    that begins the study anew, with other settings, makes this one raise ValueError.
+    """
+    problems: dict[str, str] = {}
+
+    def failed(subject: Subject, error: Exception) -> None:
+        if debug:
+            traceback.print_exception(error, file=sys.stderr)
+        known = isinstance(error, (*INPUT_ERRORS, ComputationError, np.linalg.LinAlgError))
+        problems[subject.name] = " ".join(f"{'' if known else f'{type(error).__name__}: '}{error}".split())
+        progress.end(f"{subject.name} failed: {problems[subject.name]}")
+
+    plan = []
+    for subject in subjects:
+        try:
+            plan.append(_Task.of(study, subject))
+        except Exception as error:
+            failed(subject, error)
+    pending = [task for task in plan if task.signature or task.regions]
+    # What ended a process before, for want of memory perhaps, may do so again: the others come first.
+    pending.sort(key=lambda task: task.attempt.exists())
+    if len(pending) < len(plan):
+        progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are done already")
+    progress.total, number, waiting = len(pending), 0, False
+    while pending:
+        elsewhere = []
+        for task in pending:
+            study.require_settings()
+            try:
+                with claim(task.attempt) as ours:
+                    if not ours:
+                        elsewhere.append(task)
+                    elif (left := task.left()) is None:
+                        progress.total -= 1
+                    else:
+                        if number and number % FORGETFUL == 0:
+                            jax.clear_caches()
+                        number += 1
+                        with progress.subject(task.subject.name):
+                            left.run(progress)
+            except Exception as error:
+                failed(task.subject, error)
+        if len(elsewhere) == len(pending):
+            if not waiting:
+                progress.end(f"waiting for other processes, which compute {len(elsewhere)} of the subjects")
+            waiting = True
+            time.sleep(PATIENCE)
+        pending = elsewhere
+    done = len(subjects) - len(problems)
+    progress.end(f"{progress.line()}: {done} of {len(subjects)} subjects are done, in {duration(progress.elapsed)}")
+    return problems
+
+
+class _Task(NamedTuple):
+    """What is to be done of a subject: its signature, and the table of its regions, unless its fingerprint is empty."""
+
+    study: Study
+    subject: Subject
+    fingerprint: str
+    signature: bool
+    regions: str
+
+    @classmethod
+    def of(cls, study: Study, subject: Subject) -> "_Task":
+        """Return what is to be done: what is not there, or was of other files or settings."""
+        fingerprint = study.fingerprint(subject)
+        regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
+        task = cls(study, subject, fingerprint, True, regions)
+        return task.left() or task._replace(signature=False, regions="")
+
+    @property
+    def attempt(self) -> Path:
+        """The file that a process holds while it computes a subject, and leaves if it dies."""
+        return self.study.folder / self.subject.folder / ".attempt"
+
+    def left(self) -> "_Task | None":
+        """Return what is not there, as another process may have done it meanwhile."""
+        missing = self.signature and not self.study.has(self.subject, MAP, self.fingerprint)
+        known = not missing and self.study.has(self.subject, REGIONS, self.regions)
+        left = self._replace(signature=missing, regions="" if known else self.regions)
+        return left if left.signature or left.regions else None
+
+    def run(self, progress: StudyProgress) -> None:
+        """Do it."""
+        study, subject = self.study, self.subject
+        if self.signature:
+            _compute(study, subject, self.fingerprint, progress)
+        if self.regions:
+            table = study.path(subject, f"{REGIONS}.tsv")
+            for old in (table.with_suffix(".json"), table):  # the sidecar first
+                old.unlink(missing_ok=True)
+            with progress.stage("regions"):
+                source, args = study.path(subject, f"{MAP}.npz"), subject.args
+                columns, rows, about = region_table(source, args.atlas, args.names, progress)
+                write_table(table, columns, rows, {**about, "Fingerprint": self.regions})
+
+
+def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
+    """Compute and write the signature of a subject."""
+    study.forget(subject)
+    settings, args = study.settings, subject.args
+    volume, field, pairs = _pairs(study, subject, progress)
+    scaled: dict[str, np.ndarray] = {}
+    if study.time_unit == "lambda1":
+        scaled["scaled_times"] = np.array(settings.times.explicit)
+        own = scaled["scaled_times"] / float(positive_range(pairs)[0])
+        settings = replace(settings, times=Times(tuple(own.tolist()), 0))
+    if args.noise == "residuals" and volume.covariance is None:  # pairs that were kept do not have it
+        volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
+    result = signature_of(args, volume, field, pairs, settings, progress)
+    result = replace(result, arrays={**scaled, **result.arrays})
+    drawing = partial(signature_panels, result, view=args.view)
+    with progress.stage("writing"):
+        study.write_signature(subject, fingerprint, result, progress.warnings, drawing)
+
+
+def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[TensorVolume, TensorField, Eigenpairs]:
+    """Return the volume, its metric and its eigenpairs: those that were kept, or computed, and kept if asked to."""
+    kept, fingerprint = study.path(subject, PAIRS), study.pairs_fingerprint(subject)
+    if are_of(kept, fingerprint):
+        return read_pairs(kept, study.settings, progress)[:3]
+    kept.unlink(missing_ok=True)
+    volume = read_volume(subject.args, progress)
+    field, pairs, _ = compute_pairs(volume, study.settings, progress)
+    if study.save_pairs:
+        image, domain = image_suffix(subject.args.file), volume.with_mask(field.grid.mask)
+        with progress.stage("writing"):
+            write_pairs(kept, domain, pairs, study.settings, image, progress.warnings, fingerprint)
+    return volume, field, pairs
