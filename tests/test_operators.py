@@ -296,7 +296,7 @@ def first_order(u, v, w):
             {"stiffness": first_order},
             r"stiffness: not symmetric: entry \(1, 7\) is 0.333333, and entry \(7, 1\) differs",
         ),
-        ({"stiffness": lambda u, v, w: u.grad}, r"<lambda>: returns shape \(2,\); expected one number"),
+        ({"stiffness": lambda u, v, w: u.grad}, r"<lambda>: returns float64 of shape \(2,\); expected one number"),
         ({"stiffness": lambda u, v, w: u.value**2 * v.value}, "not linear in u"),
         ({"stiffness": lambda u, v, w: v.value * v.value}, "<lambda>: reads nothing of u"),
         ({"stiffness": lambda u, v, w: w["young"]}, "a form reads 'young', and there is none"),

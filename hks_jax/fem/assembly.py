@@ -139,11 +139,11 @@ def assemble(
         raise ValueError('boundary: got "mirror" with components, which a reflection would have to turn; use another')
     problems = doubled_problems(sides)
     spaces = [grid_space(domain.grid, problem) for problem in problems]
-    space, tensors = spaces[0], domain.tensors
-    held = _checked_fields(
-        operator, given, space, partial(_grid_points, domain.grid, space, tensors.dtype), tensors.dtype
-    )
-    operator = operator._replace(checked=not is_traced((domain, held)))
+    space, held = spaces[0], {}
+    if given:
+        dtype = domain.tensors.dtype
+        held = _checked_fields(operator, given, space, partial(_grid_points, domain.grid, space, dtype), dtype)
+    operator = operator._replace(checked=not (operator.own and is_traced((domain, held))))
     pencils = [_assemble_grid(domain, held, each, operator) for each in spaces]
     if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
         where = (
