@@ -118,7 +118,7 @@ def assemble(
             )
         spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
         points = partial(_mesh_points, nodes, spaces[0])
-        given = {name: value if callable(value) else domain.inside(value) for name, value in given.items()}
+        given = {name: value if callable(value) else domain.restrict(value) for name, value in given.items()}
         held = _checked_fields(operator, given, spaces[0], points, nodes.dtype)
         operator = operator._replace(checked=not (operator.own and is_traced((domain, held, nodes))))
         curved = midpoints is not None
@@ -411,7 +411,7 @@ def _assemble_mesh(
     shape = len(space.cells), element.weights.size
     if curved:
         slopes = jnp.asarray(element.gradients, nodes.dtype)
-        frames = mesh.oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
+        frames = mesh._oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
         metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest"))
     else:
         metric, frames = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))
