@@ -51,7 +51,7 @@ class SimplicialMesh(eqx.Module):
         """Return what belongs to the cells inside the mask, of an array (n, …) over all cells that were given."""
         if self._mask is None or np.shape(of_cells)[:1] != self._mask.value.shape:
             return of_cells
-        return of_cells[self._mask.value]
+        return (np.asarray(of_cells) if isinstance(of_cells, list | tuple) else of_cells)[self._mask.value]
 
     @property
     def metric(self) -> Float[Array, "n d d"]:
