@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hks_jax.atomic import atomic_path
+from hks_jax.domain.components import active_elements
 from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, figure3_fields, figure4_fields, phantom
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import MetricChoice
@@ -73,12 +74,11 @@ def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
 
 def _triangles(grid: Grid, periodic: bool) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3 2"]]:
     """Return the corners' nodes and places: two triangles for each cell whose nodes are all inside."""
-    cells = np.argwhere(np.ones(grid.shape if periodic else [n - 1 for n in grid.shape], dtype=bool))
+    cells = np.argwhere(active_elements(grid.inside, (periodic,) * 2))
     steps = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
     corners = cells[:, None, None] + steps
     nodes = np.ravel_multi_index(tuple(np.moveaxis(corners % grid.shape, -1, 0)), grid.shape)
-    kept = grid.inside.ravel()[nodes].all(axis=(1, 2))
-    return nodes[kept].reshape(-1, 3), (corners[kept] * np.asarray(grid.spacing)).reshape(-1, 3, 2)
+    return nodes.reshape(-1, 3), (corners * np.asarray(grid.spacing)).reshape(-1, 3, 2)
 
 
 def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
