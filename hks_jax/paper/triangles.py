@@ -4,13 +4,11 @@ The grid's cells are cut by their diagonals, and every edge has a length in the 
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.components import active_elements
 from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, figure3_fields, figure4_fields, phantom
 from hks_jax.domain.grid import Grid
@@ -98,8 +96,8 @@ def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
     return cases
 
 
-def triangles(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``triangles.md``."""
+def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
+    """Return a table in Markdown, by the name of its file."""
     echo("triangles: edge lengths in the metric, on the paper's fields")
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",
@@ -114,7 +112,4 @@ def triangles(output: Path, full: bool, echo: Callable[[str], None]) -> list[Pat
         counts = [count(field, rule, periodic) for rule in LENGTHS]
         wrong = " | ".join(str(c.violating) for c in counts)
         lines.append(f"| {name} | {counts[0].triangles} | {wrong} | {counts[0].vertices} | {counts[0].no_area} |")
-    path = output / "triangles.md"
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return [path]
+    return {"triangles.md": "\n".join(lines) + "\n"}
