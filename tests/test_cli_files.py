@@ -243,6 +243,21 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     refused("--array: 'D' has 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
 
 
+def test_signature_of_a_surface_without_some_vertices(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    sphere = hj.examples.sphere_mesh(3)
+    meshio.Mesh(np.asarray(sphere.vertices), [("triangle", sphere.faces)]).write(tmp_path / "s.vtk")
+    inside = np.asarray(sphere.vertices)[:, 2] > -0.4
+    lines = ["#!ascii label", str(inside.sum()), *(f"{number} 0 0 0 0" for number in np.flatnonzero(inside))]
+    (tmp_path / "inside.label").write_text("\n".join(lines) + "\n")
+    cap = hj.SurfaceMesh(sphere.vertices, sphere.faces, mask=inside)
+    expected = hj.hks(hj.eigenpairs(cap, 12, "mean"), [0.5])
+    more = ["--inside", str(tmp_path / "inside.label"), "--boundary", "mean", "-k", "12", "--times", "0.5", "-q"]
+    assert main(["hks", str(tmp_path / "s.vtk"), "-o", str(tmp_path / "out"), *more]) == 0
+    with np.load(tmp_path / "out" / "hks.npz") as found:
+        np.testing.assert_allclose(found["hks"], expected, rtol=1e-5)
+
+
 # ---------------------------------------------------------------------------------------------------- convert
 
 

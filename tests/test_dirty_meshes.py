@@ -226,7 +226,7 @@ def test_cleaning_says_all_that_it_did_on_the_command_line(tmp_path, capsys):
     path = save_off(tmp_path / "m.off", dirty, np.concatenate([faces, more]))
     assert main(["info", str(path)]) == 2
     assert (
-        "vertices: 1 of 52 belong to no face (the first is vertex 50); remove them. --clean puts"
+        "vertices: 1 of 52 belong to no face (the first is vertex 50); remove them, or leave them out by a mask. --clean puts"
         in capsys.readouterr().err
     )
     assert main(["info", str(path), "--clean", "--json"]) == 0

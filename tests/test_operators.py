@@ -252,7 +252,7 @@ def test_forms_on_a_surface_see_space(rng):
     pairs = hj.eigenpairs(own, 5)
     assert pairs.eigenvalues[0] == 0
     assert (pairs.eigenvalues[1:] < hj.eigenpairs(built_in, 5).eigenvalues[1:]).all()
-    with unchecked(), pytest.raises(ValueError, match="M: it has 64 negative"):
+    with unchecked(), pytest.raises(ValueError, match="mass: it has 64 negative"):
         hj.eigenpairs(hj.assemble(mesh, mass=lambda u, v, w: -u.value * v.value), 3)
 
 
@@ -296,7 +296,7 @@ def first_order(u, v, w):
             {"stiffness": first_order},
             r"stiffness: not symmetric: entry \(1, 7\) is 0.333333, and entry \(7, 1\) differs",
         ),
-        ({"stiffness": lambda u, v, w: u.grad}, r"<lambda>: returns shape \(2,\); expected one number"),
+        ({"stiffness": lambda u, v, w: u.grad}, r"<lambda>: returns float64 of shape \(2,\); expected one number"),
         ({"stiffness": lambda u, v, w: u.value**2 * v.value}, "not linear in u"),
         ({"stiffness": lambda u, v, w: v.value * v.value}, "<lambda>: reads nothing of u"),
         ({"stiffness": lambda u, v, w: w["young"]}, "a form reads 'young', and there is none"),
@@ -317,5 +317,7 @@ def test_what_cannot_be_looked_at_becomes_nan():
     field = flat((5, 5), (1.0, 1.0))
     unsymmetric = jax.jit(lambda s: hj.assemble(field, stiffness=first_order, fields={"s": s}).stiffness.coefficients)
     assert np.isnan(unsymmetric(1.0)).any()
+    with pytest.raises(ValueError, match="stiffness: the form closes over traced values; hand them over by fields="):
+        jax.grad(lambda c: hj.assemble(field, stiffness=lambda u, v, w: c * u.value * v.value).stiffness.flat()[0])(1.0)
     negative = jax.jit(lambda rho: hj.eigenpairs(hj.assemble(field, density=rho), 3).result)
     assert negative(-1.0) == hj.RESULTS.not_finite

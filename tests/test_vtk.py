@@ -131,7 +131,7 @@ def test_damaged_files(tmp_path, tensors):
     for name, binary in (("a.vti", False), ("b.vti", True), ("a.vtk", False), ("b.vtk", True)):
         path = write(tmp_path / name, data, binary)
         path.write_bytes(path.read_bytes()[:-500])
-        with pytest.raises(ValueError, match=r"not readable VTK image data|incomplete; it ends"):
+        with pytest.raises(ValueError, match="not readable VTK image data"):
             read_tensors(path)
         path.write_bytes(b"not what the name says")
         with pytest.raises(ValueError, match="not readable VTK image data"):

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hks_jax import SurfaceMesh, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
@@ -39,11 +39,12 @@ from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.io import TensorVolume, read_mesh, read_mesh_arrays, sample_tensors
+from hks_jax.io import TensorVolume, read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN, is_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.result import Result
 from hks_jax.io.tensor_order import unpack
+from hks_jax.optional import optional
 
 OPTIONS = f"""
 @file @metric {READING} @output {SOLVING}
@@ -53,6 +54,9 @@ OPTIONS = f"""
     of a mesh that lies in a volume, such as a cortex: the tensors, sampled at its vertices in the coordinates of the
     scanner (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation); options on voxels and numbers
     are about this file
+--inside FILE
+    of a mesh: the vertices of the domain, such as a cortex without its medial wall: FreeSurfer's .label, or zeros and
+    ones in .npy, or .npz with 'mask'
 @signature @noise @view
 --save-pairs  keep the eigenpairs, in OUT as pairs.npz: 'hks-jax hks OUT/pairs.npz --times …' solves nothing again
 """
@@ -68,6 +72,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if is_mesh(args.file):
         return _on_mesh(args, Settings.of(args, metric=args.metric, times=times), progress)
     refuse(args, ("clean",), "it is for meshes; leave it out for tensors on a grid, and see --repair")
+    refuse(args, ("inside",), "it is for meshes; leave it out for tensors on a grid, and see --mask")
     refuse(args, ("tensors",), "it is for a mesh that lies in a volume; leave it out for the volume itself")
     return _on_grid(args, Settings.of(args, times=times), progress)
 
@@ -153,15 +158,28 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | 
     mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))
     vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
+    inside = None if args.inside is None else _inside(args.inside, len(vertices))
     if args.tensors:
         volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
         require_valid(volume, "--repair")
-        tensors = sample_tensors(volume, mesh.vertices).astype(args.dtype)
+        at = np.arange(len(vertices)) if inside is None else np.flatnonzero(inside)
+        tensors = np.zeros((len(vertices), 3, 3), args.dtype)
+        tensors[at] = sample_tensors(volume, np.asarray(mesh.vertices)[at])
     elif args.array:
         tensors = _tensors(args).astype(args.dtype)
     else:
-        return kind(vertices, cells)
-    return kind.from_tensors(vertices, cells, tensors, args.metric, at="vertices", interpolation=args.interpolation)
+        return kind(vertices, cells, mask=inside)
+    settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
+    return kind.from_tensors(vertices, cells, tensors, args.metric, **settings)
+
+
+def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
+    if path.suffix != ".label":
+        return read_mask(path)
+    numbers = optional("nibabel.freesurfer").read_label(path)
+    if numbers.size == 0 or numbers.max() >= n_vertices:
+        raise ValueError(f"--inside: {path} names {numbers.size} vertices, and the mesh has {n_vertices}")
+    return np.isin(np.arange(n_vertices), numbers)
 
 
 def _tensors(args: argparse.Namespace) -> Float[np.ndarray, "V 3 3"]:

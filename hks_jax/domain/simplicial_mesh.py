@@ -32,12 +32,12 @@ class SimplicialMesh(eqx.Module):
             raise ValueError(f"vertices: got shape {positions.shape}; expected (V, 3)")
         cells = checked_cells(cells, len(positions), dimension, mask is not None)
         self._mask = None if mask is None else StaticArray(checked_mask(mask, cells, len(positions), dimension))
-        triangulation = Triangulation(self.inside(cells), len(positions))
+        triangulation = Triangulation(self.restrict(cells), len(positions))
         if not is_traced(positions):
             check_places(np.asarray(positions, dtype=np.float64), triangulation)
         self.vertices = positions
         self.triangulation = triangulation
-        self._metric = None if metric is None else _checked_metric(self.inside(metric), triangulation)
+        self._metric = None if metric is None else _checked_metric(self.restrict(metric), triangulation)
         if metric is None and not is_traced(positions):
             check_metric(np.asarray(self.metric), np.asarray(positions, np.float64), triangulation.cells)
 
@@ -47,11 +47,11 @@ class SimplicialMesh(eqx.Module):
         cells = f"{len(self.triangulation.cells)} {WORDS[self.triangulation.dimension].simplices}"
         return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"
 
-    def inside(self, of_cells: Any) -> Any:
+    def restrict(self, of_cells: Any) -> Any:
         """Return what belongs to the cells inside the mask, of an array (n, …) over all cells that were given."""
         if self._mask is None or np.shape(of_cells)[:1] != self._mask.value.shape:
             return of_cells
-        return of_cells[self._mask.value]
+        return (np.asarray(of_cells) if isinstance(of_cells, list | tuple) else of_cells)[self._mask.value]
 
     @property
     def metric(self) -> Float[Array, "n d d"]:
@@ -64,9 +64,9 @@ class SimplicialMesh(eqx.Module):
     def _edges(self) -> Float[Array, "n 3 d"]:
         """The edges v₁ − v₀, v₂ − v₀ … of each cell, as columns; NaN for inverted tetrahedra."""
         corners = self.vertices[self.triangulation.cells]
-        return self.oriented(jnp.swapaxes(corners[:, 1:] - corners[:, :1], -1, -2))
+        return self._oriented(jnp.swapaxes(corners[:, 1:] - corners[:, :1], -1, -2))
 
-    def oriented(self, frames: Float[Array, "*n 3 d"]) -> Float[Array, "*n 3 d"]:
+    def _oriented(self, frames: Float[Array, "*n 3 d"]) -> Float[Array, "*n 3 d"]:
         """Return frames ∂x/∂ξ of cells; NaN in place of those that turn tetrahedra inside out."""
         if self.triangulation.dimension == 2:
             return frames
@@ -81,7 +81,9 @@ def with_tensors(
     mesh: Mesh, tensors: Any, metric: MetricChoice | None, at: str | None, interpolation: Interpolation
 ) -> Mesh:
     """Return a mesh with the metric of tensors in space; see `SurfaceMesh.from_tensors`, `TetMesh.from_tensors`."""
-    metric_tensors = metric_of_tensors(mesh._edges, mesh.triangulation, mesh.inside(tensors), metric, at, interpolation)
+    metric_tensors = metric_of_tensors(
+        mesh._edges, mesh.triangulation, mesh.restrict(tensors), metric, at, interpolation
+    )
     given = _checked_metric(metric_tensors, mesh.triangulation)  # such as an inverse that overflows
     return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 

@@ -73,7 +73,8 @@ def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPe
         negative, sound = certain_count(SymmetricPencil(part.mass, DiagonalOperator(ones)), zero)
         if int(negative) or not sound:
             what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
-            raise ValueError(f"M: it has {what}, by the inertia of its factorisation; expected positive definite")
+            name = "M" if isinstance(part.space, MatrixSpace) else "mass"
+            raise ValueError(f"{name}: it has {what}, by the inertia of its factorisation; expected positive definite")
     return pencil
 
 

@@ -13,7 +13,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.domain.triangulation import FACETS
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.fem.space import FunctionSpace, GridSpace
+from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
 
 Real = TypeVar("Real", float, Float[np.ndarray, " n"])
 Volume = TypeVar("Volume", float, Float[Array, ""])
@@ -70,8 +70,11 @@ def weyl_count(
     if domain is None:
         return weyl_number(numbers, float(volume), d)
     shape = domain.grid.shape if isinstance(domain, TensorField) else (len(domain.vertices),)
-    if shape != pencil.space.node_shape:
-        raise ValueError(f"domain: got one of shape {shape}; expected that of the problem, {pencil.space.node_shape}")
+    nodes = pencil.space.node_shape
+    if isinstance(pencil.space, MeshSpace):  # of degree 2 there are more nodes than vertices
+        nodes = (pencil.space.triangulation.n_vertices,)
+    if shape != nodes:
+        raise ValueError(f"domain: got one of shape {shape}; expected that of the problem, {nodes}")
     # The problems that make up a doubled domain have opposite conditions where it was doubled.
     rim = sum(rim_measure(domain, part.space) for part in pencil.parts)
     return weyl_number(numbers, float(volume), d, rim)

@@ -118,7 +118,7 @@ def assemble(
             )
         spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
         points = partial(_mesh_points, nodes, spaces[0])
-        given = {name: value if callable(value) else domain.inside(value) for name, value in given.items()}
+        given = {name: value if callable(value) else domain.restrict(value) for name, value in given.items()}
         held = _checked_fields(operator, given, spaces[0], points, nodes.dtype)
         operator = operator._replace(checked=not (operator.own and is_traced((domain, held, nodes))))
         curved = midpoints is not None
@@ -139,11 +139,11 @@ def assemble(
         raise ValueError('boundary: got "mirror" with components, which a reflection would have to turn; use another')
     problems = doubled_problems(sides)
     spaces = [grid_space(domain.grid, problem) for problem in problems]
-    space, tensors = spaces[0], domain.tensors
-    held = _checked_fields(
-        operator, given, space, partial(_grid_points, domain.grid, space, tensors.dtype), tensors.dtype
-    )
-    operator = operator._replace(checked=not is_traced((domain, held)))
+    space, held = spaces[0], {}
+    if given:
+        dtype = domain.tensors.dtype
+        held = _checked_fields(operator, given, space, partial(_grid_points, domain.grid, space, dtype), dtype)
+    operator = operator._replace(checked=not (operator.own and is_traced((domain, held))))
     pencils = [_assemble_grid(domain, held, each, operator) for each in spaces]
     if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
         where = (
@@ -168,6 +168,9 @@ def _checked_operator(
         raise ValueError(f'mass: got {mass!r}; expected "consistent", "lumped" or a form')
     if stiffness is not None and not callable(stiffness):
         raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form, a function of u, v and w")
+    for name, form in (("stiffness", stiffness), ("mass", mass)):
+        if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
+            raise ValueError(f"{name}: the form closes over traced values; hand them over by fields={{…}}, numbers too")
     require_count("components", components)
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
@@ -408,7 +411,7 @@ def _assemble_mesh(
     shape = len(space.cells), element.weights.size
     if curved:
         slopes = jnp.asarray(element.gradients, nodes.dtype)
-        frames = mesh.oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
+        frames = mesh._oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
         metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest"))
     else:
         metric, frames = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))

@@ -137,9 +137,9 @@ def _reads(form: Form, functions: ShapeFunction, w: Point) -> tuple[bool, ...]:
     """Return whether a form reads the value of u and its derivatives: by what it does not, nothing is multiplied."""
     u = jax.tree.map(lambda leaf: leaf[0], functions)
     traced = jax.make_jaxpr(lambda *leaves: form(ShapeFunction(*leaves), u, w))(*u)
-    if [result.shape for result in traced.out_avals] != [()]:
-        got = ", ".join(str(result.shape) for result in traced.out_avals)
-        raise ValueError(f"{_name(form)}: returns shape {got}; expected one number, shape ()")
+    if [(result.shape, result.dtype) for result in traced.out_avals] != [((), u.value.dtype)]:
+        got = ", ".join(f"{result.dtype} of shape {result.shape}" for result in traced.out_avals)
+        raise ValueError(f"{_name(form)}: returns {got}; expected one number, {u.value.dtype} of shape ()")
     inputs = [id(variable) for equation in traced.jaxpr.eqns for variable in equation.invars]
     read = tuple(id(variable) in inputs for variable in traced.jaxpr.invars)
     if not any(read):

@@ -5,7 +5,7 @@ import hashlib
 import os
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,7 +15,8 @@ from hks_jax.inverse.unknowns import Values
 from hks_jax.npz import load_npz, write_npz
 
 
-class Checkpoint(NamedTuple):
+@dataclasses.dataclass
+class Checkpoint:
     """Where a fit stands."""
 
     values: Any  # the unknowns
@@ -23,7 +24,7 @@ class Checkpoint(NamedTuple):
     start: int  # which of the starts
     stage: int  # which stage of the continuation
     step_size: float  # by which the damping is divided
-    best: Any  # the unknowns of the best of the starts before, and their losses
+    best: Any  # the unknowns of the best of the starts before
     losses: list[float]  # of the starts before
 
 
@@ -38,7 +39,7 @@ def fingerprint(*parts: Any) -> str:
 def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> None:
     """Write a checkpoint."""
     rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], np.float64)
-    content = checkpoint._asdict() | {"mark": mark, "history": rows, "losses": np.array(checkpoint.losses)}
+    content = vars(checkpoint) | {"mark": mark, "history": rows, "losses": np.array(checkpoint.losses)}
     write_npz(path, content, compressed=False)
 
 
@@ -48,7 +49,7 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
         data = load_npz(path)
     except (OSError, ValueError) as error:
         raise ValueError(f"checkpoint: {error}; or give another name, or remove it") from error
-    lacking = {"mark", *Checkpoint._fields} - set(data)
+    lacking = {"mark", *(field.name for field in dataclasses.fields(Checkpoint))} - set(data)
     if lacking:
         names = ", ".join(sorted(lacking))
         raise ValueError(f"checkpoint: {path} is not one of a fit, it lacks {names}; give another name, or remove it")
@@ -73,26 +74,22 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
 
 @dataclasses.dataclass
 class Log:
-    """What happened so far; called after each step, it tells and saves it."""
+    """Called after each step of a fit, it tells and saves it."""
 
+    now: Checkpoint  # where the fit stands
     progress: Callable[[Step], None] | None  # called with each step
     path: str | os.PathLike[str] | None  # of the checkpoint
     mark: str  # of what fit it is
-    best: Values  # the best unknowns of the starts before
     clock: float  # when the fit began, by `time.perf_counter`
-    history: list[Step] = dataclasses.field(default_factory=list)  # the steps
-    losses: list[float] = dataclasses.field(default_factory=list)  # of the starts before
-    start: int = 0  # which of the starts is under way,
-    stage: int = 0  # and which stage of it
 
     def __call__(
         self, number: int, told: tuple[float, float, float], accepted: bool, values: Values, step_size: float
     ) -> None:
         """Take up a step by its number within the stage: loss, misfit and gradient, and whether it was taken."""
-        seconds = time.perf_counter() - self.clock
-        self.history.append(Step(number, *told, accepted, seconds, self.stage, self.start))
+        now, seconds = self.now, time.perf_counter() - self.clock
+        now.values, now.step_size = values, step_size
+        now.history.append(Step(number, *told, accepted, seconds, now.stage, now.start))
         if self.progress is not None:
-            self.progress(self.history[-1])
+            self.progress(now.history[-1])
         if self.path is not None:
-            now = Checkpoint(values, self.history, self.start, self.stage, step_size, self.best, self.losses)
             save(self.path, self.mark, now)

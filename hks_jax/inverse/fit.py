@@ -152,17 +152,14 @@ def fit_metric(
 
     choices = parametrisation, k, boundary, optimiser, smoothness, tolerance, continuation, starts, spread, seed, noise
     mark = files.fingerprint(whole, weights, init.domain_tensors, regularisers, repr(choices))
-    resumed = files.load(checkpoint, mark) if checkpoint is not None and Path(checkpoint).exists() else None
-    log = Log(progress, checkpoint, mark, first, clock)
-    if resumed:
-        log.history, log.losses, log.best = list(resumed.history), list(resumed.losses), jnp.asarray(resumed.best)
-        log.clock -= log.history[-1].seconds
-
+    now = files.Checkpoint(first, [], 0, 0, 1.0, first, [])
+    if checkpoint is not None and Path(checkpoint).exists():
+        now = files.load(checkpoint, mark)
+        clock -= now.history[-1].seconds
+    log = Log(now, progress, checkpoint, mark, clock)
     search = Search(optimiser, tolerance, noise, inner_product, max_steps, log)
-    reached = search.from_starts(
-        problems, lambda start: _moved(first, inner_product, spread, seed, start), starts, resumed
-    )
-    log.stage, log.best = len(problems), reached.values
+    reached = search.from_starts(problems, lambda start: _moved(first, inner_product, spread, seed, start), starts)
+    now.stage, now.best = len(problems), reached.values
     renewed = partial(problem_of, whole) if k is None else None
     values, outcome, result, problem = search.with_enough_pairs(reached, problems[-1], renewed)
     for message in outcome.pairs.messages():
@@ -181,7 +178,7 @@ def fit_metric(
             '"log-euclidean", another init or weaker regularisers; or the noise is larger. What the fit added '
             "to init may be the misfit's and not the metric's"
         )
-    history, losses = tuple(log.history), tuple(log.losses)
+    history, losses = tuple(now.history), tuple(now.losses)
     field, reached_loss = unknowns.field(values), float(outcome.loss)
     return MetricFit(field, reached_loss, misfit, left, history, result, values, problem, losses, noise)
 
@@ -197,9 +194,7 @@ def _unknowns(parametrisation: Any, parameters: Any, init: TensorField, domain: 
 
 
 def _moved(first: Any, inner_product: InnerProduct, spread: float, seed: int, start: int) -> Any:
-    """Return the values to begin with: the first as they are, the others with smooth noise."""
-    if start == 0:
-        return first
+    """Return the values to begin a further start with, the first ones with smooth noise."""
     noise = jax.random.normal(jax.random.fold_in(jax.random.key(seed), start), first.shape, first.dtype)
     noise = inner_product.solve(noise)
     return first + spread * noise / jnp.sqrt(jnp.mean(noise**2))

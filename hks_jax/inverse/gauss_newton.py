@@ -35,11 +35,9 @@ class _State(eqx.Module):
 
     values: Values  # the unknowns
     gradient: Values  # the gradient
-    # by how much the last step from there changes half the sum of squares, by the linearisation
-    promised: Float[Array, ""]
+    promised: Float[Array, ""]  # the change of half the sum of squares by the last step from there, linearised
     change: Float[Array, ""]  # the size of the step that led there, in tolerances
-    # B in the direction of that step over the curvature that it saw: times μ, the part of damping
-    damped: Float[Array, ""]
+    damped: Float[Array, ""]  # B along that step over the curvature that it saw: times μ, the part of damping
     tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
     done: Bool[Array, ""]  # whether no step is needed any more
 
@@ -51,8 +49,7 @@ class DampedDescent(eqx.Module):
     result is a descent direction whenever they stop.
     """
 
-    # what the unknowns still change, relative and absolute, when no further step is computed
-    tolerance: Float[Array, ""]
+    tolerance: Float[Array, ""]  # the change of the unknowns, relative and absolute, at which steps end
     damping: Float[Array, ""]  # μ at step size 1
     inner_product: InnerProduct  # B
     inner_tolerance: Float[Array, ""]  # reduction of the residual, in the norm of the preconditioner's inverse

@@ -32,12 +32,9 @@ class Signature:
     """A kind of signature."""
 
     name: str  # what `fit_metric` calls it; empty for a function of the user's
-    # takes eigenpairs, times, the width of a wave kernel and how many entries there are; a user's takes the
-    # eigenpairs alone
+    # Takes eigenpairs, times, the width of a wave kernel, the number of entries; a user's takes the eigenpairs alone.
     function: Callable[..., Array]
-    # of what it depends on beside the eigenpairs: ``"t"`` for times of the flow of heat, ``"e"`` for energies, empty
-    # for nothing
-    symbol: str = ""
+    symbol: str = ""  # "t": it depends on times of the flow of heat; "e": on energies; empty: on the eigenpairs alone
     at_nodes: bool = False  # whether it has a value for each node
 
 
@@ -55,15 +52,14 @@ SIGNATURES = {
 class Observation(eqx.Module):
     """The observed entries of a target."""
 
-    target: Float[Array, " m"]  # (m,) their values
-    root_weights: Float[Array, " m"]  # (m,) the square roots of their weights, which add up to one
+    target: Float[Array, " m"]  # their values
+    root_weights: Float[Array, " m"]  # the square roots of their weights, which add up to one
     times: Float[Array, " n_times"] | None  # the times, energies, or None
     sigma: Float[Array, ""] | None  # the width of a wave kernel signature, or None
     shape: tuple[int, ...] = eqx.field(static=True)  # of the whole target
     entries: StaticArray = eqx.field(static=True)  # which of the flat target's entries they are
     signature: Signature = eqx.field(static=True)  # its kind
-    # one of `LOSSES`, or a function of predicted and target (m,) to residuals (m,)
-    loss: str | Loss = eqx.field(static=True)
+    loss: str | Loss = eqx.field(static=True)  # one of `LOSSES`, or a function of predicted and target to residuals
 
     def predict(self, pairs: Eigenpairs) -> Array:
         """Return the whole signature."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 
-from hks_jax.inverse.checkpoint import Checkpoint, Log
+from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.conformal import (
     Euclidean,
     InnerProduct,
@@ -111,34 +111,33 @@ class Search:
     def through_stages(self, problems: Sequence[Problem], values: Values, first: int, step_size: float) -> Reached:
         """Solve the problems from the first on, one after another; the outcome is that of the last of them."""
         reached, last = Reached(values, None, "interrupted"), len(problems) - 1
-        for self.log.stage in range(first, len(problems)):
-            tolerances = 1.0 if self.log.stage == last else _EARLY
-            reached = self.solve(problems[self.log.stage], reached.values, tolerances, step_size)
+        now = self.log.now
+        for now.stage in range(first, len(problems)):
+            tolerances = 1.0 if now.stage == last else _EARLY
+            reached = self.solve(problems[now.stage], reached.values, tolerances, step_size)
             step_size = 1.0
             if reached.stopped:
                 break
-        if reached.outcome is None or self.log.stage < last:
+        if reached.outcome is None or now.stage < last:
             reached = reached._replace(outcome=outcome_of(problems[-1], reached.values))
         return reached
 
-    def from_starts(
-        self, problems: Sequence[Problem], begin: Callable[[int], Values], starts: int, resumed: Checkpoint | None
-    ) -> Reached:
-        """Return the best of several starts, each at the unknowns that `begin` returns for its number."""
-        if resumed and resumed.stage == len(problems):  # with more eigenpairs; no start is open any more
-            return Reached(jnp.asarray(resumed.values), None, "converged")
-        best = Reached(self.log.best, None, "interrupted")
-        for self.log.start in range(resumed.start if resumed else 0, starts):
-            if resumed and self.log.start == resumed.start:
-                where = jnp.asarray(resumed.values), resumed.stage, resumed.step_size
-            else:
-                where = begin(self.log.start), 0, 1.0
+    def from_starts(self, problems: Sequence[Problem], begin: Callable[[int], Values], starts: int) -> Reached:
+        """Return the best of several starts: where the log stands, then at what `begin` returns for each number."""
+        now, first = self.log.now, self.log.now.start
+        where = jnp.asarray(now.values), now.stage, now.step_size
+        if now.stage == len(problems):  # with more eigenpairs; no start is open any more
+            return Reached(where[0], None, "converged")
+        best = Reached(jnp.asarray(now.best), None, "interrupted")
+        for now.start in range(first, starts):
+            if now.start > first:
+                where = begin(now.start), 0, 1.0
             reached = self.through_stages(problems, *where)
             assert reached.outcome is not None
             loss = float(reached.outcome.loss)
-            if not self.log.losses or not loss >= min(self.log.losses):
-                best, self.log.best = reached, reached.values
-            self.log.losses.append(loss)
+            if not now.losses or not loss >= min(now.losses):
+                best, now.best = reached, reached.values
+            now.losses.append(loss)
             if reached.result == "interrupted":
                 break
         return best

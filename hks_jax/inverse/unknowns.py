@@ -75,8 +75,7 @@ class Nodal(Unknowns):
 class Free(Unknowns):
     """The parameters of a function of the user's."""
 
-    # maps them to a field, or to tensors on the grid of the initial field
-    function: Callable[[Any], Any] = eqx.field(static=True)
+    function: Callable[[Any], Any] = eqx.field(static=True)  # maps them to a field, or to tensors on its grid
     parameters: Any  # where to start, any pytree of floating point arrays
     init: TensorField  # the initial field, for its grid and interpolation
 

@@ -98,9 +98,9 @@ def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
         )
     else:
         n_nodes, n_elements = (int(each.partition(b"\n")[0]) for each in (nodes, elements))
-        for each, declared in ((nodes, n_nodes), (elements, n_elements)):
+        for each, declared in ((nodes, n_nodes), (elements, n_elements)) if text else ():
             there = sum(1 for line in each.splitlines()[1:] if line.strip())
-            if text and there != declared:  # meshio passes over the rest
+            if there != declared:  # meshio passes over the rest
                 raise ValueError(f"it declares {declared} nodes or elements, and has {there} lines for them")
         rows, node = nodes.partition(b"\n")[2], np.dtype("<i4, (3,)<f8")
         tags = map(int, rows.split()[::4]) if text else np.frombuffer(rows[: n_nodes * node.itemsize], node)["f0"]

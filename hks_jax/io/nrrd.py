@@ -48,9 +48,9 @@ KINDS = {
 class Placement(NamedTuple):
     """Where the voxels lie, in mm where the file declares a unit."""
 
-    directions: Float[np.ndarray, "d d"]  # (d, d), the step along each voxel axis as a column, in the file's space
-    origin: Float[np.ndarray, " d"]  # (d,), in the file's space
-    # (d,), what takes the file's space to right, anterior, superior; None where it is not patient-based
+    directions: Float[np.ndarray, "d d"]  # the step along each voxel axis as a column, in the file's space
+    origin: Float[np.ndarray, " d"]  # in the file's space
+    # The signs that take the file's space to right, anterior, superior; None where it is not patient-based.
     signs: Float[np.ndarray, " d"] | None
     placed: bool  # whether the file gives directions at all, and not spacings alone
     unit: str = ""  # of length in the file; empty if it declares none

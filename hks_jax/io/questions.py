@@ -32,8 +32,7 @@ class Alternative(NamedTuple):
 
     name: str  # a frame, or an axis of the voxels or of the scanner that is reversed
     is_frame: bool  # whether it is a frame
-    # the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it
-    angle: float
+    angle: float  # the mean, in degrees, between a principal direction and the mean of the two neighbours' along it
     errors: float  # by how many standard errors that is less than with the axes in which the file was read
 
 
@@ -41,8 +40,7 @@ class Coherence(NamedTuple):
     """How well the fibres of neighbours continue each other, as the file was read, and along other axes."""
 
     frame: str  # in which the file was read
-    # the mean angle, in degrees, between a principal direction and the mean of the two neighbours' along it
-    angle: float
+    angle: float  # the mean, in degrees, between a principal direction and the mean of the two neighbours' along it
     others: tuple[Alternative, ...]  # the same along other axes
 
     @property

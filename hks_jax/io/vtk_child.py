@@ -81,4 +81,4 @@ if __name__ == "__main__":
     try:
         main(*sys.argv[1:])
     except Exception as error:
-        sys.exit(" ".join(f"{type(error).__name__}: {error}".split()))
+        sys.exit(" ".join(str(error).split()) or type(error).__name__)

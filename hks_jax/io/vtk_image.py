@@ -57,7 +57,8 @@ def load(path: Path) -> dict[str, np.ndarray]:
 def read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
     """Read tensors; see `hks_jax.io.read_tensors`."""
     file = existing(name)
-    with reading(file, "readable VTK image data (.vti, or structured points in .vtk)"):
+    kind = "readable VTK image data (.vti, or structured points in .vtk)"
+    with reading(file, kind):
         content, xml = file.read_bytes(), name.lower().endswith(".vti")
         if xml:
             _check_pieces(content)
@@ -69,7 +70,8 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     place = "point" if _tensors_at(image, "point", array) or not _tensors_at(image, "cell", array) else "cell"
     chosen, declared = _tensor_array(name, image, place, array)
     components = image[f"{place}:{chosen}"]
-    (_check_range if xml else _check_length)(name, content, chosen, components)
+    with reading(file, kind):
+        (_check_range if xml else _check_length)(content, chosen, components)
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
     if components.shape[-1] == 9:
         if order is not None:
@@ -103,7 +105,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
         np.ascontiguousarray(to_voxel_axes(_on_grid(tensors, shape), frame, affine)),
         tuple(spacing.tolist()),
         tuple(affine[:3, 3].tolist()) if straight else (0.0,) * 3,
-        None if mask is None else as_mask("mask", np.ascontiguousarray(_on_grid(mask, shape))),
+        None if mask is None else as_mask(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape))),
         None if straight else affine,
         order=order,
         frame=frame,
@@ -210,7 +212,7 @@ def _check_pieces(content: bytes) -> None:
         raise ValueError(f"its pieces have {there} cells; expected the {whole} of the whole extent")
 
 
-def _check_range(name: str, content: bytes, array: str, values: np.ndarray) -> None:
+def _check_range(content: bytes, array: str, values: np.ndarray) -> None:
     """Raise ValueError unless an array's rows have lengths in the range that its file gives, where it gives one."""
     tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
     told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
@@ -220,12 +222,12 @@ def _check_range(name: str, content: bytes, array: str, values: np.ndarray) -> N
         lengths = np.linalg.norm(values, axis=-1)
     if not any(np.allclose([each.min(), each.max()], told, rtol=1e-4) for each in (lengths, values)):
         raise ValueError(
-            f"{name}: not readable VTK image data, or damaged: array {array!r} has rows of lengths {lengths.min():.4g} "
-            f"to {lengths.max():.4g}, and its file says {told[0]:.4g} to {told[1]:.4g}"
+            f"array {array!r} has rows of lengths {lengths.min():.4g} to {lengths.max():.4g}, and its file says "
+            f"{told[0]:.4g} to {told[1]:.4g}"
         )
 
 
-def _check_length(name: str, content: bytes, array: str, values: np.ndarray) -> None:
+def _check_length(content: bytes, array: str, values: np.ndarray) -> None:
     """Raise ValueError where a legacy file ends before an array does, which VTK hardly notices."""
     key = re.escape(quote(array).encode())
     line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
@@ -233,7 +235,7 @@ def _check_length(name: str, content: bytes, array: str, values: np.ndarray) -> 
         return  # a name that is written otherwise: nothing to measure from
     rest, text = content[line.end() :], b"ASCII" in content.split(maxsplit=40)[:40]
     if len(rest.split(maxsplit=values.size)) < values.size if text else len(rest) < values.nbytes:
-        raise ValueError(f"{name}: incomplete; it ends before the {values.size} values of {array!r} do")
+        raise ValueError(f"it ends before the {values.size} values of {array!r} do")
 
 
 def _tensors_at(image: Mapping[str, np.ndarray], place: str, name: str | None) -> list[str]:

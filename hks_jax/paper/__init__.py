@@ -8,20 +8,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
+from hks_jax import plot
+from hks_jax.atomic import atomic_path
 from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, table1, triangles
 
 Echo = Callable[[str], None]
 
-ITEMS: dict[str, Callable[[Path, bool, Echo], list[Path]]] = {
-    "table1": table1.table1,
-    "figure1": figure1.figure1,
-    "figure2": figure2.figure2,
-    "figure3": figure3.figure3,
-    "figure4": figure4.figure4,
-    "figure5": figure5.figure5,
-    "figure6": figure6.figure6,
-    "triangles": triangles.triangles,
+_MODULES = (table1, figure1, figure2, figure3, figure4, figure5, figure6, triangles)
+ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
+    module.__name__.rpartition(".")[2]: module.make for module in _MODULES
 }
+"""What makes each: a picture, or texts by the names of their files."""
 
 
 def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:
@@ -49,7 +48,14 @@ def run(output: Path, full: bool = False, only: list[str] | None = None, echo: E
             echo(f"{place} {text}")
 
         start = time.perf_counter()
-        paths = ITEMS[name](output, full, say)
+        made = ITEMS[name](full, say)
+        paths = [output / file for file in (made if isinstance(made, dict) else (f"{name}.png",))]
+        if isinstance(made, Figure):
+            plot.save_figure(made, paths[0])
+        else:
+            for path, text in zip(paths, made.values(), strict=True):
+                with atomic_path(path) as temporary:
+                    temporary.write_text(text, encoding="utf-8")
         seconds = time.perf_counter() - start
         say(f"{name}: {', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
         written += paths

@@ -1,7 +1,6 @@
 """Figure 1: a surface and the metric that it induces on its parameter domain have the same HKS."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,8 +20,8 @@ DRAWN = 200
 ANGLES = ("0", "π/4", "π/2", "3π/4", "π", "5π/4", "3π/2")
 
 
-def figure1(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``figure1.png``."""
+def make(full: bool, echo: Callable[[str], None]) -> Figure:
+    """Return the figure."""
     n, k = FULL if full else QUICK
     field, mesh = bumpy_torus_field(n), bumpy_torus_mesh(n)
     echo(f"figure1: {k} eigenpairs of the surface with {n}² vertices, and of its metric")
@@ -58,7 +57,7 @@ def figure1(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
     fig.colorbar(mappable, ax=[surface_hks, domain_hks], label=f"HKS at $t$ = {TIME:g}", shrink=0.6, aspect=30)
     arrow(fig, surface, ellipses, (0.5, 0.0), (0.5, 1.12), "pull back")
     fig.suptitle("The heat kernel signature belongs to the metric, not to the embedding")
-    return [plot.save_figure(fig, output / "figure1.png")]
+    return fig
 
 
 def angle_axes(ax: Axes, quarters: np.ndarray) -> None:

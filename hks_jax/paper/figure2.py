@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from hks_jax import plot
@@ -33,8 +33,8 @@ def bump(x: Float[Array, " 2"]) -> Float[Array, "2 2"]:
     return (1 + jnp.sum(jnp.exp(-distances / 0.02))) * jnp.eye(2)
 
 
-def figure2(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``figure2.png``."""
+def make(full: bool, echo: Callable[[str], None]) -> Figure:
+    """Return the figure."""
     n = FULL if full else QUICK
     grid = Grid.from_bounds(0.0, 1.0, (n, n))
     fig = plot.new_figure(18, 6.8)
@@ -45,7 +45,7 @@ def figure2(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         _row(row, field, name)
     for ax, title in zip(rows[0], TITLES, strict=True):
         ax.set_title(title)
-    return [plot.save_figure(fig, output / "figure2.png")]
+    return fig
 
 
 def _row(panels: np.ndarray, field: TensorField, name: str) -> None:

@@ -1,9 +1,9 @@
 """Figure 3: four fields of diagonal tensors, and what the HKS sees of them."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from hks_jax import plot
 from hks_jax.domain.examples import figure3_fields
@@ -19,8 +19,8 @@ TITLES = (
 )
 
 
-def figure3(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``figure3.png``."""
+def make(full: bool, echo: Callable[[str], None]) -> Figure:
+    """Return the figure."""
     n = FULL if full else QUICK
     fig = plot.new_figure(15, 7.2)
     tops, bottoms = fig.subplots(2, 4, sharex=True, sharey=True)
@@ -38,4 +38,4 @@ def figure3(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         bottom.set_xlabel("$u_1$")
     tops[0].set_ylabel("unit circles of the metric\n$u_2$")
     bottoms[0].set_ylabel(rf"$4\pi t\,\mathrm{{HKS}}(t)$ at $t$ = {TIME:g}" + "\n$u_2$")
-    return [plot.save_figure(fig, output / "figure3.png")]
+    return fig

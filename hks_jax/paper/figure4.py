@@ -1,7 +1,8 @@
 """Figure 4: constant eigenvalues, varying eigenvectors: the HKS sees how the integral lines bend."""
 
 from collections.abc import Callable
-from pathlib import Path
+
+from matplotlib.figure import Figure
 
 from hks_jax import plot
 from hks_jax.domain.examples import figure4_fields
@@ -12,8 +13,8 @@ STRIP = 0.28  # heat falls to exp(−STRIP²/t) = exp(−8); the circles' and sp
 QUICK, FULL = 47, 201  # nodes per axis
 
 
-def figure4(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``figure4.png``."""
+def make(full: bool, echo: Callable[[str], None]) -> Figure:
+    """Return the figure."""
     n = FULL if full else QUICK
     fields = figure4_fields(n)
     fig = plot.new_figure(3.6 * len(fields) + 0.6, 7.2)
@@ -30,4 +31,4 @@ def figure4(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
     tops[0].set_ylabel("major (black), minor lines\n$u_2$")
     bottoms[0].set_ylabel(rf"$4\pi t\,\mathrm{{HKS}}(t)$ at $t$ = {TIME:g}" + "\n$u_2$")
     fig.suptitle("Constant eigenvalues, turning eigenvectors: the first three fields are flat, the others are not")
-    return [plot.save_figure(fig, output / "figure4.png")]
+    return fig

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from hks_jax import plot
 from hks_jax.domain.examples import degenerate_point_field
@@ -16,8 +16,8 @@ QUICK, FULL = 41, 201
 INDICES = tuple(Fraction(n, 2) for n in (-4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 
 
-def figure5(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``figure5.png``."""
+def make(full: bool, echo: Callable[[str], None]) -> Figure:
+    """Return the figure."""
     n = FULL if full else QUICK
     fields, images = [degenerate_point_field(float(index), n) for index in INDICES], []
     for index, field in zip(INDICES, fields, strict=True):
@@ -32,4 +32,4 @@ def figure5(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
         ax.set_title(f"index {str(index).replace('-', '−')}")
     fig.colorbar(image, ax=panels, label=rf"$4\pi t\,\mathrm{{HKS}}(t)$ at $t$ = {TIME:g}", shrink=0.7, aspect=30)
     fig.suptitle("Degenerate points: HKS and lines of the major eigenvector")
-    return [plot.save_figure(fig, output / "figure5.png")]
+    return fig

@@ -1,10 +1,10 @@
 """Figure 6: a slice of a brain at several t, each image with its own colours."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.figure import Figure
 from scipy.ndimage import distance_transform_edt
 
 from hks_jax import plot
@@ -18,8 +18,8 @@ LENGTHS = (5.0, 10.0, 20.0, 40.0)  # mm: how far heat goes, √(t / mean diffusi
 SLICE = 0
 
 
-def figure6(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``figure6.png``: of the brain in the PyPI wheel ``mdt`` where that is installed, else of a phantom."""
+def make(full: bool, echo: Callable[[str], None]) -> Figure:
+    """Return the figure: of the brain in the PyPI wheel ``mdt`` where that is installed, else of a phantom."""
     volume, name = _brain(echo), "brain"
     if volume is None:
         tensors, mask, spacing = phantom()
@@ -62,7 +62,7 @@ def figure6(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]
     fig.suptitle(
         f"Diffusion tensors of a {name}, and their HKS; the natural boundary raises it (grey: beyond the colours)"
     )
-    return [plot.save_figure(fig, output / "figure6.png")]
+    return fig
 
 
 def _cropped(volume: TensorVolume) -> TensorVolume:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.examples import bumpy_torus_field, bumpy_torus_mesh
 from hks_jax.paper.signature import signature
 
@@ -38,8 +37,8 @@ class Row(NamedTuple):
     area_weighted: float
 
 
-def table1(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``table1.md`` and ``table1.csv``."""
+def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
+    """Return the table as Markdown and as comma-separated values, by the names of their files."""
     k = REFERENCE_PAIRS if full else QUICK_PAIRS
     if full:
         echo(f"table1: {REFERENCE_PAIRS} eigenpairs of the surface with {REFERENCE_SIZE}² vertices")
@@ -51,11 +50,7 @@ def table1(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
         echo(f"table1: {k} eigenpairs of the metric on {n}² nodes")
         rows.append(row(n, k, reference))
     lines = [",".join(map(str, each)) + "\n" for each in (Row._fields, *rows)]
-    texts = {"table1.md": markdown(rows, computed=full), "table1.csv": "".join(lines)}
-    for name, text in texts.items():
-        with atomic_path(output / name) as path:
-            path.write_text(text, encoding="utf-8")
-    return [output / name for name in texts]
+    return {"table1.md": markdown(rows, computed=full), "table1.csv": "".join(lines)}
 
 
 def row(n: int, k: int, reference: Float[np.ndarray, "m m"]) -> Row:

@@ -4,13 +4,12 @@ The grid's cells are cut by their diagonals, and every edge has a length in the 
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from hks_jax.atomic import atomic_path
+from hks_jax.domain.components import active_elements
 from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, figure3_fields, figure4_fields, phantom
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import MetricChoice
@@ -73,12 +72,11 @@ def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
 
 def _triangles(grid: Grid, periodic: bool) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3 2"]]:
     """Return the corners' nodes and places: two triangles for each cell whose nodes are all inside."""
-    cells = np.argwhere(np.ones(grid.shape if periodic else [n - 1 for n in grid.shape], dtype=bool))
+    cells = np.argwhere(active_elements(grid.inside, (periodic,) * 2))
     steps = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
     corners = cells[:, None, None] + steps
     nodes = np.ravel_multi_index(tuple(np.moveaxis(corners % grid.shape, -1, 0)), grid.shape)
-    kept = grid.inside.ravel()[nodes].all(axis=(1, 2))
-    return nodes[kept].reshape(-1, 3), (corners[kept] * np.asarray(grid.spacing)).reshape(-1, 3, 2)
+    return nodes.reshape(-1, 3), (corners * np.asarray(grid.spacing)).reshape(-1, 3, 2)
 
 
 def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
@@ -98,8 +96,8 @@ def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
     return cases
 
 
-def triangles(output: Path, full: bool, echo: Callable[[str], None]) -> list[Path]:
-    """Write ``triangles.md``."""
+def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
+    """Return a table in Markdown, by the name of its file."""
     echo("triangles: edge lengths in the metric, on the paper's fields")
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",
@@ -114,7 +112,4 @@ def triangles(output: Path, full: bool, echo: Callable[[str], None]) -> list[Pat
         counts = [count(field, rule, periodic) for rule in LENGTHS]
         wrong = " | ".join(str(c.violating) for c in counts)
         lines.append(f"| {name} | {counts[0].triangles} | {wrong} | {counts[0].vertices} | {counts[0].no_area} |")
-    path = output / "triangles.md"
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return [path]
+    return {"triangles.md": "\n".join(lines) + "\n"}

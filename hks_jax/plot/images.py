@@ -139,11 +139,7 @@ def hks_panels(
     t, titles = panel_titles(values, times, grid, titles, unit)
     images = [masked("values", v, grid) for v in np.asarray(values)]
     if shared_range:
-        given = {
-            name: kwargs[name] for name in ("quantiles", "least_range", "centre", "vmin", "vmax") if name in kwargs
-        }
-        low, high, own = colours_of(np.concatenate([image.compressed() for image in images]), **given)
-        kwargs |= {"vmin": low, "vmax": high, "cmap": kwargs.get("cmap") or own}
+        kwargs = shared_colours(np.concatenate([image.compressed() for image in images]), kwargs)
 
     rows, columns = _layout(t.size)
     width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
@@ -224,6 +220,13 @@ def colours_of(
     lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
     low, high = low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
     return Colours(low if vmin is None else vmin, high if vmax is None else vmax, cmap)
+
+
+def shared_colours(values: np.ndarray, kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments of `scalar_image` by which images of parts of the values have the colours of all."""
+    names = ("quantiles", "least_range", "centre", "vmin", "vmax")
+    low, high, own = colours_of(values, **{name: kwargs[name] for name in names if name in kwargs})
+    return {**kwargs, "vmin": low, "vmax": high, "cmap": kwargs.get("cmap") or own}
 
 
 def _layout(n: int) -> tuple[int, int]:

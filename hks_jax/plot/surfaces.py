@@ -15,6 +15,7 @@ from matplotlib.colors import Colormap, Normalize
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from hks_jax.domain.components import active_elements
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.surface_mesh import SurfaceMesh
 from hks_jax.domain.tet_mesh import TetMesh
@@ -174,10 +175,7 @@ def _domain(pyvista: ModuleType, array: np.ma.MaskedArray, grid: Grid) -> Any:
     """Return the elements all of whose nodes have a value, with the values at their points."""
     image = pyvista.ImageData(dimensions=grid.shape, spacing=grid.spacing, origin=grid.origin)
     image.point_data["values"] = array.filled(0.0).ravel(order="F")  # VTK's first axis runs fastest
-    known = ~np.ma.getmaskarray(array)
-    inside = np.ones([n - 1 for n in grid.shape], dtype=bool)
-    for corner in np.ndindex(2, 2, 2):
-        inside &= known[tuple(slice(c, c + n) for c, n in zip(corner, inside.shape, strict=True))]
+    inside = active_elements(~np.ma.getmaskarray(array), (False,) * 3)
     return image.extract_cells(np.flatnonzero(inside.ravel(order="F")))
 
 

@@ -15,7 +15,7 @@ from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
-from hks_jax.plot.images import beyond, colours_of, masked, panel_titles, scalar_image
+from hks_jax.plot.images import beyond, colours_of, masked, panel_titles, scalar_image, shared_colours
 from hks_jax.plot.orientation import Orientation
 
 AXES = "xyz"
@@ -46,10 +46,6 @@ def orthogonal_slices(
     *,
     node: Sequence[int] | None = None,
     cross: bool = True,
-    cmap: str | Colormap = "viridis",
-    vmin: float | None = None,
-    vmax: float | None = None,
-    quantiles: tuple[float, float] = (0.0, 1.0),
     orientation: Orientation | None = None,
     **kwargs: Any,
 ) -> AxesImage:
@@ -61,14 +57,10 @@ def orthogonal_slices(
         grid: the 3D grid of the values; its spacing makes the aspect.
         node: indices (i, j, k) of the node; None: `middle_node` of what is finite.
         cross: whether thin lines show where the other two slices are.
-        cmap: colour map.
-        vmin: value of the first colour; None: from `quantiles`.
-        vmax: value of the last colour; None: from `quantiles`.
-        quantiles: the quantiles of the whole volume that take the first and the last colour where vmin and vmax do
-            not say.
         orientation: how the grid lies in space. The slices are then turned, have coordinates of space, and letters at
             their edges.
-        **kwargs: passed to `Axes.imshow`.
+        **kwargs: passed to `scalar_image`, such as its cmap, vmin, vmax, centre and quantiles, which are those of the
+            whole volume.
 
     Raises:
         ValueError: not three axes, a grid that is not 3D, values that are not of its shape or nowhere finite, a node
@@ -77,8 +69,8 @@ def orthogonal_slices(
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
     array, grid, node = _turned(_volume(values, grid), grid, node, orientation)
-    low, high, _ = colours_of(array.compressed(), quantiles, vmin=vmin, vmax=vmax)
-    return _slices(axes, array, grid, node, orientation, cross=cross, cmap=cmap, vmin=low, vmax=high, **kwargs)
+    kwargs = shared_colours(array.compressed(), kwargs)
+    return _slices(axes, array, grid, node, orientation, cross=cross, **kwargs)
 
 
 def _slices(
@@ -139,7 +131,7 @@ def volume_panels(
         limits: the values of the first and the last colour, one pair per time; None: from `quantiles`.
         path: where to save the figure; None: nowhere.
         cmap: colour map, or one per time.
-        quantiles: as for `orthogonal_slices`.
+        quantiles: those of each volume that take the first and the last colour.
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: as for `orthogonal_slices`.

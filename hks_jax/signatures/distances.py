@@ -183,7 +183,9 @@ def _least_kernels(
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
-        raise ValueError("pairs: the distance needs the spacing of nodes, which matrices from elsewhere do not have")
+        raise ValueError(
+            "pairs: the distance needs the spacing of nodes, which is known of grids and linear elements alone"
+        )
     weights = jnp.where(pairs.kept[None], jnp.exp(-times[:, None] * pairs.eigenvalues[None]), 0)
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps

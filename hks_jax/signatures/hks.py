@@ -84,7 +84,8 @@ def hks(
         pairs: from `eigenpairs`.
         times: (n_times,) positive, in (metric length)².
         normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
-            domain's area or volume (→ 1 for large t); ``"flat"`` multiplies by (4πt)^(d/2) (→ 1 for small t inside).
+            domain's area or volume (→ 1 for large t, but with a potential or a density); ``"flat"`` multiplies by
+            (4πt)^(d/2) (→ 1 for small t inside, 1/ρ with a density ρ).
         method: ``"spectral"``: the sum over the pairs. ``"spectrum-free"``: without them, from the matrices that they
             belong to (see `hks_spectrum_free`). ``"auto"``: the pairs at the times that they resolve to the
             tolerance, the other at the rest; `hks_auto` also reports which, and how they agree.

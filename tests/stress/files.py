@@ -352,7 +352,7 @@ def _checkpoint(rng: np.random.Generator, folder: Path) -> Sample:
     def read(path: Path) -> Content:
         found = checkpoint.load(path, "mark")
         return {"history": np.array([tuple(vars(step).values()) for step in found.history])} | {
-            name: np.asarray(getattr(found, name)) for name in found._fields if name != "history"
+            name: np.asarray(value) for name, value in vars(found).items() if name != "history"
         }
 
     return Sample(path, read)
