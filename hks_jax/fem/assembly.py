@@ -118,7 +118,11 @@ def assemble(
             )
         spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
         points = partial(_mesh_points, nodes, spaces[0])
-        given = {name: value if callable(value) else domain.restrict(value) for name, value in given.items()}
+        at_vertices = (domain.triangulation.n_vertices,)
+        given = {
+            name: value if callable(value) or np.shape(value)[:1] == at_vertices else domain.restrict(value)
+            for name, value in given.items()
+        }
         held = _checked_fields(operator, given, spaces[0], points, nodes.dtype)
         operator = operator._replace(checked=not (operator.own and is_traced((domain, held, nodes))))
         curved = midpoints is not None
