@@ -243,6 +243,23 @@ def test_elasticity_agrees_with_scikit_fem_and_has_rigid_modes(rng, domain):
     assert jnp.vdot(jax.jit(jax.grad(stiff))(jnp.asarray(mu)), direction) == pytest.approx(float(slope), rel=1e-5)
 
 
+def test_components_know_masks_and_boundaries(rng):
+    """Functions whose components do not mix have every scalar eigenvalue once for each."""
+    mask = np.ones((8, 7), bool)
+    mask[:3, :3] = False
+    field = hj.TensorField(hj.Grid((8, 7), mask=mask), random_spd(rng, (8, 7)))
+
+    def apart(u, v, w):
+        return jnp.sum((u.grad @ w.inverse) * v.grad)
+
+    for boundary, mass in (("dirichlet-rim", "consistent"), (("periodic", "neumann"), "lumped")):
+        scalar = hj.eigenpairs(field, 4, boundary, mass=mass).eigenvalues
+        pairs = hj.eigenpairs(hj.assemble(field, boundary, mass, stiffness=apart, components=2), 8)
+        np.testing.assert_allclose(pairs.eigenvalues, np.repeat(scalar, 2), atol=1e-9)
+        assert pairs.eigenfunctions.shape == (8, 8, 7, 2)
+        assert np.isnan(pairs.eigenfunctions[:, 0, 0]).all()
+
+
 def test_forms_on_a_surface_see_space(rng):
     """The gradient is tangential, and the metric that of the mesh, whatever the order of a triangle's vertices."""
     torus = hj.examples.bumpy_torus_mesh(8)
