@@ -173,12 +173,12 @@ class Eigenpairs(eqx.Module):
     def unconfirmed(self) -> Bool[Array, ""]:
         """Whether the solver's certificate ends before the last eigenvalue.
 
-        Where the null space is known, some solvers have no certificate, and nothing is to be confirmed.
+        Where it is known where the spectrum begins, some solvers have no certificate, and nothing is to be confirmed.
         """
         if not self.k:
             return jnp.zeros((), bool)
         known = self.eigenvalues, self.kept, self.complete_below, self.spectral_origin, self.multiplet_tolerance
-        return _unconfirmed(*known, self.null_space_known)
+        return _unconfirmed(*known, self.lowest and all(part.bounded for part in self.pencil.parts))
 
     @property
     def result(self) -> RESULTS:

@@ -50,7 +50,8 @@ def _of_one(pencil: Pencil) -> Pencil:
     if nulls is not None:
         vectors = space.extend(nulls.vectors, outside=0.0)
         nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
-    return Pencil(StencilOperator(stiffness, whole), mass, pencil.metric, pencil.volume, whole, null_space=nulls)
+    matrices, bound = (StencilOperator(stiffness, whole), mass), pencil.lower_bound
+    return Pencil(*matrices, pencil.metric, pencil.volume, whole, null_space=nulls, lower_bound=bound)
 
 
 # A Rayleigh quotient, the largest Kᵢᵢ/Mᵢᵢ is no more than the largest eigenvalue: the spectrum becomes no wider. It is

@@ -252,8 +252,19 @@ def _pencil(
     mass = DiagonalOperator(entries=space.restrict(lumped)) if operator.lumped else consistent
     if operator.own:
         return Pencil(stiffness, mass, None, None, space)
-    null_space = None if "potential" in fields else _constants(space, lumped)
-    return Pencil(stiffness, mass, metric, volume, space, null_space=null_space)
+    if "potential" not in fields:
+        return Pencil(stiffness, mass, metric, volume, space, null_space=_constants(space, lumped))
+    return Pencil(stiffness, mass, metric, volume, space, lower_bound=_least(fields["potential"], space, operator))
+
+
+# K = A + ∫ρV hᵢhⱼ with A ⪰ 0, and V is at least v at the quadrature points: K − vM ⪰ 0 for the mass of the same points.
+# The lumped mass D ⪰ M is larger, so that there v may not be positive.
+def _least(potential: Field, space: FunctionSpace, operator: WeakForm) -> Float[Array, ""] | None:
+    """Return a lower bound of the spectrum; None where values between nodes may be less than those at them."""
+    if potential.at == "nodes" and isinstance(space, MeshSpace) and space.degree == 2:
+        return None
+    least = jnp.min(jax.lax.stop_gradient(potential.values))
+    return jnp.minimum(least, 0) if operator.lumped else least
 
 
 def _constants(space: FunctionSpace, values: Array) -> NullSpace:

@@ -22,15 +22,23 @@ class Pencil(SymmetricPencil):
             not known.
         space: the space of the functions.
         null_space: that of K ⪰ 0; None where nothing is known, and K may be indefinite.
+        lower_bound: a number below which there is no eigenvalue, where that is known of a K that may be indefinite;
+            constant to derivatives.
     """
 
     metric: SampledMetric | None
     volume: Float[Array, ""] | None
     space: FunctionSpace = eqx.field(static=True)
+    lower_bound: Float[Array, ""] | None = eqx.field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         """Return one line: how many unknowns on what, and under which boundary."""
         return f"Pencil({self.space!r})"
+
+    @property
+    def bounded(self) -> bool:
+        """Whether it is known where the spectrum begins."""
+        return self.null_space is not None or self.lower_bound is not None
 
     @property
     def measured(self) -> bool:
