@@ -225,8 +225,9 @@ def test_cleaning_says_all_that_it_did_on_the_command_line(tmp_path, capsys):
     more = [[0, 1, 49], faces[4], [7, 7, 8], [3, 51, 10]]
     path = save_off(tmp_path / "m.off", dirty, np.concatenate([faces, more]))
     assert main(["info", str(path)]) == 2
-    said = "vertices: 1 of 52 belong to no face (the first is vertex 50); remove them, or leave them out by a mask."
-    assert f"{said} --clean puts" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "vertices: 1 of 52 belong to no face (the first is vertex 50); remove them" in said
+    assert "--clean puts right what it can" in said
     assert main(["info", str(path), "--clean", "--json"]) == 0
     captured = capsys.readouterr()
     assert captured.err.strip() == (

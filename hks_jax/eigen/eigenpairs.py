@@ -245,11 +245,12 @@ class Eigenpairs(eqx.Module):
 def _anisotropy(pencil: AnyPencil | None) -> float:
     """Return the ratio of eigenvalues that few tensors on a grid exceed, by a sample; 1 where none are known."""
     metric = None if pencil is None else pencil.parts[0].metric
-    if metric is None or metric.spacing is None:
+    if metric is None or metric.spacing is None or not getattr(metric.tensors, "is_fully_addressable", True):
         return 1.0
-    d = metric.tensors.shape[-1]
-    tensors = metric.tensors.reshape(-1, d, d)
-    sample = np.asarray(tensors[:: max(1, len(tensors) // _SAMPLE)], np.float64)
+    tensors, d = metric.tensors, metric.tensors.shape[-1]
+    if tensors.size > _SAMPLE * d * d:
+        tensors = tensors.reshape(-1, d, d)[:: tensors.size // (_SAMPLE * d * d)]
+    sample = np.asarray(tensors, np.float64).reshape(-1, d, d)
     values = np.linalg.eigvalsh(sample[np.isfinite(sample).all(axis=(1, 2))])
     values = values[values[:, 0] > 0]
     return float(np.quantile(values[:, -1] / values[:, 0], 1 - MANY)) if len(values) else 1.0
