@@ -57,7 +57,7 @@ class Eigenpairs(eqx.Module):
 
     Attributes:
         eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for null vectors.
-        vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the doubled domain under "mirror"
+        vectors: (k, n_dof) the eigenfunctions by their unknowns, φᵢᵀMφⱼ = δᵢⱼ (on the doubled domain under "mirror"
             and "mean", that is 1/√2 of it here, for each doubling).
         frame: (k, n_dof) the same numbers; only their derivative differs. It leaves out the rotations of the
             eigenfunctions among themselves, which are singular at multiple eigenvalues and of no use to signatures.
@@ -109,7 +109,12 @@ class Eigenpairs(eqx.Module):
     @property
     def eigenfunctions(self) -> Float[Array, "k *shape"]:
         """The eigenfunctions at the nodes: NaN outside the mask, zero at Dirichlet nodes."""
-        return self.space.extend(self.vectors)
+        return self.space.extend(self.at_nodes)
+
+    @property
+    def at_nodes(self) -> Float[Array, "k n_dof"]:
+        """The eigenfunctions' values at the free nodes: `vectors`, unless the quadrature is ``"cancelling"``."""
+        return self.pencil.read(self.vectors, self.part)
 
     @property
     def space(self) -> FunctionSpace:

@@ -1,9 +1,10 @@
 """From a tensor field or a mesh to its stiffness and mass: one element's integrals, mapped over all elements."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from hks_jax.fem.elements import Element, at_quadrature, element_matrices, simpl
 from hks_jax.fem.fields import Field, checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
+from hks_jax.fem.quadrature import MASS, Quadrature, moved
 from hks_jax.fem.resolution import SampledMetric
 from hks_jax.fem.space import (
     FunctionSpace,
@@ -57,6 +59,7 @@ def assemble(
     components: int = 1,
     degree: int = 1,
     midpoints: Any = None,
+    quadrature: Quadrature = "gauss",
 ) -> AnyPencil:
     """Assemble the generalized eigenproblem Kφ = λMφ of an operator: by default the Laplace–Beltrami operator.
 
@@ -93,20 +96,35 @@ def assemble(
             ``domain.triangulation.edges``.
         midpoints: of degree 2, where the middles of the edges are, (E, 3), which curves the sides; or a function of a
             place in space that moves the middles of straight sides there, on a `TetMesh` those of its boundary alone.
+        quadrature: ``"gauss"``, or on grids ``"cancelling"``: points at which the leading error of heat kernel
+            signatures cancels, at the same cost (docs/accuracy.md). The mass is consistent, and nodal values are no
+            longer the unknowns φ: they are read from ½(I + D⁻¹M)φ, D the row sums of M, by all signatures.
 
     Returns:
         The pencil (stiffness, mass); with ``"mirror"`` and ``"mean"`` the `MirrorPencil` of the problems that make it
         up. With a potential or forms of your own nothing is known of the null space.
 
     Raises:
-        ValueError: an unknown boundary, mass or degree, a domain without elements or free nodes; ``"mean"`` without a
-            rim; a field of another shape, that is NaN, or a density that is not positive; a form that does not return
-            one number, is not linear, or whose matrix is not symmetric (by how much, and where).
+        ValueError: an unknown boundary, mass, degree or quadrature, a domain without elements or free nodes; ``"mean"``
+            without a rim; a field of another shape, that is NaN, or a density that is not positive; a form that does
+            not return one number, is not linear, or whose matrix is not symmetric (by how much, and where);
+            ``"cancelling"`` with a mesh, a lumped mass or a form of your own.
 
     Warns:
         AccuracyWarning: a Dirichlet condition that no node of the domain feels.
     """
     operator, given = _checked_operator(mass, stiffness, components, potential, density, fields)
+    if quadrature not in get_args(Quadrature):
+        raise ValueError(f'quadrature: got {quadrature!r}; expected "gauss" or "cancelling"')
+    if quadrature == "cancelling":
+        for what, is_given in (
+            ("a mesh, where no such points are known", isinstance(domain, SimplicialMesh)),
+            ("a lumped mass, whose error no points cancel", operator.lumped),
+            ("a form of your own, whose error is not known", operator.own),
+        ):
+            if is_given:
+                raise ValueError(f'quadrature: got "cancelling" with {what}; expected "gauss"')
+        operator = operator._replace(cancelling=True)
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
             raise ValueError(f"boundary: got {boundary!r}; a mesh takes one of {', '.join(map(repr, MESH_BOUNDARIES))}")
@@ -222,9 +240,8 @@ def _assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpac
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
     couplings, settings = couplings_for(tensors, space), (space.periodic, field.interpolation, operator)
     x = _grid_points(field.grid, space, tensors.dtype) if operator.own else None
-    *matrices, lumped, volume = _grid_integrals(
-        tensors, domain, elements, couplings, gradients, weights, x, fields, *settings
-    )
+    table = gradients, weights, steps
+    *matrices, lumped, volume = _grid_integrals(tensors, domain, elements, couplings, *table, x, fields, *settings)
     metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
     if operator.components > 1:
         own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
@@ -249,7 +266,8 @@ def _pencil(
     if operator.own:
         return Pencil(stiffness, mass, None, None, space)
     null_space = None if "potential" in fields else _constants(space, lumped)
-    return Pencil(stiffness, mass, metric, volume, space, null_space=null_space)
+    row_sums = space.restrict(lumped) if operator.cancelling else None
+    return Pencil(stiffness, mass, metric, volume, space, null_space=null_space, row_sums=row_sums)
 
 
 def _constants(space: FunctionSpace, values: Array) -> NullSpace:
@@ -293,6 +311,7 @@ def _grid_integrals(
     couplings: Bool[np.ndarray | Array, "offsets *shape"] | None,
     gradients: Float[np.ndarray | Array, "q n d"],
     weights: Float[np.ndarray | Array, " q"],
+    spacing: Float[np.ndarray | Array, " d"],
     x: Float[Array, "*elements q d"] | None,
     fields: dict[str, Field],
     periodic: tuple[bool, ...],
@@ -319,8 +338,17 @@ def _grid_integrals(
     def kept(matrices: Float[Array, "E n n"]) -> Float[Array, "E n n"]:
         return jnp.where(elements.reshape(-1, 1, 1), matrices, 0)
 
+    points = replace(element, values=tensor_product_element(len(periodic), MASS).values)
+
     def integrals(metric: Array, x: Array | None, fields: dict[str, Array]) -> tuple[Array, ...]:
-        return element_matrices(metric, element, operator, x, fields)
+        if not operator.cancelling:
+            return element_matrices(metric, element, operator, x, fields)
+        alone = {name: field for name, field in fields.items() if name != "potential"}
+        energy, mass = element_matrices(metric, points, operator, x, alone)
+        whole = moved(energy, metric, spacing)
+        if "potential" in fields:
+            whole = whole + element_matrices(metric, points, operator, x, fields)[0] - energy
+        return whole, mass
 
     stiffness, mass = map(kept, jax.vmap(integrals)(metric, places, held))
     if operator.components > 1:
