@@ -130,7 +130,7 @@ def errors(name: str, field: hj.TensorField, boundary: str, times: np.ndarray, s
         pairs = hj.eigenpairs(pencil, pencil.stiffness.size, solver="dense")
         found, said = np.asarray(hj.hks(pairs, times)), hj.truncation(pairs, times)
         relative = (found / signature - 1)[:, inside]
-        inner = distance_transform_cdt(np.pad(inside, 1))[1:-1, 1:-1][inside] >= DEPTH
+        inner = distance_transform_cdt(np.pad(inside, 1))[(slice(1, -1),) * inside.ndim][inside] >= DEPTH
         for t, each, estimate in zip(TIMES, relative, said.resolution_bias, strict=True):
             row = {"field": name, "nodes": field.grid.shape[0], "quadrature": way, "t": float(t)}
             row |= {"error": rms(each), "estimate": float(estimate)}
