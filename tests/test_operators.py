@@ -40,7 +40,7 @@ def test_harmonic_oscillator(d):
     for n in sizes:
         pencil = hj.assemble(euclidean(n, 5.0, d), "dirichlet", potential=square)
         pairs = hj.eigenpairs(pencil, counts[-1], throw=True)
-        assert pairs.complete_below > pairs.eigenvalues[-1] - 1e-6
+        assert not pairs.unconfirmed
         errors.append(np.abs(pairs.eigenvalues - exact).max())
     assert [hj.count_eigenvalues(pencil, d + 2 * level + 1) for level in range(levels)] == counts
     order = np.log(errors[0] / errors[1]) / np.log((sizes[1] - 1) / (sizes[0] - 1))
@@ -75,8 +75,8 @@ def test_finite_well_has_its_bound_states_below_zero():
 
 
 def test_gaussian_weight_has_hermite_polynomials_for_eigenfunctions():
-    """−ρ⁻¹ div(ρ∇·), ρ = exp(−|x|²): 2n; as an argument, as a form, with every solver."""
-    field = euclidean(41, 4.0)
+    """−ρ⁻¹ div(ρ∇·), ρ = exp(−|x|²): 2n; as an argument and as a form."""
+    field = euclidean(25, 4.0)
 
     def gauss(x):
         return jnp.exp(-x @ x)
@@ -93,13 +93,44 @@ def test_gaussian_weight_has_hermite_polynomials_for_eigenfunctions():
         np.testing.assert_allclose(getattr(own, name).coefficients, getattr(pencil, name).coefficients, atol=1e-15)
     assert pencil.volume == pytest.approx(64)
     exact = np.repeat(2.0 * np.arange(4), np.arange(1, 5))
-    for solver in ("shift-invert", "chebyshev-filter"):
-        pairs = hj.eigenpairs(pencil, 10, solver=solver)
-        assert pairs.eigenvalues[0] == 0
-        np.testing.assert_allclose(pairs.eigenvalues, exact, atol=0.15)
+    pairs = hj.eigenpairs(pencil, 10, solver="shift-invert")
+    assert pairs.eigenvalues[0] == 0
+    np.testing.assert_allclose(pairs.eigenvalues, exact, atol=0.3)
     np.testing.assert_allclose(hj.eigenpairs(own, 10).eigenvalues, pairs.eigenvalues, atol=1e-7)
     nodal = hj.assemble(field, density=np.exp(-np.square(field.grid.nodes).sum(-1)))
-    np.testing.assert_allclose(hj.eigenpairs(nodal, 6).eigenvalues, exact[:6], atol=0.15)
+    np.testing.assert_allclose(hj.eigenpairs(nodal, 6).eigenvalues, exact[:6], atol=0.3)
+
+
+@pytest.mark.parametrize("mass", ["consistent", "lumped"])
+@pytest.mark.parametrize("solver", ["shift-invert", pytest.param("chebyshev-filter", marks=pytest.mark.slow)])
+def test_solvers_for_positive_matrices_count_from_the_potential_s_minimum(rng, solver, mass):
+    """Also where it is far below the spectrum, and where all of it is far above zero; with derivatives."""
+    n, spike = (25, 0) if solver == "chebyshev-filter" else (15, -3e4)
+    field, noise = euclidean(n, 3.0), rng.normal(size=(n, n))
+    for offset in (-40, 1e4):
+        V = np.square(field.grid.nodes).sum(-1) + offset
+        V[n // 2, n // 2] += spike * (offset < 0)
+        pencil = hj.assemble(field, "dirichlet", mass, potential=V)
+        pairs, exact = (hj.eigenpairs(pencil, 6, solver=each, throw=True) for each in (solver, "dense"))
+        np.testing.assert_allclose(pairs.eigenvalues, exact.eigenvalues, rtol=1e-8)
+
+    def trace(s, solver):
+        pencil = hj.assemble(field, "dirichlet", mass, potential=V - 1e4 + s * noise)
+        return hj.heat_trace(hj.eigenpairs(pencil, 6, solver=solver), [0.5])[0]
+
+    slopes = [jax.grad(trace)(0.0, each) for each in (solver, "dense")]
+    assert slopes[0] == pytest.approx(float(slopes[1]), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_density_with_other_solvers_and_without_a_spectrum():
+    pencil = hj.assemble(euclidean(25, 2.0), density=lambda x: 1.5 + jnp.sin(x[0]))
+    everything = hj.eigenpairs(pencil, 25**2)
+    some = hj.eigenpairs(pencil, 10, solver="chebyshev-filter")
+    np.testing.assert_allclose(some.eigenvalues, everything.eigenvalues[:10], rtol=1e-6, atol=1e-12)
+    for method in ("colouring", "selected-inversion"):
+        found = hj.hks_spectrum_free(pencil, [0.1, 0.3], method=method)
+        np.testing.assert_allclose(found, hj.hks(everything, [0.1, 0.3]), rtol=1e-3)
 
 
 def test_derivatives_of_signatures_by_potential_and_density(rng):
@@ -233,6 +264,23 @@ def test_elasticity_agrees_with_scikit_fem_and_has_rigid_modes(rng, domain):
     assert jnp.vdot(jax.jit(jax.grad(stiff))(jnp.asarray(mu)), direction) == pytest.approx(float(slope), rel=1e-5)
 
 
+def test_components_know_masks_and_boundaries(rng):
+    """Functions whose components do not mix have every scalar eigenvalue once for each."""
+    mask = np.ones((8, 7), bool)
+    mask[:3, :3] = False
+    field = hj.TensorField(hj.Grid((8, 7), mask=mask), random_spd(rng, (8, 7)))
+
+    def apart(u, v, w):
+        return jnp.sum((u.grad @ w.inverse) * v.grad)
+
+    for boundary, mass in (("dirichlet-rim", "consistent"), (("periodic", "neumann"), "lumped")):
+        scalar = hj.eigenpairs(field, 4, boundary, mass=mass).eigenvalues
+        pairs = hj.eigenpairs(hj.assemble(field, boundary, mass, stiffness=apart, components=2), 8)
+        np.testing.assert_allclose(pairs.eigenvalues, np.repeat(scalar, 2), atol=1e-9)
+        assert pairs.eigenfunctions.shape == (8, 8, 7, 2)
+        assert np.isnan(pairs.eigenfunctions[:, 0, 0]).all()
+
+
 def test_forms_on_a_surface_see_space(rng):
     """The gradient is tangential, and the metric that of the mesh, whatever the order of a triangle's vertices."""
     torus = hj.examples.bumpy_torus_mesh(8)
@@ -265,9 +313,9 @@ def test_what_is_true_of_the_laplacian_alone_is_left_out():
     assert np.isnan(estimate.resolution_bias[0])
     everything = hj.heat_trace(hj.eigenpairs(pencil, 17**2), [0.3])[0]
     assert estimate.tail[0] == pytest.approx(float(1 - hj.heat_trace(pairs, [0.3])[0] / everything), rel=0.3)
-    for solver in ("shift-invert", "chebyshev-filter"):
-        with pytest.raises(ValueError, match=f"solver: '{solver}' needs a stiffness that is positive semidefinite"):
-            hj.eigenpairs(pencil, 3, solver=solver)
+    own = hj.assemble(euclidean(5, 4.0), stiffness=lambda u, v, w: u.value * v.value)
+    with pytest.raises(ValueError, match="solver: 'shift-invert' needs a stiffness that is positive semidefinite"):
+        hj.eigenpairs(own, 3, solver="shift-invert")
     with pytest.raises(ValueError, match="nothing is known of the null space"):
         hj.hks_spectrum_free(pencil, [0.1])
 

@@ -9,7 +9,7 @@ from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.host.shift_invert import ShiftInvert
-from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos, known_by_weyl
+from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.stencil import StencilOperator
@@ -76,7 +76,7 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
-    if not known_by_weyl(pencil):
+    if not (pencil.measured and pencil.bounded):
         return BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
     exact = pencil.stiffness.dtype == np.float64
     # In 3D factorisations fill in, and in float32 they lose too many digits.

@@ -13,6 +13,7 @@ from hks_jax.eigen.quality import largest
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil, Pencil
+from hks_jax.fem.quadrature import Quadrature
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.dissection import Dissection, dissect
@@ -58,12 +59,12 @@ def count_eigenvalues(
     return count_below(checked_pencil(domain, boundary, mass), below)
 
 
-def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
+def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
     """Return the pencil of a domain as a user gives it.
 
     Of matrices and forms of the user's own, where concrete, M is tested for definiteness.
     """
-    pencil = pencil_of(domain, boundary, mass)
+    pencil = pencil_of(domain, boundary, mass, quadrature)
     for part in jax.lax.stop_gradient(pencil).parts:
         own = isinstance(part.space, MatrixSpace) or part.volume is None
         if not own or isinstance(part.mass, DiagonalOperator) or is_traced(part):

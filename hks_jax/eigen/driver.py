@@ -20,6 +20,7 @@ from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
+from hks_jax.fem.quadrature import Quadrature
 from hks_jax.traced import is_traced
 
 
@@ -34,6 +35,7 @@ def eigenpairs(
     progress: Report | None = None,
     *,
     interval: tuple[float, float] | None = None,
+    quadrature: Quadrature = "gauss",
 ) -> Eigenpairs:
     """Compute the k lowest eigenpairs of the Laplace–Beltrami operator, or of any symmetric pencil Kφ = λMφ.
 
@@ -50,9 +52,9 @@ def eigenpairs(
         solver: ``"auto"`` (by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
             ``"shift-invert"`` (on the host), ``"block-lanczos"`` (2D and surfaces above all),
             ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
-            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``. Where K may be indefinite,
-            and in an interval, only ``"dense"`` and ``"block-lanczos"``; derivatives in an interval take the
-            tolerance of the solver's ``adjoint`` alone.
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``. Of matrices and forms of
+            your own that may be indefinite, and in an interval, only ``"dense"`` and ``"block-lanczos"``; derivatives
+            in an interval take the tolerance of the solver's ``adjoint`` alone.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns;
             ``"drop"`` leaves its copies out of every signature; ``"complete"`` computes 8 pairs more and takes the
@@ -63,6 +65,7 @@ def eigenpairs(
             code and derivatives are NaN, with a warning where values are concrete.
         progress: called with short texts while it runs, where values are concrete; ``print`` will do.
         interval: (a, b): all eigenpairs with a ≤ λ < b in place of the lowest.
+        quadrature: see `assemble`; belongs to the pencil if one is given.
 
     Returns:
         The pairs with residuals and convergence flags. λ of a null vector (a constant for each natural component) is
@@ -79,7 +82,7 @@ def eigenpairs(
         AccuracyWarning: unconverged pairs, a bound that is not confirmed, or a multiple eigenvalue that k cuts (where
             values are concrete).
     """
-    pencil = checked_pencil(domain, boundary, mass)
+    pencil = checked_pencil(domain, boundary, mass, quadrature)
     check_choice(multiplet)
     report = progress or silent
     if interval is not None:

@@ -57,7 +57,7 @@ class Eigenpairs(eqx.Module):
 
     Attributes:
         eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for null vectors.
-        vectors: (k, n_dof) the eigenfunctions at the free nodes, φᵢᵀMφⱼ = δᵢⱼ (on the doubled domain under "mirror"
+        vectors: (k, n_dof) the eigenfunctions by their unknowns, φᵢᵀMφⱼ = δᵢⱼ (on the doubled domain under "mirror"
             and "mean", that is 1/√2 of it here, for each doubling).
         frame: (k, n_dof) the same numbers; only their derivative differs. It leaves out the rotations of the
             eigenfunctions among themselves, which are singular at multiple eigenvalues and of no use to signatures.
@@ -109,7 +109,12 @@ class Eigenpairs(eqx.Module):
     @property
     def eigenfunctions(self) -> Float[Array, "k *shape"]:
         """The eigenfunctions at the nodes: NaN outside the mask, zero at Dirichlet nodes."""
-        return self.space.extend(self.vectors)
+        return self.space.extend(self.at_nodes)
+
+    @property
+    def at_nodes(self) -> Float[Array, "k n_dof"]:
+        """The eigenfunctions' values at the free nodes: `vectors`, unless the quadrature is ``"cancelling"``."""
+        return self.pencil.read(self.vectors, self.part)
 
     @property
     def space(self) -> FunctionSpace:
@@ -173,12 +178,12 @@ class Eigenpairs(eqx.Module):
     def unconfirmed(self) -> Bool[Array, ""]:
         """Whether the solver's certificate ends before the last eigenvalue.
 
-        Where the null space is known, some solvers have no certificate, and nothing is to be confirmed.
+        Where it is known where the spectrum begins, some solvers have no certificate, and nothing is to be confirmed.
         """
         if not self.k:
             return jnp.zeros((), bool)
         known = self.eigenvalues, self.kept, self.complete_below, self.spectral_origin, self.multiplet_tolerance
-        return _unconfirmed(*known, self.null_space_known)
+        return _unconfirmed(*known, self.lowest and all(part.bounded for part in self.pencil.parts))
 
     @property
     def result(self) -> RESULTS:

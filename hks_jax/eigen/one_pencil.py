@@ -15,11 +15,11 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
-from hks_jax.eigen.origin import LocatedPencil, locate, translated
+from hks_jax.eigen.origin import locate, translated
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
-from hks_jax.linear.pencil import SymmetricPencil, tabulated
+from hks_jax.linear.pencil import NullSpace, SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 _FAR = 30
@@ -34,7 +34,7 @@ def solve_lowest(
     With ``throw``, a derivative that does not converge is an error.
     """
     n_dof = pencil.size
-    if pencil.null_space is None and not solver.indefinite:
+    if not (pencil.bounded or solver.indefinite):
         raise ValueError(
             f"solver: {solver.name!r} needs a stiffness that is positive semidefinite, with its null space, and of "
             'this pencil nothing is known. Use "block-lanczos" or "dense", or give `sparse_pencil` the null vectors'
@@ -48,6 +48,8 @@ def solve_lowest(
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
+    if pencil.null_space is None and not solver.indefinite:
+        return _from_bound(pencil, solver, k, extra, name, throw, report)
     if not isinstance(solver, BlockLanczos) or known_by_weyl(pencil):
         found = solved(solver, pencil, k, extra, False, throw, report)
         return _pairs(pencil, pencil, jnp.zeros((), found[0].dtype), found, solver, name)
@@ -73,6 +75,27 @@ def solve_lowest(
         frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
         found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method, name if method is solver else method.name)
+
+
+def _from_bound(
+    pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool, report: Report
+) -> Eigenpairs:
+    """Return the lowest pairs by a solver for K ⪰ 0: those of K − σM, σ a lower bound of the spectrum."""
+
+    def solve(origin: Float[Array, ""]) -> tuple[Pencil, tuple[Any, ...]]:
+        stiffness = pencil.stiffness.with_flat(pencil.shifted(origin))
+        nothing = NullSpace(jnp.zeros((0, pencil.size), origin.dtype))
+        moved = Pencil(stiffness, pencil.mass, pencil.metric, pencil.volume, pencil.space, null_space=nothing)
+        return moved, solved(solver, moved, k, extra, False, throw, report)
+
+    assert pencil.lower_bound is not None
+    origin = jax.lax.stop_gradient(pencil.lower_bound)
+    moved, found = solve(origin)
+    values = jax.lax.stop_gradient(found[0])
+    if not is_traced(values) and _is_far(moved, values):  # as after a spike, to which tolerances are relative
+        origin = origin + 2 * values[0] - values[-1]
+        moved, found = solve(origin)
+    return _pairs(pencil, moved, origin, found, solver, name)
 
 
 def _is_far(pencil: SymmetricPencil, values: Float[Array, " k"]) -> bool:
@@ -162,7 +185,7 @@ def _pairs(
     """Return eigenpairs, found as those of a pencil whose eigenvalues count from the origin."""
     values, vectors, frame, following, bound = found
     held = jax.lax.stop_gradient((tabulated(solved_pencil), values, vectors))
-    known = not isinstance(solved_pencil, LocatedPencil) and solved_pencil.null_space is not None
+    known = solved_pencil is pencil and pencil.null_space is not None
     residuals, converged, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
     # Of a constant JAX makes a number where it differentiates.
     following, bound = jnp.asarray(following), jnp.asarray(bound)

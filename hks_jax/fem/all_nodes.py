@@ -50,7 +50,11 @@ def _of_one(pencil: Pencil) -> Pencil:
     if nulls is not None:
         vectors = space.extend(nulls.vectors, outside=0.0)
         nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
-    return Pencil(StencilOperator(stiffness, whole), mass, pencil.metric, pencil.volume, whole, null_space=nulls)
+    sums = pencil.row_sums
+    if sums is not None:  # with infinite ones, nothing is read from neighbours
+        sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
+    known_of_it = StencilOperator(stiffness, whole), mass, pencil.metric, pencil.volume, whole
+    return Pencil(*known_of_it, null_space=nulls, lower_bound=pencil.lower_bound, row_sums=sums)
 
 
 # A Rayleigh quotient, the largest Kᵢᵢ/Mᵢᵢ is no more than the largest eigenvalue: the spectrum becomes no wider. It is

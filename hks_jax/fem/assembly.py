@@ -1,44 +1,25 @@
-"""From a tensor field or a mesh to its stiffness and mass: one element's integrals, mapped over all elements."""
+"""From a tensor field or a mesh to a pencil: what is asked for, checked, and assembled on its domain."""
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
-from itertools import product
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, get_args
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import real_array, require_count
-from hks_jax.compilation import jit_quickly
-from hks_jax.domain import spd
-from hks_jax.domain.grid import Grid
+from hks_jax.checks import require_count
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
-from hks_jax.fem.elements import Element, at_quadrature, element_matrices, simplex_element, tensor_product_element
 from hks_jax.fem.fields import Field, checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
+from hks_jax.fem.grid_assembly import assemble_grid, grid_points
+from hks_jax.fem.mesh_assembly import assemble_mesh, mesh_nodes, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.resolution import SampledMetric
-from hks_jax.fem.space import (
-    FunctionSpace,
-    GridSpace,
-    MeshSpace,
-    VectorSpace,
-    couplings_for,
-    grid_space,
-    mask_for,
-    mesh_space,
-    vector_space,
-)
-from hks_jax.fem.stencil import StencilOperator
-from hks_jax.linear.operators import DiagonalOperator, PatternedOperator, SparseOperator, require_symmetric
-from hks_jax.linear.pattern import SparsePattern
-from hks_jax.linear.pencil import NullSpace
+from hks_jax.fem.quadrature import Quadrature
+from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
 
 MassKind = Literal["consistent", "lumped"]
@@ -57,6 +38,7 @@ def assemble(
     components: int = 1,
     degree: int = 1,
     midpoints: Any = None,
+    quadrature: Quadrature = "gauss",
 ) -> AnyPencil:
     """Assemble the generalized eigenproblem Kφ = λMφ of an operator: by default the Laplace–Beltrami operator.
 
@@ -93,36 +75,55 @@ def assemble(
             ``domain.triangulation.edges``.
         midpoints: of degree 2, where the middles of the edges are, (E, 3), which curves the sides; or a function of a
             place in space that moves the middles of straight sides there, on a `TetMesh` those of its boundary alone.
+        quadrature: ``"gauss"``, or on grids ``"cancelling"``: points at which the leading error of heat kernel
+            signatures cancels, at the same cost (docs/accuracy.md). The mass is consistent, and nodal values are no
+            longer the unknowns φ: they are read from ½(I + D⁻¹M)φ, D the row sums of M, by all signatures.
 
     Returns:
         The pencil (stiffness, mass); with ``"mirror"`` and ``"mean"`` the `MirrorPencil` of the problems that make it
         up. With a potential or forms of your own nothing is known of the null space.
 
     Raises:
-        ValueError: an unknown boundary, mass or degree, a domain without elements or free nodes; ``"mean"`` without a
-            rim; a field of another shape, that is NaN, or a density that is not positive; a form that does not return
-            one number, is not linear, or whose matrix is not symmetric (by how much, and where).
+        ValueError: an unknown boundary, mass, degree or quadrature, a domain without elements or free nodes; ``"mean"``
+            without a rim; a field of another shape, that is NaN, or a density that is not positive; a form that does
+            not return one number, is not linear, or whose matrix is not symmetric (by how much, and where);
+            ``"cancelling"`` with a mesh, a lumped mass or a form of your own.
 
     Warns:
         AccuracyWarning: a Dirichlet condition that no node of the domain feels.
     """
     operator, given = _checked_operator(mass, stiffness, components, potential, density, fields)
+    if quadrature not in get_args(Quadrature):
+        raise ValueError(f'quadrature: got {quadrature!r}; expected "gauss" or "cancelling"')
+    if quadrature == "cancelling":
+        for what, is_given in (
+            ("a mesh, where no such points are known", isinstance(domain, SimplicialMesh)),
+            ("a lumped mass, whose error no points cancel", operator.lumped),
+            ("a form of your own, whose error is not known", operator.own),
+        ):
+            if is_given:
+                raise ValueError(f'quadrature: got "cancelling" with {what}; expected "gauss"')
+        operator = operator._replace(cancelling=True)
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
             raise ValueError(f"boundary: got {boundary!r}; a mesh takes one of {', '.join(map(repr, MESH_BOUNDARIES))}")
         conditions = ("neumann", "dirichlet") if boundary == "mean" else (boundary,)
-        nodes = _nodes_of_mesh(domain, degree, midpoints)
+        nodes = mesh_nodes(domain, degree, midpoints)
         if degree == 2 and operator.lumped:
             raise ValueError(
                 'mass: got "lumped" with degree=2, whose row sums vanish at the vertices; use "consistent"'
             )
         spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
-        points = partial(_mesh_points, nodes, spaces[0])
-        given = {name: value if callable(value) else domain.restrict(value) for name, value in given.items()}
+        points = partial(mesh_points, nodes, spaces[0])
+        at_vertices = (domain.triangulation.n_vertices,)
+        given = {
+            name: value if callable(value) or np.shape(value)[:1] == at_vertices else domain.restrict(value)
+            for name, value in given.items()
+        }
         held = _checked_fields(operator, given, spaces[0], points, nodes.dtype)
         operator = operator._replace(checked=not (operator.own and is_traced((domain, held, nodes))))
         curved = midpoints is not None
-        pencils = [_assemble_mesh(domain, nodes, held, each, operator, curved) for each in spaces]
+        pencils = [assemble_mesh(domain, nodes, held, each, operator, curved) for each in spaces]
         if curved and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
             raise ValueError(
                 "midpoints: they fold cells, or turn them inside out; move them nearer to the middles of straight sides"
@@ -142,9 +143,9 @@ def assemble(
     space, held = spaces[0], {}
     if given:
         dtype = domain.tensors.dtype
-        held = _checked_fields(operator, given, space, partial(_grid_points, domain.grid, space, dtype), dtype)
+        held = _checked_fields(operator, given, space, partial(grid_points, domain.grid, space, dtype), dtype)
     operator = operator._replace(checked=not (operator.own and is_traced((domain, held))))
-    pencils = [_assemble_grid(domain, held, each, operator) for each in spaces]
+    pencils = [assemble_grid(domain, held, each, operator) for each in spaces]
     if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
         where = (
             'acts on the sides of the grid, which the mask does not reach. "dirichlet-rim" takes in the mask\'s own rim'
@@ -211,248 +212,3 @@ def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
     free = [pencil.space.free for pencil in pencils]
     including = (tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))
     return MirrorPencil(tuple(pencils), tuple(including))
-
-
-def _assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
-    # Masks, element and spacing go in as arrays, so that problems that differ only in them share one compilation. The
-    # element is made in double precision: its rounding would scale the whole metric.
-    tensors, spacing = field.tensors, field.grid.spacing
-    element = tensor_product_element(space.dimension).stretched(spacing)
-    gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
-    domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
-    couplings, settings = couplings_for(tensors, space), (space.periodic, field.interpolation, operator)
-    x = _grid_points(field.grid, space, tensors.dtype) if operator.own else None
-    *matrices, lumped, volume = _grid_integrals(
-        tensors, domain, elements, couplings, gradients, weights, x, fields, *settings
-    )
-    metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
-    if operator.components > 1:
-        own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
-        gathered = [_gathered(own, each[kept]) for each in matrices]
-        sums = _row_sums(own, matrices[1][kept])
-        return _pencil(gathered[0], gathered[1], sums, None, volume, own, operator, fields)
-    stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in matrices)
-    return _pencil(stiffness, consistent, lumped, metric, volume, space, operator, fields)
-
-
-def _pencil(
-    stiffness: PatternedOperator,
-    consistent: PatternedOperator,
-    lumped: Float[Array, "*node_shape"],
-    metric: SampledMetric | None,
-    volume: Float[Array, ""],
-    space: FunctionSpace,
-    operator: WeakForm,
-    fields: dict[str, Field],
-) -> Pencil:
-    mass = DiagonalOperator(entries=space.restrict(lumped)) if operator.lumped else consistent
-    if operator.own:
-        return Pencil(stiffness, mass, None, None, space)
-    null_space = None if "potential" in fields else _constants(space, lumped)
-    return Pencil(stiffness, mass, metric, volume, space, null_space=null_space)
-
-
-def _constants(space: FunctionSpace, values: Array) -> NullSpace:
-    """Return what every stiffness of a Laplace–Beltrami operator annihilates: constants on natural components."""
-    n_null, labels, numbers = space.n_null, space.null_labels, jnp if is_traced(values) else np
-    if n_null == 0 or (n_null == 1 and (labels == 0).all()):
-        vectors = numbers.ones((n_null, space.n_dof), values.dtype)
-    else:
-        number = numbers.arange(n_null, dtype=np.int32)[:, None]
-        vectors = (numbers.asarray(labels, np.int32) == number).astype(values.dtype)
-    return NullSpace(jnp.asarray(vectors), fixed=True)
-
-
-def _grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
-    """Return the positions of the quadrature points; those of an element that exists in place of those of others."""
-    first = np.argwhere(space.elements)[0].astype(dtype)
-    corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
-    inner = tensor_product_element(space.dimension).values @ corners
-    origin, spacing, inner = (np.asarray(x, dtype) for x in (grid.origin, grid.spacing, inner))
-    return _points_from(mask_for(jnp.zeros(()), space.elements), first, origin, spacing, inner)
-
-
-@jax.jit
-def _points_from(
-    elements: Bool[np.ndarray | Array, "*elements"],
-    first: Float[np.ndarray | Array, " d"],
-    origin: Float[np.ndarray | Array, " d"],
-    spacing: Float[np.ndarray | Array, " d"],
-    inner: Float[np.ndarray | Array, "q d"],
-) -> Float[Array, "*elements q d"]:
-    low = jnp.moveaxis(jnp.indices(elements.shape), 0, -1).astype(first.dtype)
-    low = jnp.where(elements[..., None], low, first)
-    return jnp.asarray(origin + spacing * (low[..., None, :] + inner))
-
-
-@jit_quickly(static_argnames=("periodic", "interpolation", "operator"))
-def _grid_integrals(
-    tensors: Float[Array, "*shape d d"],
-    domain: Bool[np.ndarray | Array, "*shape"],
-    elements: Bool[np.ndarray | Array, "*elements"],
-    couplings: Bool[np.ndarray | Array, "offsets *shape"] | None,
-    gradients: Float[np.ndarray | Array, "q n d"],
-    weights: Float[np.ndarray | Array, " q"],
-    x: Float[Array, "*elements q d"] | None,
-    fields: dict[str, Field],
-    periodic: tuple[bool, ...],
-    interpolation: Interpolation,
-    operator: WeakForm,
-) -> tuple[Array, Array, Array, Array]:
-    """Return stiffness and mass as stencils, the row sums of the mass at all nodes, and the volume.
-
-    Of functions with several components the matrices of all elements in place of stencils.
-    """
-    element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
-    tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
-
-    # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them
-    # into everything that reads a component, and compute them again for each.
-    nodal = tensors if interpolation == "linear" else spd.log(tensors)
-    metric = jax.vmap(lambda corners: at_quadrature(corners, element))(_at_corners(nodal, periodic))
-    if interpolation == "log-euclidean":
-        metric = jax.lax.optimization_barrier(spd.exp(jax.lax.optimization_barrier(metric)))
-    at_corners = partial(_at_corners, periodic=periodic)
-    held = {name: field.at_points(at_corners, element.values, elements.shape) for name, field in fields.items()}
-    places = None if x is None else x.reshape(-1, *x.shape[-2:])
-
-    def kept(matrices: Float[Array, "E n n"]) -> Float[Array, "E n n"]:
-        return jnp.where(elements.reshape(-1, 1, 1), matrices, 0)
-
-    def integrals(metric: Array, x: Array | None, fields: dict[str, Array]) -> tuple[Array, ...]:
-        return element_matrices(metric, element, operator, x, fields)
-
-    stiffness, mass = map(kept, jax.vmap(integrals)(metric, places, held))
-    if operator.components > 1:
-        return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
-    stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
-    # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
-    lumped = volumes = jnp.sum(mass, axis=0)
-    if "density" in fields:
-        volumes = kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None])
-    volume = jnp.sum(volumes)
-    if couplings is None:
-        return stiffness, mass, lumped, volume
-    return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, volume
-
-
-def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ...]) -> Float[Array, "E n ..."]:
-    """Gather what is at the nodes at the corners of every element."""
-    d, rest = len(periodic), nodal.shape[len(periodic) :]
-    nodes = jnp.pad(nodal, [*[(0, int(wraps)) for wraps in periodic], *[(0, 0)] * len(rest)], mode="wrap")
-    corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
-    return jnp.stack(corners, axis=d).reshape(-1, 2**d, *rest)
-
-
-def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
-    """Add up element matrices into 3^d coefficients a node.
-
-    Local pair (a, b) of corners couples the element's node at corner a to the node at offset b − a.
-    """
-    d = len(periodic)
-    couplings = jnp.moveaxis(matrices, (-2, -1), (0, 1)).reshape(2**d, *(2,) * d, *matrices.shape[:d])
-    # For all corners b at once: one pad for each a, and not one for each pair, is half as long to compile in 3D.
-    total = jnp.zeros((), matrices.dtype)
-    for a, node in enumerate(product((0, 1), repeat=d)):
-        total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
-    total = total.reshape(3**d, *total.shape[d:])
-    for axis, wraps in enumerate(periodic, start=1):
-        if wraps:  # the last node is the first again
-            inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
-            last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
-            total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
-    return total
-
-
-def _nodes_of_mesh(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array, "nodes 3"]:
-    """Return the places of the nodes: the vertices, and of degree 2 the middles of the edges."""
-    if degree not in (1, 2):
-        raise ValueError(f"degree: got {degree!r}; expected 1 or 2")
-    vertices = mesh.vertices
-    if degree == 1:
-        if midpoints is not None:
-            raise ValueError("midpoints: got with degree=1, whose sides are straight; pass degree=2")
-        return vertices
-    middles = jnp.mean(vertices[mesh.triangulation.edges], axis=1)
-    if midpoints is None:
-        return jnp.concatenate([vertices, middles])
-    if mesh._metric is not None:
-        raise ValueError("midpoints: the mesh has a metric of its own, constant in each cell; leave midpoints out")
-    if callable(midpoints):
-        moved = jax.vmap(midpoints)(middles)
-        if mesh.triangulation.dimension == 3:
-            moved = jnp.where(mesh.triangulation.boundary_edges[:, None], moved, middles)
-    else:
-        moved = real_array("midpoints", midpoints)
-    if moved.shape != middles.shape:
-        raise ValueError(
-            f"midpoints: got shape {moved.shape}; expected {middles.shape}, one for each of "
-            "mesh.triangulation.edges, or a function of one place"
-        )
-    return jnp.concatenate([vertices, moved.astype(vertices.dtype)])
-
-
-def _mesh_points(nodes: Float[Array, "nodes 3"], space: MeshSpace) -> Float[Array, "n q 3"]:
-    """Return the places of the quadrature points in each cell."""
-    values = jnp.asarray(simplex_element(space.dimension, space.degree).values, nodes.dtype)
-    return jnp.einsum("qi,nix->nqx", values, nodes[space.cells], precision="highest")
-
-
-@jit_quickly(static_argnames=("space", "operator", "curved"))
-def _assemble_mesh(
-    mesh: SimplicialMesh,
-    nodes: Float[Array, "nodes 3"],
-    fields: dict[str, Field],
-    space: MeshSpace,
-    operator: WeakForm,
-    curved: bool,
-) -> Pencil:
-    element = simplex_element(space.dimension, space.degree)
-    shape = len(space.cells), element.weights.size
-    if curved:
-        slopes = jnp.asarray(element.gradients, nodes.dtype)
-        frames = mesh._oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
-        metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest"))
-    else:
-        metric, frames = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))
-    held = {
-        name: field.at_points(lambda x: x[space.cells], element.values, shape[:1]) for name, field in fields.items()
-    }
-    x, seen = (_mesh_points(nodes, space), frames) if operator.own else (None, None)
-
-    def integrals(metric: Array, x: Array | None, frames: Array | None, fields: dict[str, Array]) -> tuple[Array, ...]:
-        return element_matrices(metric, element, operator, x, fields, frames)
-
-    stiffness, mass = jax.vmap(integrals)(metric, x, seen, held)
-    own = space if operator.components == 1 else vector_space(space, operator.components)
-    lumped = volumes = _row_sums(own, mass)
-    if "density" in fields:
-        volumes = jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype)
-    # How far P1 elements err is known from their edges; of P2 no such estimate is.
-    sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
-    return _pencil(
-        _gathered(own, stiffness), _gathered(own, mass), lumped, sampled, jnp.sum(volumes), own, operator, fields
-    )
-
-
-def _gathered(space: MeshSpace | VectorSpace, matrices: Float[Array, "E m m"]) -> SparseOperator:
-    """Add up the matrices of all elements."""
-    where, slots, pattern = _sparse_pattern(space)
-    return SparseOperator(jax.ops.segment_sum(matrices.reshape(-1)[where], slots, pattern.rows.size), pattern)
-
-
-def _row_sums(space: MeshSpace | VectorSpace, matrices: Float[Array, "E m m"]) -> Float[Array, "*node_shape"]:
-    """Return the row sums at all nodes, those to eliminated nodes included."""
-    sums = jnp.sum(matrices, axis=-1).ravel()
-    return jax.ops.segment_sum(sums, space.cells.ravel(), space.free.size).reshape(space.node_shape)
-
-
-@lru_cache(maxsize=16)
-def _sparse_pattern(space: MeshSpace | VectorSpace) -> tuple[np.ndarray, np.ndarray, SparsePattern]:
-    """Return which local entries count (both ends free), the matrix entry that each adds to, and the pattern."""
-    n, corners = space.n_dof, space.cells.shape[1]
-    cells = space.degrees_of_freedom[space.cells]
-    rows, cols = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, (1, corners)).ravel()
-    where = np.flatnonzero((rows >= 0) & (cols >= 0))
-    keys, slots = np.unique(rows[where] * n + cols[where], return_inverse=True)
-    return where, slots, SparsePattern(n, keys // n, keys % n)

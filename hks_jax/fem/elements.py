@@ -3,8 +3,8 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from itertools import combinations, product
+from functools import lru_cache, partial, reduce
+from itertools import combinations
 
 import jax.numpy as jnp
 import numpy as np
@@ -73,24 +73,21 @@ def at_quadrature(nodal: Float[Array, "n d d"], element: Element) -> Float[Array
     return jnp.einsum("qn,nab->qab", jnp.asarray(element.values, nodal.dtype), nodal, precision="highest")
 
 
-@lru_cache(maxsize=2)
-def tensor_product_element(dimension: int) -> Element:
-    """Return the Q1 element (bilinear, trilinear) with 2^d Gauss points on the unit square or cube.
+GAUSS = 1 / math.sqrt(3)
+"""ξ of Gauss's two points ±ξ on [−1, 1]."""
+
+
+@lru_cache(maxsize=4)
+def tensor_product_element(dimension: int, point: float = GAUSS) -> Element:
+    """Return the Q1 element (bilinear, trilinear) on the unit square or cube, with points at ±``point`` of [−1, 1]^d.
 
     Nodes and points are in the order of ``itertools.product((0, 1), repeat=d)``.
     """
-    gauss = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-    h = np.stack([1 - gauss, gauss], axis=1)  # (point, node) of the unit interval
-    dh = np.array([[-1.0, 1.0], [-1.0, 1.0]])
-    d, corners = dimension, list(product((0, 1), repeat=dimension))
-    n = len(corners)
-    values, gradients = np.ones((n, n)), np.ones((n, n, d))
-    for (q, point), (i, node) in product(enumerate(corners), enumerate(corners)):
-        for a in range(d):
-            values[q, i] *= h[point[a], node[a]]
-            for b in range(d):
-                gradients[q, i, b] *= (dh if a == b else h)[point[a], node[a]]
-    return Element(values, gradients, np.full(n, 1 / n))
+    near, far = (1 + point) / 2, (1 - point) / 2
+    h, dh = np.array([[near, far], [far, near]]), np.array([[-1.0, 1.0], [-1.0, 1.0]])  # (point, node) of the interval
+    axes, n = range(dimension), 2**dimension
+    gradients = [reduce(np.kron, [dh if a == b else h for b in axes]) for a in axes]
+    return Element(reduce(np.kron, [h] * dimension), np.stack(gradients, axis=-1), np.full(n, 1 / n))
 
 
 # With d + 1 points, one beside each corner, whose barycentric coordinates are 1 − d·a and d times a, the rule of equal

@@ -79,6 +79,7 @@ class WeakForm(NamedTuple):
         lumped: whether the mass becomes a diagonal of row sums.
         components: of the functions.
         own: whether a form is the user's, of which nothing is known.
+        cancelling: whether shape functions are taken where the leading error of signatures cancels.
         checked: whether their matrices can be looked at afterwards; else those that are not symmetric become NaN.
     """
 
@@ -87,6 +88,7 @@ class WeakForm(NamedTuple):
     lumped: bool = False
     components: int = 1
     own: bool = False
+    cancelling: bool = False
     checked: bool = True
 
 

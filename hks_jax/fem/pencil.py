@@ -1,9 +1,10 @@
 """The matrix pencil of the Laplace–Beltrami operator."""
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from hks_jax.fem.resolution import Resolution, SampledMetric, resolution_of
 from hks_jax.fem.space import FunctionSpace
@@ -22,15 +23,26 @@ class Pencil(SymmetricPencil):
             not known.
         space: the space of the functions.
         null_space: that of K ⪰ 0; None where nothing is known, and K may be indefinite.
+        lower_bound: a number below which there is no eigenvalue, where that is known of a K that may be indefinite;
+            constant to derivatives.
+        row_sums: (n_dof,) those of M, eliminated columns included, where values at nodes are read with them, infinite
+            where these are 0; None where the unknowns are the values at nodes.
     """
 
     metric: SampledMetric | None
     volume: Float[Array, ""] | None
     space: FunctionSpace = eqx.field(static=True)
+    lower_bound: Float[Array, ""] | None = eqx.field(default=None, kw_only=True)
+    row_sums: Float[Array, " n_dof"] | None = eqx.field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         """Return one line: how many unknowns on what, and under which boundary."""
         return f"Pencil({self.space!r})"
+
+    @property
+    def bounded(self) -> bool:
+        """Whether it is known where the spectrum begins."""
+        return self.null_space is not None or self.lower_bound is not None
 
     @property
     def measured(self) -> bool:
@@ -42,7 +54,21 @@ class Pencil(SymmetricPencil):
         """What the spacing of the nodes does to signatures, for estimates; None where it is not known."""
         if self.metric is None:
             return None
-        return resolution_of(self.metric, self.space, isinstance(self.mass, DiagonalOperator))
+        return resolution_of(
+            self.metric, self.space, isinstance(self.mass, DiagonalOperator), self.row_sums is not None
+        )
+
+    def read(self, functions: Float[Array, "... n_dof"], part: Any = None) -> Float[Array, "... n_dof"]:
+        """Return the values at the free nodes of functions that are given by their unknowns (`assemble`)."""
+        if self.row_sums is None:
+            return functions
+        return (functions + self.mass.apply(functions) / self.row_sums) / 2
+
+    def integrals(self, values: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
+        """Return the functional ∫φu of values that are `read` from φ, for functions u given by theirs."""
+        if self.row_sums is None:
+            return self.mass.apply(values)
+        return jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums) * values
 
     def with_stiffness(self, stiffness: PatternedOperator) -> "Pencil":
         """Return the pencil of another operator on the same domain, such as K + V, of whose kernel nothing is known.
@@ -54,7 +80,7 @@ class Pencil(SymmetricPencil):
         """
         if stiffness.pattern != self.pattern:
             raise ValueError("stiffness: got a matrix with another pattern; use `sparse_pencil` for any two matrices")
-        return Pencil(stiffness, self.mass, self.metric, self.volume, self.space)
+        return Pencil(stiffness, self.mass, self.metric, self.volume, self.space, row_sums=self.row_sums)
 
     @property
     def parts(self) -> tuple["Pencil", ...]:
@@ -92,6 +118,19 @@ class MirrorPencil(eqx.Module):
     def resolution(self) -> Resolution | None:
         """What the spacing of the nodes does to signatures, for estimates."""
         return self.parts[0].resolution
+
+    def read(self, functions: Float[Array, "k n_dof"], part: Int[Array, " k"] | None) -> Float[Array, "k n_dof"]:
+        """Return the values at the free nodes of functions, of which each belongs to a part."""
+        # Where both have unknowns, the mass of a part is that of the first; elsewhere its functions vanish.
+        sums = [
+            jnp.where(part.space.free, part.space.extend(part.row_sums, outside=0.0), jnp.inf)
+            for part in self.parts
+            if part.row_sums is not None
+        ]
+        if not sums:
+            return functions
+        whole = self.space.restrict(jnp.stack(sums))[part]
+        return jnp.where(jnp.isinf(whole), 0, functions + self.parts[0].mass.apply(functions) / whole) / 2
 
     @property
     def volume(self) -> Float[Array, ""] | None:

@@ -34,25 +34,27 @@ class Resolution(eqx.Module):
 
     Attributes:
         mesh_width: (*shape) the local distance of neighbouring nodes in the units of the metric.
-        dispersion: (*shape) the bias times t, in (metric length)², of tensors that do not vary: it falls as t grows.
+        dispersion: (*shape) a in the bias (a/t)^order, in (metric length)², of tensors that do not vary.
         turning: (*shape) the relative error of eigenvalues, whatever their size, because tensors turn or stretch
             between neighbours.
         swelling: the relative error of the domain's area or volume.
+        order: 2 where the leading error cancels, else 1.
     """
 
     mesh_width: Float[Array, "*shape"]
     dispersion: Float[Array, "*shape"]
     turning: Float[Array, "*shape"]
     swelling: Float[Array, ""]
+    order: int = eqx.field(static=True, default=1, kw_only=True)
 
 
-def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool) -> Resolution:
+def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, cancelling: bool) -> Resolution:
     """Return what the spacing of a grid, or the edges of a mesh, do to the functions of a space."""
     if isinstance(space, GridSpace):
         # The mask goes in as an array, so that grids that differ only in it share one compilation.
         domain = mask_for(metric.tensors, space.domain)
-        settings = space.periodic, metric.interpolation, lumped
-        return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings))
+        settings = space.periodic, metric.interpolation, lumped, cancelling
+        return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings), order=1 + cancelling)
     assert isinstance(space, MeshSpace)
     return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
 
@@ -65,9 +67,21 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool) -> 
 #
 # A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6, which adds d/24 Σₐ hₐ²gₐₐ/t, by E λkₐ² = (d + 2)gₐₐ/4t²;
 # 1/20 in place of 1/24 is what the next terms make of it at t = 6h².
-def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool) -> Any:
-    """Return the error (*shape), times t, of the signature that Q1 elements give where tensors do not vary."""
+#
+# Where the leading error cancels (hks_jax/fem/quadrature.py) and the tensor is diagonal, λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240 and
+# the nodal square is larger by (Σₐ hₐ²kₐ²)²/576: with E kₐ⁶ = 15gₐₐ³/8t³ the relative error is
+#
+#     Σₐ hₐ⁴gₐₐ²/128t² + Σₐᵦ hₐ²hᵦ² (gₐₐgᵦᵦ + 2gₐᵦ²)/2304t².
+#
+# Of tensors that are turned it is twice to half as much.
+def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> Any:
+    """Return `Resolution.dispersion` (*shape) of Q1 elements."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
+    if cancelling:
+        scaled = tensors * spacing[:, None] * spacing
+        along = xp.stack([scaled[..., a, a] for a in range(d)], axis=-1)
+        mixed = along.sum(-1) ** 2 + 2 * (scaled**2).sum((-2, -1))
+        return xp.sqrt((along**2).sum(-1) / 128 + mixed / 2304)
     of_mass = 1 / 12 + (d / 20 if lumped else 0)
     total = xp.zeros(tensors.shape[:-2], tensors.dtype)
     for a in range(d):
@@ -124,7 +138,7 @@ def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
     return pairs & (xp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@numpy_where_known(static_argnums=(3, 4, 5))
+@numpy_where_known(static_argnums=(3, 4, 5, 6))
 def _of_grid(
     xp: Any,
     tensors: Any,
@@ -133,12 +147,13 @@ def _of_grid(
     periodic: tuple[bool, ...],
     interpolation: Interpolation,
     lumped: bool,
+    cancelling: bool,
 ) -> tuple[Any, ...]:
     tensors = xp.where(domain[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
     along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
     return (
         xp.sqrt(xp.max(xp.stack(along), axis=0)),
-        _dispersion(xp, tensors, spacing, lumped),
+        _dispersion(xp, tensors, spacing, lumped, cancelling),
         _turning(xp, tensors, domain, periodic),
         _swelling(xp, tensors, domain, periodic, interpolation),
     )

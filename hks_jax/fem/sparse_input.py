@@ -17,6 +17,7 @@ from hks_jax.checks import real_array, require_number
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
+from hks_jax.fem.quadrature import Quadrature
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.operators import ROUNDING, DiagonalOperator, Operator, SparseOperator, require_symmetric
 from hks_jax.linear.pattern import SparsePattern
@@ -90,14 +91,14 @@ def sparse_pencil(
     return Pencil(pencil.stiffness, pencil.mass, None, volume, space, null_space=null_space)
 
 
-def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind) -> AnyPencil:
+def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
     """Return the pencil of a field, a mesh, a matrix K or a pair (K, M); or the one that is given, checked."""
     matrices = BCOO | BCSR | Operator | np.ndarray | jax.Array | list | LinearOperator
     matrix = issparse(domain) or isinstance(domain, matrices)
     if not matrix and not isinstance(domain, SymmetricPencil | MirrorPencil | tuple):
-        return assemble(domain, boundary, mass)
-    if boundary != "neumann" or mass != "consistent":
-        raise ValueError("boundary, mass: a pencil has them already; give them to `assemble` instead")
+        return assemble(domain, boundary, mass, quadrature=quadrature)
+    if (boundary, mass, quadrature) != ("neumann", "consistent", "gauss"):
+        raise ValueError("boundary, mass, quadrature: a pencil has them already; give them to `assemble` instead")
     if isinstance(domain, tuple) and len(domain) != 2:
         raise ValueError(f"domain: got a tuple of {len(domain)}; expected a pair (K, M)")
     if not isinstance(domain, Pencil | MirrorPencil):

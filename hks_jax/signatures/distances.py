@@ -93,7 +93,7 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
     n = pairs.n_null  # raises where that is not known
     if not pairs.null_space_known:  # negative ones come first
         n = int((jax.lax.stop_gradient(pairs.eigenvalues) <= 0).sum())
-    scaled = pairs.vectors[n:] / jnp.sqrt(jnp.where(pairs.kept, pairs.eigenvalues, 1)[n:, None])
+    scaled = pairs.at_nodes[n:] / jnp.sqrt(jnp.where(pairs.kept, pairs.eigenvalues, 1)[n:, None])
     return pairs.space.extend(nan_outside(scaled, pairs.kept[n:, None]))
 
 

@@ -69,7 +69,7 @@ def spectral_flow(
     # Inner products over the doubled domain: twice those over the domain for each doubling, and 0 with odd functions.
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
-    functionals = len(parts) * parts[0].mass.apply(pairs.space.transfer(known, everywhere.space))
+    functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
     flow = _kernel(Applied(functionals), filters, everywhere.of_part(0))
     return nan_outside(everywhere.space.extend(flow), pairs.space.domain)
 
@@ -89,7 +89,7 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
     """Read the kernels Φ f(Λ) Φᵀ of m filters."""
     # Where JAX differentiates this body and not the rule (the outer of two derivatives), it must not.
     pairs = first_order_only(pairs)
-    return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.vectors)
+    return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
 
 
 @jax.jit
@@ -110,6 +110,9 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #
 # xᵢ the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept count as pairs
 # with f = 0. Under "mirror" and "mean" it is the sum over the parts, whose pairs do not mix.
+#
+# Signatures read the kernel RΦ f(Λ) ΦᵀRᵀ at the nodes (`Pencil.read`). R stands to the left of each φ and x, and
+# f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ) comes to the sum.
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
@@ -125,11 +128,15 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
             own = pairs.of_part(number)
             known = own.eigenvalues, own.vectors, own.kept, d_frame
             static = part.n_fixed > 0, len(pairs.pencil.parts), pairs.space
-            terms.append(_tangent(contraction, filters, known, _rows_of(own, number), *static, change.parts[number]))
+            reader = None if part.row_sums is None else part
+            matrices = change.parts[number], reader
+            terms.append(_tangent(contraction, filters, known, _rows_of(own, number), *static, *matrices))
     elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
         pairs = first_order_only(pairs)
         moved = jax.jvp(
-            lambda values, vectors: _weighted(contraction, _all_weights(filters, values, pairs.kept), vectors),
+            lambda values, vectors: _weighted(
+                contraction, _all_weights(filters, values, pairs.kept), pairs.pencil.read(vectors, pairs.part)
+            ),
             (pairs.eigenvalues, pairs.vectors),
             _instantiated((d_pairs.eigenvalues, d_pairs.vectors)),
         )
@@ -167,6 +174,7 @@ def _tangent(
     copies: int,
     space: FunctionSpace,
     change: Pencil,
+    reader: Pencil | None,
 ) -> Array:
     """Return the derivative by the change of one part: of values, vectors, those kept, and their moving frame."""
     values, vectors, kept, d_frame = pairs if selection is None else (x[selection[0]] for x in pairs)
@@ -186,7 +194,14 @@ def _tangent(
 
     stiffness, mass = (blocks[place] for blocks in jax.lax.map(products, jnp.asarray(starts)))
     weights = _all_weights(filters, values, kept)
-    _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (vectors,), (d_frame,))
+    read, d_read = vectors, d_frame
+    if reader is not None:
+
+        def read_by(pencil: Pencil, x: Array) -> Array:
+            return pencil.space.transfer(pencil.read(space.transfer(x, pencil.space)), space)
+
+        read, d_read = jax.jvp(read_by, (reader, vectors), (change, d_frame))
+    _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (read,), (d_read,))
 
     def mixing(one: Filter) -> tuple[Float[Array, "k k"], Bool[Array, " k"]]:
         of_f, of_lambda_f = _divided_differences(one, values, kept, fixed)
@@ -195,7 +210,7 @@ def _tangent(
 
     def inner(some: Filter) -> Array:
         matrices, matters = jax.lax.map(mixing, some)
-        return contraction.mixed(matrices, vectors, matters)
+        return contraction.mixed(matrices, read, matters)
 
     together = min(_FILTERS, len(weights))
     starts, place = row_blocks(len(weights), together)

@@ -42,6 +42,7 @@ class Truncation(eqx.Module):
         coarse_fraction: (n,) the fraction of nodes where that bias exceeds 10 %.
         smallest_time: the least time that the k pairs resolve to 1 % in that mean. The worst node then lacks up to 6 %,
             beside a Dirichlet side up to 20 %.
+        order: the power of 1/t with which the rest of the bias falls.
     """
 
     times: Float[Array, " n"]
@@ -50,6 +51,7 @@ class Truncation(eqx.Module):
     lasting_bias: Float[Array, " n"]
     coarse_fraction: Float[Array, " n"]
     smallest_time: Float[Array, ""]
+    order: int = eqx.field(static=True, default=1, kw_only=True)
 
     def messages(self) -> list[str]:
         """Say in sentences which times are under-resolved; empty if none is. Needs concrete values."""
@@ -68,9 +70,9 @@ class Truncation(eqx.Module):
         if early.any():
             at = np.argmax(np.where(early, bias, 0))
             first = times[at]
-            # The estimate is x/(1 + x) with x² = (a/t)² + c² (see `_resolution_bias`), c that which does not fall.
+            # The estimate is x/(1 + x) with x² = (a/t)^(2·order) + c² (see `_resolution_bias`); c does not fall.
             x, c, limit = (each / (1 - each) for each in (min(bias[at], 1 - 1e-15), lasting[at], BIAS_LIMIT))
-            least = first * ((x**2 - c**2) / max(limit**2 - c**2, 1e-6)) ** 0.5
+            least = first * ((x**2 - c**2) / max(limit**2 - c**2, 1e-6)) ** (0.5 / self.order)
             messages.append(
                 f"{int(early.sum())} of {times.size} times are too small for the grid: the discretisation biases the "
                 f"signature at t = {first:.4g} by about {bias[at]:.1%} at half of the nodes. "
@@ -112,14 +114,14 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     pairs, at = jax.lax.stop_gradient((pairs, checked_times("times", times, dtype)))
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
     dimension, resolution = dimension_of(pairs, "an estimate of the truncation"), pairs.pencil.resolution
-    by_weyl, errors = pairs.null_space_known, None
+    by_weyl, errors, order = pairs.null_space_known, None, 1
     if resolution is not None and by_weyl:
-        errors = resolution.dispersion, resolution.turning, resolution.swelling
+        errors, order = (resolution.dispersion, resolution.turning, resolution.swelling), resolution.order
     free = mask_for(known, pairs.space.free)
-    return Truncation(at, *_truncation(errors, free, *known, at, dimension, by_weyl))
+    return Truncation(at, *_truncation(errors, free, *known, at, dimension, by_weyl, order), order=order)
 
 
-@numpy_where_known(static_argnums=(7, 8))
+@numpy_where_known(static_argnums=(7, 8, 9))
 def _truncation(
     xp: Any,
     errors: tuple[Any, Any, Any] | None,
@@ -131,6 +133,7 @@ def _truncation(
     at: Any,
     dimension: int,
     by_weyl: bool,
+    order: int,
 ) -> tuple[Any, ...]:
     """Return what `Truncation` has beside the times; the exponent is Weyl's or that of the spectrum."""
     # Weyl's law counts from the bottom of the spectrum, which a potential moves.
@@ -155,7 +158,7 @@ def _truncation(
     if errors is None:
         unknown = xp.full_like(at, xp.nan)
         return tail, unknown, unknown, unknown, smallest
-    bias, lasting = _resolution_bias(xp, errors, free, at, 1 - (1 - slope) * (1 - tail))
+    bias, lasting = _resolution_bias(xp, errors, free, at, 1 - (1 - slope) * (1 - tail), order)
     coarse = xp.sum(bias > BIAS_LIMIT, axis=1, dtype=at.dtype) / xp.sum(free, dtype=at.dtype)
     return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
@@ -164,7 +167,9 @@ def _truncation(
 # s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where the constant is left. A volume larger by the
 # factor 1 + v is that of the metric times (1 + v)^(2/d), which divides the signature by 1 + v and eigenvalues by
 # (1 + v)^(2/d): an error of v(1 − s). Where k pairs are too few for t, what lies beyond them counts with s = 1.
-def _resolution_bias(xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any) -> tuple[Any, Any]:
+def _resolution_bias(
+    xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any, order: int
+) -> tuple[Any, Any]:
     """Return the estimated relative error (n, nodes) by the spacing, and its part that does not fall with t.
 
     Both are 0 at nodes that are not free.
@@ -172,7 +177,7 @@ def _resolution_bias(xp: Any, errors: tuple[Any, Any, Any], free: Any, times: An
     dispersion, turning = (xp.where(free, x, 0).ravel() for x in errors[:2])
     lasting = slope[:, None] * turning[None] + (xp.abs(1 - slope) * errors[2])[:, None]
     lasting = xp.where(free.ravel()[None], lasting, 0)
-    both = xp.hypot(dispersion[None] / times[:, None], lasting)
+    both = xp.hypot((dispersion[None] / times[:, None]) ** order, lasting)
     # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 

@@ -65,7 +65,7 @@ def hks_spectrum_free(
             `jax.jit`.
         TypeError: colouring on a mesh.
     """
-    pencil = pencil_of(domain, boundary, mass)
+    pencil = _read_as_unknowns(pencil_of(domain, boundary, mass))
     times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     settings = choose_method(pencil, times, method, tolerance)
@@ -103,7 +103,7 @@ def colouring(
             about as many vectors as nodes.
         TypeError: a mesh.
     """
-    pencil = pencil_of(domain, boundary, mass)
+    pencil = _read_as_unknowns(pencil_of(domain, boundary, mass))
     require_grid(pencil)
     times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
@@ -112,6 +112,15 @@ def colouring(
     settings = plan(pencil, times, tolerance, memory, slack)
     require_fewer_vectors(settings, pencil)
     return settings
+
+
+def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
+    if any(part.row_sums is not None for part in pencil.parts):
+        raise ValueError(
+            'domain: got a pencil of the quadrature "cancelling", from whose unknowns values are read that this method '
+            'does not compute; expected "gauss". Or compute eigenpairs, and the signature from them'
+        )
+    return pencil
 
 
 def _diagonal(

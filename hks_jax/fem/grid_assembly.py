@@ -1,0 +1,159 @@
+"""Stiffness and mass on grids: one element's integrals, mapped over all elements, as stencils."""
+
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hks_jax.compilation import jit_quickly
+from hks_jax.domain import spd
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_checks import Interpolation
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.fem.assembled import assembled, gathered, row_sums_of
+from hks_jax.fem.elements import Element, at_quadrature, element_matrices, tensor_product_element
+from hks_jax.fem.fields import Field
+from hks_jax.fem.forms import WeakForm
+from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.quadrature import MASS, moved
+from hks_jax.fem.resolution import SampledMetric
+from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
+from hks_jax.fem.stencil import StencilOperator
+
+
+def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
+    """Return the pencil of a field, of one problem of a doubled domain."""
+    # Masks, element and spacing go in as arrays, so that problems that differ only in them share one compilation. The
+    # element is made in double precision: its rounding would scale the whole metric.
+    tensors, spacing = field.tensors, field.grid.spacing
+    element = tensor_product_element(space.dimension).stretched(spacing)
+    gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
+    domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
+    couplings, settings = couplings_for(tensors, space), (space.periodic, field.interpolation, operator)
+    x = grid_points(field.grid, space, tensors.dtype) if operator.own else None
+    table = gradients, weights, steps
+    *matrices, lumped, volume = _grid_integrals(tensors, domain, elements, couplings, *table, x, fields, *settings)
+    metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
+    if operator.components > 1:
+        own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
+        gathered = [gathered(own, each[kept]) for each in matrices]
+        sums = row_sums_of(own, matrices[1][kept])
+        return assembled(gathered[0], gathered[1], sums, None, volume, own, operator, fields)
+    stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in matrices)
+    return assembled(stiffness, consistent, lumped, metric, volume, space, operator, fields)
+
+
+def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
+    """Return the positions of the quadrature points; those of an element that exists in place of those of others."""
+    first = np.argwhere(space.elements)[0].astype(dtype)
+    corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
+    inner = tensor_product_element(space.dimension).values @ corners
+    origin, spacing, inner = (np.asarray(x, dtype) for x in (grid.origin, grid.spacing, inner))
+    return _points_from(mask_for(jnp.zeros(()), space.elements), first, origin, spacing, inner)
+
+
+@jax.jit
+def _points_from(
+    elements: Bool[np.ndarray | Array, "*elements"],
+    first: Float[np.ndarray | Array, " d"],
+    origin: Float[np.ndarray | Array, " d"],
+    spacing: Float[np.ndarray | Array, " d"],
+    inner: Float[np.ndarray | Array, "q d"],
+) -> Float[Array, "*elements q d"]:
+    low = jnp.moveaxis(jnp.indices(elements.shape), 0, -1).astype(first.dtype)
+    low = jnp.where(elements[..., None], low, first)
+    return jnp.asarray(origin + spacing * (low[..., None, :] + inner))
+
+
+@jit_quickly(static_argnames=("periodic", "interpolation", "operator"))
+def _grid_integrals(
+    tensors: Float[Array, "*shape d d"],
+    domain: Bool[np.ndarray | Array, "*shape"],
+    elements: Bool[np.ndarray | Array, "*elements"],
+    couplings: Bool[np.ndarray | Array, "offsets *shape"] | None,
+    gradients: Float[np.ndarray | Array, "q n d"],
+    weights: Float[np.ndarray | Array, " q"],
+    spacing: Float[np.ndarray | Array, " d"],
+    x: Float[Array, "*elements q d"] | None,
+    fields: dict[str, Field],
+    periodic: tuple[bool, ...],
+    interpolation: Interpolation,
+    operator: WeakForm,
+) -> tuple[Array, Array, Array, Array]:
+    """Return stiffness and mass as stencils, the row sums of the mass at all nodes, and the volume.
+
+    Of functions with several components the matrices of all elements in place of stencils.
+    """
+    element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
+    tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
+
+    # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them
+    # into everything that reads a component, and compute them again for each.
+    nodal = tensors if interpolation == "linear" else spd.log(tensors)
+    metric = jax.vmap(lambda corners: at_quadrature(corners, element))(_at_corners(nodal, periodic))
+    if interpolation == "log-euclidean":
+        metric = jax.lax.optimization_barrier(spd.exp(jax.lax.optimization_barrier(metric)))
+    at_corners = partial(_at_corners, periodic=periodic)
+    held = {name: field.at_points(at_corners, element.values, elements.shape) for name, field in fields.items()}
+    places = None if x is None else x.reshape(-1, *x.shape[-2:])
+
+    def kept(matrices: Float[Array, "E n n"]) -> Float[Array, "E n n"]:
+        return jnp.where(elements.reshape(-1, 1, 1), matrices, 0)
+
+    points = replace(element, values=tensor_product_element(len(periodic), MASS).values)
+
+    def integrals(metric: Array, x: Array | None, fields: dict[str, Array]) -> tuple[Array, ...]:
+        if not operator.cancelling:
+            return element_matrices(metric, element, operator, x, fields)
+        alone = {name: field for name, field in fields.items() if name != "potential"}
+        energy, mass = element_matrices(metric, points, operator, x, alone)
+        whole = moved(energy, metric, spacing)
+        if "potential" in fields:
+            whole = whole + element_matrices(metric, points, operator, x, fields)[0] - energy
+        return whole, mass
+
+    stiffness, mass = map(kept, jax.vmap(integrals)(metric, places, held))
+    if operator.components > 1:
+        return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
+    stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
+    # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
+    lumped = volumes = jnp.sum(mass, axis=0)
+    if "density" in fields:
+        volumes = kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None])
+    volume = jnp.sum(volumes)
+    if couplings is None:
+        return stiffness, mass, lumped, volume
+    return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, volume
+
+
+def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ...]) -> Float[Array, "E n ..."]:
+    """Gather what is at the nodes at the corners of every element."""
+    d, rest = len(periodic), nodal.shape[len(periodic) :]
+    nodes = jnp.pad(nodal, [*[(0, int(wraps)) for wraps in periodic], *[(0, 0)] * len(rest)], mode="wrap")
+    corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
+    return jnp.stack(corners, axis=d).reshape(-1, 2**d, *rest)
+
+
+def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
+    """Add up element matrices into 3^d coefficients a node.
+
+    Local pair (a, b) of corners couples the element's node at corner a to the node at offset b − a.
+    """
+    d = len(periodic)
+    couplings = jnp.moveaxis(matrices, (-2, -1), (0, 1)).reshape(2**d, *(2,) * d, *matrices.shape[:d])
+    # For all corners b at once: one pad for each a, and not one for each pair, is half as long to compile in 3D.
+    total = jnp.zeros((), matrices.dtype)
+    for a, node in enumerate(product((0, 1), repeat=d)):
+        total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
+    total = total.reshape(3**d, *total.shape[d:])
+    for axis, wraps in enumerate(periodic, start=1):
+        if wraps:  # the last node is the first again
+            inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
+            last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
+            total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
+    return total
