@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.options import parse_times, refuse
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
+from hks_jax.cli.values import parse_times
 from hks_jax.io.result import Result
 from hks_jax.signatures.suitable import RESOLVED
 
