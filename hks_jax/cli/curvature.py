@@ -21,7 +21,7 @@ from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read_volume
 from hks_jax.curvature import gaussian_curvature
-from hks_jax.io import save
+from hks_jax.io import Result
 from hks_jax.io.formats import WRITTEN
 
 OPTIONS = f"""
@@ -72,8 +72,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     volume = volume.with_mask(field.grid.mask)
     stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]
     with writing(args.output, report, progress, lambda: stale) as (folder, done):
-        for suffix in filter(None, (".npz", image_suffix(args.file))):
-            save(folder / f"curvature{suffix}", curvature, volume, name="curvature")
+        result = Result(volume, curvature[None], np.zeros(0), np.zeros(0), report, name="curvature")
+        result.save(folder / "curvature", image_suffix(args.file))
         grid, box = cropped(volume, known)
         limit = float(np.quantile(np.abs(values), COLOURED)) or 1.0
         orientation = placed(volume, box, args.view)
