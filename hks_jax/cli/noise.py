@@ -80,8 +80,7 @@ def _noise(args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progre
         return hj.TensorNoise(volume.covariance, grid)
     if args.noise == "roughness":
         return hj.TensorNoise.from_roughness(volume.tensors, grid)
-    second = second_scan(args)
-    if second is not None:
+    if (second := second_scan(args)) is not None:
         return hj.TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, grid)
     return hj.TensorNoise.relative(volume.tensors, float(args.noise), grid)
 

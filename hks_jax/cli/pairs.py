@@ -69,14 +69,9 @@ def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solv
     """Return the eigenpairs, where the settings that are settled are theirs, and the suffix of images."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
-    volume = TensorVolume(
-        arrays["tensors"],
-        tuple(arrays["spacing"].tolist()),
-        tuple(arrays["origin"].tolist()),
-        arrays.get("mask"),
-        arrays.get("affine"),
-        **{name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])},
-    )
+    spacing, origin = (tuple(arrays[name].tolist()) for name in ("spacing", "origin"))
+    about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}
+    volume = TensorVolume(arrays["tensors"], spacing, origin, arrays.get("mask"), arrays.get("affine"), **about)
     boundary = recorded_boundary(record["settings"])
     assert boundary is not None
     settings = replace(settings, **{**record["settings"], "boundary": boundary})

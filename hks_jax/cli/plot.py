@@ -127,26 +127,17 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot.signature import placed
 
     values, volume = result.values, result.volume
-    grid, d, limit = result.grid, volume.dimension, None
+    grid, d = result.grid, volume.dimension
     orientation = placed(volume, None, "neurological")
     if orientation is not None:  # points have the coordinates that the images show
         values, grid = orientation.array(values), orientation.grid(grid)
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates each")
+    style = {"scaled": args.scaled, "cmap": args.cmap, "unit": args.unit or ""}
     if result.eigenvalues.size:
-        limit = RESOLVED[d] / float(result.eigenvalues[-1])
+        style["limit"] = RESOLVED[d] / float(result.eigenvalues[-1])
     figure = new_figure(5.4, 4.0)
-    hks_curves(
-        figure.subplots(),
-        values,
-        result.times,
-        grid,
-        args.points,
-        limit=limit,
-        scaled=args.scaled,
-        cmap=args.cmap,
-        unit=args.unit or "",
-    )
+    hks_curves(figure.subplots(), values, result.times, grid, args.points, **style)
     if args.title:
         figure.suptitle(args.title)
     return figure

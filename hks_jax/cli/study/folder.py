@@ -199,10 +199,9 @@ def reading_options(args: argparse.Namespace) -> dict[str, Any]:
 
     A second scan is one of the files, and said to be one alone: its path may change.
     """
-    reading = {option: getattr(args, option.replace("-", "_")) for option in COLUMNS}
-    if args.noise is None:
-        return {option: value for option, value in reading.items() if option not in ("noise", "draws")}
-    return {**reading, "noise": args.noise if second_scan(args) is None else "file"}
+    names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
+    reading = {option: getattr(args, option.replace("-", "_")) for option in names}
+    return reading if second_scan(args) is None else {**reading, "noise": "file"}
 
 
 def times_text(unit: str) -> str:
