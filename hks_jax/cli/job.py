@@ -86,7 +86,7 @@ def result_of(
     settings: Settings,
     progress: Progress,
 ) -> Result:
-    """Compute the signature on a volume, whose mask is the domain, or a mesh, of which the report says `described`."""
+    """Compute the signature on a volume, whose mask is the domain, or on a mesh; `described` goes into the report."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
         values, origin = _signature(pairs, times, settings)

@@ -16,7 +16,7 @@ from hks_jax.io.repair import REPAIRS
 
 
 def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return what reads a text, and says what was expected where `read` returns None."""
+    """Return a reader of texts whose error says what was expected where `read` returns None."""
 
     def parse(text: str) -> Any:
         if (value := read(text)) is None:
@@ -120,4 +120,4 @@ KINDS: dict[str, Callable[[str], Any] | Iterable[str]] = {
     "CONDITION": parse_boundary,
     **{"ORDER": ORDERS, "UNIT": UNITS, "SOLVER": ("auto", *SOLVERS)},
 }
-"""What the words of the table stand for: how a text is read, or what it may be. All others are texts."""
+"""By the words of the table of options: what reads a text, or the texts that are allowed. Other words are any text."""

@@ -26,13 +26,13 @@ class Result:
     """A signature, or another scalar field, on a volume or slice whose mask is the domain, or on a mesh.
 
     Attributes:
-        place: the volume or slice, or the mesh. The tensors of a file that has none are unit ones.
+        place: the volume or slice, or the mesh. Where a file has no tensors they are the identity.
         values: (n_times, *shape).
         times: (n_times,), or (0,) for a result without.
         eigenvalues: (k,), or (0,) where they are not known.
         report: what is known about it; ``settings`` are those of the computation.
         arrays: more arrays by name, which are saved with it: ``deviation``, ``bias`` and ``noise_maps`` (n_draws,
-            n_times, *shape) of error bars; ``scaled_times`` λ₁t; ``input_tensors``, those of which it is.
+            n_times, *shape) of error bars; ``scaled_times`` λ₁t; ``input_tensors``, where they are known.
         name: ``"hks"`` or ``"curvature"``.
         source: the file that it was read from.
     """
@@ -94,7 +94,7 @@ class Result:
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:
         """Write it as `stem` with ``.npz`` after it and, unless that is empty, with the suffix of an image or a mesh.
 
-        The npz also has the times, the eigenvalues, the tensors that it is of, and all other arrays. Where the tensors
+        The npz also has the times, the eigenvalues, the tensors, and all other arrays. Where the tensors
         are of single precision the values are, too: more digits mean nothing and take room.
 
         Args:
