@@ -40,6 +40,7 @@ from hks_jax.eigen.solver import Eigensolver as Eigensolver
 from hks_jax.eigen.weyl import weyl_count as weyl_count
 from hks_jax.fem.assembly import assemble as assemble
 from hks_jax.fem.boundary import crop as crop
+from hks_jax.fem.boundary import default_boundary as default_boundary
 from hks_jax.fem.boundary import reflect as reflect
 from hks_jax.fem.factorise import Multifrontal as Multifrontal
 from hks_jax.fem.factorise import SparseLinearOperator as SparseLinearOperator

@@ -1,11 +1,10 @@
 """Keeping what was compiled from one process to the next."""
 
 import os
-import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 import jax
+import platformdirs
 
 
 def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
@@ -24,7 +23,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     given = jax.config.values["jax_compilation_cache_dir"]
     if given is not None:
         return Path(given)
-    path = cache_folder(sys.platform, os.environ, Path.home()) if folder is None else Path(folder)
+    path = platformdirs.user_cache_path("hks-jax", appauthor=False) if folder is None else Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -35,13 +34,3 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     # JAX keeps what took a second or more. To read a small program takes a tenth of the time to compile it.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return path
-
-
-def cache_folder(platform: str, environment: Mapping[str, str], home: Path) -> Path:
-    """Return where caches go by the platform's convention: XDG's on Linux, and those of macOS and Windows."""
-    if platform == "darwin":
-        return home / "Library" / "Caches" / "hks-jax"
-    if platform == "win32":
-        return Path(environment.get("LOCALAPPDATA") or home / "AppData" / "Local") / "hks-jax" / "Cache"
-    given = Path(environment.get("XDG_CACHE_HOME", ""))
-    return (given if given.is_absolute() else home / ".cache") / "hks-jax"  # XDG: a relative path is to be ignored

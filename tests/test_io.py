@@ -20,6 +20,7 @@ from dipy.segment.mask import median_otsu
 
 import hks_jax as hj
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, atomic_path, erode, find_example_brain, read_mask
+from hks_jax.io.result import recorded_boundary
 from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
 
 SHAPE = (4, 5, 6)
@@ -558,3 +559,42 @@ def test_the_example_brain_is_found_by_metadata_alone(tmp_path, monkeypatch):
     assert found is not None
     assert found.images == tmp_path / names[0]
     assert (found.mask, found.bval, found.bvec) == tuple(tmp_path / n for n in names[1:])
+
+
+# ---------------------------------------------------------------------------------------------------- results
+
+
+@pytest.mark.parametrize("times", [np.array([1.0, 2.5]), np.zeros(0)], ids=["over times", "without"])
+def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
+    affine = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
+    tensors, mask = np.broadcast_to(np.diag([1.0, 2.0]), (6, 5, 2, 2)), rng.random((6, 5)) < 0.9
+    about = {"order": "fit", "notes": ("fitted",), "source": "dwi.nii", "digest": "0f"}
+    volume = TensorVolume(tensors, (2.0, 3.0), (1.0, 0.0), mask, affine, 1, **about)
+    values = np.where(mask, rng.random((max(times.size, 1), 6, 5)), np.nan)
+    settings = {"metric": "inverse", "normalisation": "flat", "boundary": (("neumann", "mean"), "periodic")}
+    arrays = {"deviation": 0.1 + values} if times.size else {}
+    result = hj.io.Result(volume, values, times, np.arange(3.0), {"settings": settings}, arrays)
+    result.save(tmp_path / "hks", "")
+    read = hj.io.Result.read(tmp_path, over_times=bool(times.size))
+    assert hj.io.Result.read(str(tmp_path / "hks.npz")).source == str(tmp_path / "hks.npz")
+    for name in ("values", "times", "eigenvalues"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(result, name))
+    for name in ("tensors", "mask", "affine", "spacing", "origin", "slice_axis", *about):
+        np.testing.assert_array_equal(getattr(read.volume, name), getattr(volume, name))
+    assert recorded_boundary(read.settings) == settings["boundary"]
+    assert read.unit == "s"
+    if times.size:
+        np.testing.assert_allclose(read.z, (values - 1) / (0.1 + values))
+    else:
+        assert read.z is None
+
+
+def test_a_result_on_a_mesh_has_no_volume(tmp_path):
+    mesh = hj.examples.ball_mesh(2)
+    values = np.ones((1, len(mesh.vertices)))
+    hj.io.Result(mesh, values, np.array([1.0]), np.zeros(0), {"settings": {}}).save(tmp_path / "hks", "")
+    read = hj.io.Result.read(tmp_path)
+    np.testing.assert_array_equal(read.place.cells, mesh.cells)
+    assert (read.settings, read.unit) == ({}, "")
+    with pytest.raises(ValueError, match=r"hks\.npz: is on a mesh"):
+        read.volume  # noqa: B018

@@ -119,6 +119,12 @@ def test_default_times_span_the_spectrum(pairs):
     assert times[0] * pairs.eigenvalues[-1] == pytest.approx(4 * np.log(10))
     assert times[-1] * pairs.eigenvalues[1] == pytest.approx(4 * np.log(10))
     np.testing.assert_allclose(np.diff(np.log(times)), np.log(times[-1] / times[0]) / 6)
+    shown = hj.default_times(pairs, 7, 0.01)
+    assert shown[0] == pytest.approx(float(times[0]))
+    assert shown[-1] * pairs.eigenvalues[1] == pytest.approx(2 * np.log(10))
+    assert hj.default_times(pairs, 2, 1 - 1e-9)[1] == pytest.approx(float(times[0]))  # not before the first
+    with pytest.raises(ValueError, match="decay: got 1"):
+        hj.default_times(pairs, 2, 1.0)
 
 
 @pytest.mark.slow

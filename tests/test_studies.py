@@ -674,7 +674,7 @@ def test_saved_pairs_give_the_signature_of_other_times_without_another_computati
     assert run(tmp_path / "t.nii.gz", "first", ["1e4"], *arguments, "--save-pairs") == 0
     assert run(tmp_path / "t.nii.gz", "other", ["2e4", "5e4"], *arguments, "--normalisation", "flat") == 0
     with monkeypatch.context() as patch:
-        patch.setattr("hks_jax.cli.job.eigenpairs", None)
+        patch.setattr("hks_jax.eigenpairs", None)
         kept = tmp_path / "first" / "pairs.npz"
         assert run(kept, "again", ["2e4", "5e4"], "--normalisation", "flat", "-q") == 0
         other, again = (np.load(tmp_path / out / "hks.npz") for out in ("other", "again"))

@@ -1,4 +1,14 @@
-"""The command line, ``hks-jax``: errors become one line on stderr and an exit code."""
+"""Heat kernel signatures of tensor fields.
+
+examples:
+  hks-jax demo
+  hks-jax info tensor.nii.gz
+  hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
+  hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
+  hks-jax hks --help
+"""
+
+# The command line, `hks-jax`: errors become one line on stderr and an exit code.
 
 import _thread
 import argparse
@@ -19,15 +29,6 @@ from hks_jax.cli.outputs import show
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
 
-EPILOG = """\
-examples:
-  hks-jax demo
-  hks-jax info tensor.nii.gz
-  hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
-  hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
-  hks-jax hks --help
-"""
-
 COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
 """Each has its help (the docstring), its `OPTIONS`, and `run`, which returns what is to be printed."""
 
@@ -47,12 +48,9 @@ class Parser(argparse.ArgumentParser):
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    parser = Parser(
-        prog="hks-jax",
-        description="Heat kernel signatures of tensor fields.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    raw = argparse.RawDescriptionHelpFormatter
+    description, _, examples = (__doc__ or "").partition("\n\n")
+    parser = Parser(prog="hks-jax", description=description, epilog=examples, formatter_class=raw)
     parser.add_argument("--version", action="version", version=f"hks-jax {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in COMMANDS:

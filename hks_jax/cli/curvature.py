@@ -14,7 +14,6 @@ import argparse
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from hks_jax.cli.job import Settings, describe_input, field_of
 from hks_jax.cli.options import READING
@@ -22,7 +21,7 @@ from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read_volume
 from hks_jax.curvature import gaussian_curvature
-from hks_jax.io import TensorVolume, save
+from hks_jax.io import Result
 from hks_jax.io.formats import WRITTEN
 
 OPTIONS = f"""
@@ -37,7 +36,8 @@ COLOURED = 0.98
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    from hks_jax.plot import save_figure
+    from hks_jax.plot import new_figure, save_figure, scalar_image
+    from hks_jax.plot.signature import cropped, placed, proportion
 
     volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
     if volume.dimension != 2:
@@ -72,23 +72,15 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     volume = volume.with_mask(field.grid.mask)
     stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]
     with writing(args.output, report, progress, lambda: stale) as (folder, done):
-        for suffix in filter(None, (".npz", image_suffix(args.file))):
-            save(folder / f"curvature{suffix}", curvature, volume, name="curvature")
-        save_figure(draw(curvature, volume, args.view), folder / "curvature.png")
+        result = Result(volume, curvature[None], np.zeros(0), np.zeros(0), report, name="curvature")
+        result.save(folder / "curvature", image_suffix(args.file))
+        grid, box = cropped(volume, known)
+        limit = float(np.quantile(np.abs(values), COLOURED)) or 1.0
+        orientation = placed(volume, box, args.view)
+        figure = new_figure(4.8, 3.6 * proportion(grid, orientation) + 0.6)
+        ax, label = figure.subplots(), "in 1/length² of the metric"
+        colours: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "label": label}
+        scalar_image(ax, curvature[box], grid, orientation=orientation, **colours)
+        ax.set_title("Gaussian curvature", fontsize="medium")
+        save_figure(figure, folder / "curvature.png")
     return done
-
-
-def draw(curvature: Float[np.ndarray, "nx ny"], volume: TensorVolume, view: Any) -> Any:
-    """Return the picture: colours on either side of zero, as many as the values reach but for a few."""
-    from hks_jax.plot import new_figure, scalar_image
-    from hks_jax.plot.signature import cropped, placed, proportion
-
-    grid, box = cropped(volume, np.isfinite(curvature))
-    limit = float(np.nanquantile(np.abs(curvature), COLOURED)) or 1.0
-    orientation = placed(volume, box, view)
-    figure = new_figure(4.8, 3.6 * proportion(grid, orientation) + 0.6)
-    ax = figure.subplots()
-    colours: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "label": "in 1/length² of the metric"}
-    scalar_image(ax, curvature[box], grid, orientation=orientation, **colours)
-    ax.set_title("Gaussian curvature", fontsize="medium")
-    return figure

@@ -18,9 +18,9 @@ import numpy as np
 
 from hks_jax.cli.job import Settings, compute_pairs
 from hks_jax.cli.noise import signature_of
-from hks_jax.cli.options import Times
 from hks_jax.cli.outputs import Done, write_outputs
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.values import Times
 from hks_jax.domain import examples
 from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
 
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     times = lengths**2 / np.median(mean[volume.mask])
     chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
     settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
-    result = signature_of(args, volume, *compute_pairs(volume, settings, progress), progress)
+    result = signature_of(args, compute_pairs(volume, settings, progress), progress)
     spread = (rf"($\sqrt{{Dt}}$ ≈ {length:.2g} mm)" for length in lengths)
     titles = [f"$t$ = {number_text(t)} s  {text}" for t, text in zip(times, spread, strict=True)]
     title = (

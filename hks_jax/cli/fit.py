@@ -157,8 +157,8 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     from hks_jax.plot import fit_panels, save_figure
     from hks_jax.plot.signature import placed
 
-    tensors, source = np.asarray(fit.field.domain_tensors), str(args.target)
-    volume = replace(target.volume, tensors=tensors, source=source, digest=digest(source), order="matrix", notes=())
+    volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors), order="matrix", frame="voxel")
+    volume = replace(volume, source=str(args.target), digest=digest(args.target), notes=())
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
     with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):

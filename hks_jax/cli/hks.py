@@ -34,10 +34,11 @@ from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
 from hks_jax.cli.noise import require_spectral, signature_of
-from hks_jax.cli.options import READING, SOLVING, options_in, parse_times, refuse
+from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
+from hks_jax.cli.values import parse_times
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN, is_mesh
@@ -87,20 +88,20 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
     from hks_jax.plot import signature_panels
 
     if saved:
-        volume, field, pairs, settings, image = saved_pairs.read_pairs(args.file, settings, progress)
+        solved, image = saved_pairs.read_pairs(args.file, settings, progress)
+        volume = solved.volume
     else:
         volume, image = read_volume(args, progress), image_suffix(args.file)
     if args.through is not None:
         _check_voxel(args.through, volume)
     if not saved:
-        field, pairs, settings = compute_pairs(volume, settings, progress)
+        solved = compute_pairs(volume, settings, progress)
     if args.save_pairs:  # at once: what comes after may fail, or be interrupted
         with progress.stage("writing", str(args.output / PAIRS)):
-            for file in of_earlier(args.output, np.asarray(pairs.eigenvalues), progress):
+            for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
-            domain = volume.with_mask(field.grid.mask)
-            saved_pairs.write_pairs(args.output / PAIRS, domain, pairs, settings, image, progress.warnings)
-    result = signature_of(args, volume, field, pairs, settings, progress)
+            saved_pairs.write_pairs(args.output / PAIRS, solved, image, progress.warnings)
+    result = signature_of(args, solved, progress)
     drawing = partial(signature_panels, result, view=args.view, through=args.through)
     return write_outputs(args.output, result, progress, drawing, image)
 
@@ -190,9 +191,8 @@ def _tensors(args: argparse.Namespace) -> Float[np.ndarray, "V 3 3"]:
     if values.shape[1] == 6 and args.order is not None:
         return unpack(values, args.order)
     if values.shape[1] != 9 or args.order is not None:
-        raise ValueError(
-            f"--array: {args.array!r} has {values.shape[1]} components; expected nine, or six with their --order"
-        )
+        n = values.shape[1]
+        raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
     return values.reshape(-1, 3, 3)
 
 

@@ -44,10 +44,7 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
     else:
         description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
-    if args.json:
-        print(json.dumps(description, indent=2, ensure_ascii=False))
-    else:
-        print("\n".join(_lines(description)))
+    print(json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description)))
 
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:

@@ -2,28 +2,16 @@
 
 import argparse
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax import (
-    Eigenpairs,
-    Grid,
-    MirrorPencil,
-    Pencil,
-    TensorField,
-    assemble,
-    default_times,
-    eigenpairs,
-    hks,
-    hks_auto,
-    truncation,
-    truncation_map,
-)
-from hks_jax.cli.options import DEFAULT_TIMES, SOLVING, Times, as_options, defaults
+import hks_jax as hj
+from hks_jax.cli.options import SOLVING, as_options, defaults
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.values import DEFAULT_TIMES, Times
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
 from hks_jax.eigen.automatic import choose_solver
@@ -66,6 +54,25 @@ class Settings:
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
 
+class Solved(NamedTuple):
+    """The eigenpairs of a volume or slice, its metric, and the settings with their boundary."""
+
+    volume: TensorVolume
+    field: hj.TensorField
+    pairs: hj.Eigenpairs
+    settings: Settings
+
+    @property
+    def domain(self) -> TensorVolume:
+        """The volume, whose mask is the domain."""
+        return self.volume.with_mask(self.field.grid.mask)
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a report says of the tensors."""
+        return describe_input(self.volume, self.field.grid.mask)
+
+
 def use_dtype(dtype: str) -> None:
     """Let JAX compute in float64 if asked to: the application's choice, made before any array is."""
     if dtype == "float64":
@@ -75,11 +82,11 @@ def use_dtype(dtype: str) -> None:
 def result_of(
     place: TensorVolume | SimplicialMesh,
     described: dict[str, Any],
-    pairs: Eigenpairs,
+    pairs: hj.Eigenpairs,
     settings: Settings,
     progress: Progress,
 ) -> Result:
-    """Compute the signature on a volume, whose mask is the domain, or a mesh, of which the report says `described`."""
+    """Compute the signature on a volume, whose mask is the domain, or on a mesh; `described` goes into the report."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
         values, origin = _signature(pairs, times, settings)
@@ -87,25 +94,21 @@ def result_of(
     return Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report)
 
 
-def automatic_times(pairs: Eigenpairs, n: int) -> tuple[float, ...]:
+def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
     """Return n of `default_times`, up to where all but the constant has decayed to `SHOWN`."""
-    return tuple(np.asarray(default_times(pairs, n, SHOWN), np.float64).tolist())
+    return tuple(np.asarray(hj.default_times(pairs, n, SHOWN), np.float64).tolist())
 
 
-def field_of(volume: TensorVolume, grid: Grid, settings: Settings) -> TensorField:
+def field_of(volume: TensorVolume, grid: hj.Grid, settings: Settings) -> hj.TensorField:
     """Return the metric of a volume or slice on its grid, in the precision asked for."""
     use_dtype(settings.dtype)
-    assert settings.metric is not None
-    tensors = volume.tensors.astype(settings.dtype)
-    return TensorField.from_diffusion(
-        grid, tensors, settings.metric, interpolation=settings.interpolation, name="tensors"
-    )
+    metric, lies, tensors = settings.metric, settings.interpolation, volume.tensors.astype(settings.dtype)
+    assert metric is not None
+    return hj.TensorField.from_diffusion(grid, tensors, metric, interpolation=lies, name="tensors")
 
 
-def compute_pairs(
-    volume: TensorVolume, settings: Settings, progress: Progress
-) -> tuple[TensorField, Eigenpairs, Settings]:
-    """Compute the eigenpairs of a volume or slice; return its metric, them, and the settings with their boundary."""
+def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) -> Solved:
+    """Compute the eigenpairs of a volume or slice."""
     grid, boundary = volume.grid(settings.components), settings.boundary
     if boundary is None:
         boundary, why = default_boundary(grid.inside)
@@ -114,29 +117,29 @@ def compute_pairs(
         for message in unreached_sides(grid.inside, boundary):
             progress.warn(message)
         field = field_of(volume, grid, settings)
-        pencil = assemble(field, boundary)
-    return field, solve(pencil, settings, progress), replace(settings, boundary=boundary)
+        pencil = hj.assemble(field, boundary)
+    return Solved(volume, field, solve(pencil, settings, progress), replace(settings, boundary=boundary))
 
 
-def solve(pencil: Pencil | MirrorPencil, settings: Settings, progress: Progress) -> Eigenpairs:
+def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Progress) -> hj.Eigenpairs:
     """Compute eigenpairs; raise ComputationError unless all of them converged."""
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     name = choose_solver(settings.solver, pencil.parts[0], k).name
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {name}"):
-        pairs = eigenpairs(pencil, k, solver=settings.solver, progress=progress.update)
+        pairs = hj.eigenpairs(pencil, k, solver=settings.solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])
     return pairs
 
 
-def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
+def _signature(pairs: hj.Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the signature and, where methods were chosen from, what the report says of the choice."""
     if settings.method != "auto":
-        return np.asarray(hks(pairs, times, settings.normalisation, settings.method)), {}
-    result = hks_auto(pairs, times, settings.normalisation)
+        return np.asarray(hj.hks(pairs, times, settings.normalisation, settings.method)), {}
+    result = hj.hks_auto(pairs, times, settings.normalisation)
     origin: dict[str, Any] = {"eigenpairs": [], result.method: [], "agreement": None}
     for t, spectral in zip(times, np.asarray(result.spectral), strict=True):
         origin["eigenpairs" if spectral else result.method].append(t)
@@ -145,9 +148,9 @@ def _signature(pairs: Eigenpairs, times: tuple[float, ...], settings: Settings) 
     return np.asarray(result.values), {"method": {name: value for name, value in origin.items() if name != "none"}}
 
 
-def _report(settings: Settings, pairs: Eigenpairs, times: tuple[float, ...]) -> dict[str, Any]:
-    estimate = truncation(pairs, jnp.asarray(times))
-    by_node = np.asarray(truncation_map(pairs, jnp.asarray(times))).reshape(len(times), -1)
+def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) -> dict[str, Any]:
+    estimate = hj.truncation(pairs, jnp.asarray(times))
+    by_node = np.asarray(hj.truncation_map(pairs, jnp.asarray(times))).reshape(len(times), -1)
     columns = {
         "t": times,
         "truncation": estimate.tail,
@@ -181,7 +184,7 @@ def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, A
     }
 
 
-def describe_pairs(pairs: Eigenpairs) -> dict[str, Any]:
+def describe_pairs(pairs: hj.Eigenpairs) -> dict[str, Any]:
     """Return what a report says of eigenpairs."""
     values = np.asarray(pairs.eigenvalues)
     return {

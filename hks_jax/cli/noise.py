@@ -10,21 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax import (
-    AccuracyWarning,
-    Eigenpairs,
-    TensorField,
-    TensorNoise,
-    Uncertainty,
-    boundary_influence,
-    eigenpairs,
-    hks,
-    uncertainty,
-)
-from hks_jax.cli.job import Settings, automatic_times, describe_input, result_of
-from hks_jax.cli.options import Times
+import hks_jax as hj
+from hks_jax.cli.job import Solved, automatic_times, result_of
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
+from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 
@@ -52,27 +42,18 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
         return None
     try:
         float(args.noise)
+        return None
     except ValueError:
         return argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
-    return None
 
 
-def signature_of(
-    args: argparse.Namespace,
-    volume: TensorVolume,
-    field: TensorField,
-    pairs: Eigenpairs,
-    settings: Settings,
-    progress: Progress,
-) -> Result:
-    """Compute the signature of a volume or slice whose metric and eigenpairs are known, with error bars if asked to."""
-    mask = field.grid.mask
-    place, described = volume.with_mask(mask), describe_input(volume, mask)
+def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -> Result:
+    """Compute the signature of a volume or slice whose eigenpairs are known, with error bars if asked to."""
     if getattr(args, "noise", None) is None:
-        return result_of(place, described, pairs, settings, progress)
-    bars, maps, interior, times = _error_bars(args, volume, field, pairs, settings, progress)
-    settings = replace(settings, times=Times(times, settings.times.automatic))
-    result = result_of(place, described, pairs, settings, progress)
+        return result_of(solved.domain, solved.described, solved.pairs, solved.settings, progress)
+    bars, maps, interior, times = _error_bars(args, solved, progress)
+    settings = replace(solved.settings, times=Times(times, solved.settings.times.automatic))
+    result = result_of(solved.domain, solved.described, solved.pairs, settings, progress)
     ratio = np.asarray(bars.signal_to_noise_at(interior))
     nodes = np.isfinite(np.asarray(bars.value[0])).sum()
     clear = np.flatnonzero(ratio > _CLEAR)
@@ -91,54 +72,49 @@ def signature_of(
     return replace(result, arrays=arrays, report={**result.report, "noise": report})
 
 
-def _noise(args: argparse.Namespace, volume: TensorVolume, field: TensorField, progress: Progress) -> TensorNoise:
+def _noise(args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progress: Progress) -> hj.TensorNoise:
     """Return the noise that the arguments name."""
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: residuals are those of a fit to diffusion-weighted images (--bval, --bvec)")
-        return TensorNoise(volume.covariance, field.grid)
+        return hj.TensorNoise(volume.covariance, grid)
     if args.noise == "roughness":
-        return TensorNoise.from_roughness(volume.tensors, field.grid)
-    second = second_scan(args)
-    if second is not None:
-        return TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, field.grid)
-    return TensorNoise.relative(volume.tensors, float(args.noise), field.grid)
+        return hj.TensorNoise.from_roughness(volume.tensors, grid)
+    if (second := second_scan(args)) is not None:
+        return hj.TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, grid)
+    return hj.TensorNoise.relative(volume.tensors, float(args.noise), grid)
 
 
 def _error_bars(
-    args: argparse.Namespace,
-    volume: TensorVolume,
-    field: TensorField,
-    pairs: Eigenpairs,
-    settings: Settings,
-    progress: Progress,
-) -> tuple[Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
+    args: argparse.Namespace, solved: Solved, progress: Progress
+) -> tuple[hj.Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
     """Return error bars, the noise (n_draws, n_times, *shape) of which they are made, the interior, and the times.
 
     The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
     few such nodes; else it is all of the domain. Automatic times begin where there is signal.
     """
-    noise, wanted = _noise(args, volume, field, progress), settings.times.automatic
+    volume, field, pairs, settings = solved
+    noise, wanted = _noise(args, volume, field.grid, progress), settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
     maps: list[np.ndarray] = []
 
     def signature(D: Any) -> Any:
         assert settings.metric is not None
         assert settings.boundary is not None
-        metric = TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
-        return hks(eigenpairs(metric, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
+        metric = hj.TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
+        return hj.hks(hj.eigenpairs(metric, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
 
     def keep(one: Any) -> None:
         maps.append(np.asarray(one, np.float32))
 
     with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", AccuracyWarning)  # of times that are not chosen, too
+        warnings.simplefilter("ignore", hj.AccuracyWarning)  # of times that are not chosen, too
         tensors, more = volume.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
-        bars = uncertainty(signature, tensors, noise, method="resample", progress=progress.update, **more)
+        bars = hj.uncertainty(signature, tensors, noise, method="resample", progress=progress.update, **more)
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:
             nodes = interior[0].sum()
-            interior &= np.asarray(boundary_influence(pairs, times)) < _RIM
+            interior &= np.asarray(hj.boundary_influence(pairs, times)) < _RIM
             interior[interior.reshape(len(times), -1).sum(axis=1) < _LEAST * nodes] = False
     chosen = np.arange(len(times))
     if not settings.times.explicit:

@@ -7,22 +7,15 @@ the options of a command (`OPTIONS` in its module, whose docstring is the help).
 """
 
 import argparse
-import math
-import os
 import re
-from argparse import ArgumentTypeError
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from hks_jax.domain.tensor_checks import MAPS
-from hks_jax.eigen.automatic import SOLVERS
-from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.io import ORDERS, UNITS
+from hks_jax.cli.values import KINDS
 from hks_jax.io.formats import SUFFIXES, WRITTEN
 from hks_jax.io.mesh import READ as MESHES
-from hks_jax.io.repair import REPAIRS
 
 FORMATS = ", ".join(SUFFIXES)
 
@@ -129,124 +122,10 @@ file FILE...
 """
 
 
-def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return what reads a text, and says what was expected where `read` returns None."""
-
-    def parse(text: str) -> Any:
-        if (value := read(text)) is None:
-            raise ArgumentTypeError(f"got {text!r}; expected {expected}")
-        return value
-
-    return parse
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    """Read finite numbers between commas; none where there is anything else."""
-    try:
-        numbers = tuple(map(float, text.split(",")))
-    except ValueError:
-        return ()
-    return numbers if all(map(math.isfinite, numbers)) else ()
-
-
-def _repair(text: str) -> tuple[str, float | None] | None:
-    name, colon, number = text.partition(":")
-    floor = _numbers(number) if colon else (None,)
-    return (name, floor[0]) if name in REPAIRS and len(floor) == 1 and (floor[0] is None or floor[0] > 0) else None
-
-
-def _positive(text: str) -> tuple[str, float] | None:
-    name, _, number = text.partition(":")
-    values = _numbers(number)
-    return (name, values[0]) if name in MAPS and len(values) == 1 and (name != "exp" or values[0] > 0) else None
-
-
-def parse_boundary(text: str) -> BoundarySpec:
-    """Read ``neumann``; ``neumann,periodic`` (one per axis); ``neumann:dirichlet,periodic`` (low side, high side)."""
-    entries = []
-    for entry in text.split(","):
-        low, colon, high = entry.partition(":")
-        entries.append((low, high) if colon else low)
-    return entries[0] if len(entries) == 1 and isinstance(entries[0], str) else tuple(entries)
-
-
-class Times(NamedTuple):
-    """Explicit times, or the number of automatic ones."""
-
-    explicit: tuple[float, ...]
-    automatic: int
-
-
-DEFAULT_TIMES = Times((), 6)
-
-
-def parse_times(words: list[str] | None) -> Times:
-    """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``."""
-    text = ",".join(piece for word in words or ["auto"] for piece in word.split(",") if piece)
-    if auto := re.fullmatch(r"auto(?::0*([1-9]\d*))?", text):
-        return Times((), int(auto[1])) if auto[1] else DEFAULT_TIMES
-    times = _numbers(text)
-    if not times or min(times) <= 0:
-        raise ValueError(f"--times: got {' '.join(words or ())!r}; expected positive numbers, or auto, or auto:N")
-    return Times(tuple(sorted(times)), 0)
-
-
-def parse_folder(text: str) -> Path:
-    """Return a path, if it is a folder that may be written, or could become one."""
-    path = Path(text)
-    nearest = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-    if not nearest.is_dir():
-        raise ArgumentTypeError(f"{nearest} is a file; expected a folder, or a name that is free")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ArgumentTypeError(f"{nearest} may not be written; choose another folder")
-    return path
-
-
-def parse_target(text: str) -> Path:
-    """Return the path of a file, if its folder may be written."""
-    return parse_folder(os.path.dirname(text) or ".") / os.path.basename(text)
-
-
-_KINDS: dict[str, Callable[[str], Any] | Iterable[str]] = {
-    **dict.fromkeys(("FILE", "RESULT", "SUBJECTS", "TARGET"), Path),
-    **dict.fromkeys(("OUT", "DIR"), parse_folder),
-    **dict.fromkeys(("TABLE", "PAGE", "PICTURE"), parse_target),
-    **dict.fromkeys(("N", "K"), int),
-    **dict.fromkeys(("H", "C", "B", "DPI", "SIGMA", "LENGTH"), float),
-    "AXIS=N": _reader(
-        "an axis and an index from 0, such as z=14",
-        lambda text: (found[1], int(found[2])) if (found := re.fullmatch(r"([xyz])=(\d+)", text)) else None,
-    ),
-    "I,J,K": _reader(
-        "three indices from 0, such as 64,64,14",
-        lambda text: tuple(map(int, text.split(","))) if re.fullmatch(r"\d+,\d+,\d+", text) else None,
-    ),
-    "X,Y": _reader("coordinates, such as 1.5,2", lambda text: x if len(x := _numbers(text)) in (2, 3) else None),
-    "Q,Q": _reader(
-        "two numbers from 0 to 1, such as 0.01,0.99",
-        lambda text: x if len(x := _numbers(text)) == 2 and 0 <= x[0] < x[1] <= 1 else None,
-    ),
-    "R": _reader(
-        "own, shared, or two ascending numbers LOW,HIGH",
-        lambda t: t if t in ("own", "shared") else x if len(x := _numbers(t)) == 2 and x[0] < x[1] else None,
-    ),
-    "WEIGHT": _reader("a positive number", lambda text: x[0] if len(x := _numbers(text)) == 1 and x[0] > 0 else None),
-    "HOW[:FLOOR]": _reader(f"{', '.join(REPAIRS)}, or one with a floor, such as clip:1e-4", _repair),
-    "HOW:NUMBER": _reader(
-        "exp:S for exp(T/S), or shift:C for T + C·I, with a number in the tensors' units, such as exp:2e6", _positive
-    ),
-    "CONDITION": parse_boundary,
-    **{"ORDER": ORDERS, "UNIT": UNITS, "SOLVER": ("auto", *SOLVERS)},
-}
-"""What the words of the table stand for: how a text is read, or what it may be. All others are texts."""
-
-
 class _FirstAndOthers(argparse.Action):
     """Keeps the first of several files apart from the others."""
 
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, *_option: Any
-    ) -> None:
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, *_option: Any) -> None:
         namespace.file, namespace.others = values[0], values[1:]
 
 
@@ -270,7 +149,7 @@ class Option(NamedTuple):
             settings["required"], word = True, word[:-1]
         if word.endswith("..."):
             settings["nargs"], word = "+", word[:-3]
-        kind = word.split("|") if "|" in word else _KINDS.get(word, str)
+        kind = word.split("|") if "|" in word else KINDS.get(word, str)
         if flags == "output":  # a file, of convert
             kind = Path
         if not word:
@@ -383,19 +262,18 @@ _LISTS = {"meshes": MESHES, "written": WRITTEN, "files": FILES, "columns": COLUM
 
 def add_command(subparsers: Any, command: ModuleType) -> argparse.ArgumentParser:
     """Add the parser of a command; its help is the docstring of its module."""
-    assert command.__doc__ is not None
     lists = {name: ", ".join(words) for name, words in _LISTS.items()}
-    summary, _, text = command.__doc__.format(**lists).partition("\n\n")
-    description, examples = re.split(r"\n(?=examples?:)", text)
+    summary, _, text = (command.__doc__ or "").format(**lists).partition("\n\n")
+    description, *examples = re.split(r"\n(?=examples?:)", text)
     given = options_in(command.OPTIONS)
     usage = [o.settings["metavar"] for o in given if not o.flags[0].startswith("-")]
     usage += [f"{o.flags[0]} {o.settings['metavar']}" for o in given if o.settings.get("required")]
     parser: argparse.ArgumentParser = subparsers.add_parser(
         command.__name__.rpartition(".")[2],
-        help=summary[0].lower() + summary[1:].rstrip("."),
+        help=summary[:1].lower() + summary[1:].rstrip("."),
         usage=" ".join(["%(prog)s", *usage, "[options]"]),
         description=description,
-        epilog=examples,
+        epilog="".join(examples),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     # What begins with a minus and a digit is a point, such as -20,35, and no option.

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.job import Settings, field_of
+from hks_jax import assemble
+from hks_jax.cli.job import Settings, Solved, field_of
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.assembly import assemble
 from hks_jax.io.arrays import place_of
 from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.io.result import plain, recorded_boundary
@@ -46,24 +44,17 @@ def check_options(args: argparse.Namespace) -> None:
     refuse(args, (*settled, "save_pairs"), why)
 
 
-def write_pairs(
-    path: Path,
-    volume: TensorVolume,
-    pairs: Eigenpairs,
-    settings: Settings,
-    image: str,
-    warnings: Sequence[str],
-    fingerprint: str = "",
-) -> None:
+def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with what was settled in computing them.
 
-    The suffix of images and the warnings come back with them; the fingerprint says what those of a study's subject were
-    computed from.
+    The suffix of images and the warnings are read back, too. The fingerprint identifies the files and settings of a
+    study's subject.
     """
+    volume, settings = solved.domain, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}
     record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
-    record["settings"] = {name: value for name, value in asdict(settings).items() if name in _SETTLED}
-    save_pairs(path, pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
+    record["settings"] = {name: settings[name] for name in settings if name in _SETTLED}
+    save_pairs(path, solved.pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
 
 
 def are_of(path: Path, fingerprint: str) -> bool:
@@ -74,20 +65,13 @@ def are_of(path: Path, fingerprint: str) -> bool:
         return bool(json.loads(str(arrays[_RECORD]))["fingerprint"] == fingerprint)
 
 
-def read_pairs(
-    path: Path, settings: Settings, progress: Progress
-) -> tuple[TensorVolume, TensorField, Eigenpairs, Settings, str]:
-    """Return the volume, its metric, the pairs, the settings with those that are settled, and the suffix of images."""
+def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solved, str]:
+    """Return the eigenpairs, where the settings that are settled are theirs, and the suffix of images."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
-    volume = TensorVolume(
-        arrays["tensors"],
-        tuple(arrays["spacing"].tolist()),
-        tuple(arrays["origin"].tolist()),
-        arrays.get("mask"),
-        arrays.get("affine"),
-        **{name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])},
-    )
+    spacing, origin = (tuple(arrays[name].tolist()) for name in ("spacing", "origin"))
+    about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}
+    volume = TensorVolume(arrays["tensors"], spacing, origin, arrays.get("mask"), arrays.get("affine"), **about)
     boundary = recorded_boundary(record["settings"])
     assert boundary is not None
     settings = replace(settings, **{**record["settings"], "boundary": boundary})
@@ -96,4 +80,4 @@ def read_pairs(
     with progress.stage("assembly"):
         field = field_of(volume, volume.grid("all"), settings)
         pairs = pairs_of(str(path), arrays, assemble(field, boundary))
-    return volume, field, pairs, settings, record["image"]
+    return Solved(volume, field, pairs, settings), record["image"]

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.options import parse_times, refuse
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
+from hks_jax.cli.values import parse_times
 from hks_jax.io.result import Result
 from hks_jax.signatures.suitable import RESOLVED
 
@@ -126,26 +127,17 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot.signature import placed
 
     values, volume = result.values, result.volume
-    grid, d, limit = result.grid, volume.dimension, None
+    grid, d = result.grid, volume.dimension
     orientation = placed(volume, None, "neurological")
     if orientation is not None:  # points have the coordinates that the images show
         values, grid = orientation.array(values), orientation.grid(grid)
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates each")
+    style = {"scaled": args.scaled, "cmap": args.cmap, "unit": args.unit or ""}
     if result.eigenvalues.size:
-        limit = RESOLVED[d] / float(result.eigenvalues[-1])
+        style["limit"] = RESOLVED[d] / float(result.eigenvalues[-1])
     figure = new_figure(5.4, 4.0)
-    hks_curves(
-        figure.subplots(),
-        values,
-        result.times,
-        grid,
-        args.points,
-        limit=limit,
-        scaled=args.scaled,
-        cmap=args.cmap,
-        unit=args.unit or "",
-    )
+    hks_curves(figure.subplots(), values, result.times, grid, args.points, **style)
     if args.title:
         figure.suptitle(args.title)
     return figure

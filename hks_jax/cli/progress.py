@@ -89,7 +89,9 @@ class Progress:
 
     def note(self, text: str) -> None:
         """Say something that is no warning."""
-        self._print(text)
+        if not self.quiet:
+            self._close_line()
+            print(f"[{time.perf_counter() - self._start:7.1f} s] {text}", file=self.stream, flush=True)
 
     def warn(self, message: str) -> None:
         """Show a warning, once; also where progress is not shown."""
@@ -138,11 +140,6 @@ class Progress:
             shown = f"{bar(done)} {remaining}, {self._text}, {self._stage}"
         return f"[{now - self._start:7.1f} s] {shown}"
 
-    def _print(self, text: str) -> None:
-        if not self.quiet:
-            self._close_line()
-            print(f"[{time.perf_counter() - self._start:7.1f} s] {text}", file=self.stream, flush=True)
-
     def _close_line(self) -> None:
         with self._lock:
             if self._open_line:
@@ -171,18 +168,13 @@ class StudyProgress(Progress):
         if self._on_terminal:
             self._draw()
         else:
-            self._print(f"{self.line()}: {name}")
+            super().note(f"{self.line()}: {name}")
         try:
             yield
         finally:
             self._spent += time.perf_counter() - begun
             self.ended += 1
             self._subject = ""
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the beginning."""
-        return time.perf_counter() - self._start
 
     def line(self) -> str:
         """Return the bar, how many of how many are done, and the time left where one was computed already."""
@@ -198,7 +190,7 @@ class StudyProgress(Progress):
 
     def end(self, text: str) -> None:
         """Say how a subject, or the study, ended."""
-        self._print(text)
+        super().note(text)
 
     def _line(self) -> str:
         shown = ", ".join(filter(None, (self._stage, self._text)))

@@ -90,15 +90,8 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
         refuse(args, ("b_max",), "it is for diffusion-weighted images; pass --bval and --bvec too")
         refuse(args, ("bvec_frame",), "it is for diffusion-weighted images; of tensors pass --frame")
         spacing = args.spacing[0] if args.spacing is not None and len(args.spacing) == 1 else args.spacing
-        volume = read_tensors(
-            [args.file, *args.others] if args.others else args.file,
-            args.order,
-            frame=args.frame,
-            array=args.array,
-            spacing=spacing,
-            confidence=args.confidence,
-            unit=args.unit,
-        )
+        files, names = [args.file, *args.others] if args.others else args.file, ("frame", "array", "confidence", "unit")
+        volume = read_tensors(files, args.order, spacing=spacing, **{name: getattr(args, name) for name in names})
         return volume, None if args.mask is None else read_mask(args.mask, volume.affine)
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; --bval and --bvec belong to one file of all images")
@@ -107,11 +100,9 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
     refuse(args, ("frame",), "it is for files of tensors; pass --bvec-frame")
     refuse(args, ("order", "array", "spacing"), "it is for files of tensors; leave it out with --bval and --bvec")
     noise: Literal["residuals"] | None = "residuals" if getattr(args, "noise", None) == "residuals" else None
-    frame: Any = args.bvec_frame or "fsl"
-    fitted = fit_dwi(
-        args.file, args.bval, args.bvec, args.mask, args.b_max, bvec_frame=frame, unit=args.unit, noise=noise
-    )
-    return fitted, None
+    axes: dict[str, Any] = {"bvec_frame": args.bvec_frame or "fsl"}
+    files = (args.file, args.bval, args.bvec, args.mask)
+    return fit_dwi(*files, args.b_max, unit=args.unit, noise=noise, **axes), None
 
 
 def _without_filling(volume: TensorVolume, background: str | None, progress: Progress) -> TensorVolume:

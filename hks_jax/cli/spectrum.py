@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
+from hks_jax.cli.job import Settings, compute_pairs, describe_pairs
 from hks_jax.cli.options import READING, SOLVING
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
@@ -35,7 +35,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
     volume = read_volume(args, progress)
     settings = Settings.of(args, boundary=args.boundary or "neumann")
-    field, pairs, settings = compute_pairs(volume, settings, progress)
+    solved = compute_pairs(volume, settings, progress)
+    field, pairs = solved.field, solved.pairs
     columns: dict[str, Any] = {
         "eigenvalues": np.asarray(pairs.eigenvalues),
         "residuals": np.asarray(pairs.residuals),
@@ -43,8 +44,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     }
     left_out = ("times", "normalisation", "method")
     report = {
-        "input": describe_input(volume, field.grid.mask),
-        "settings": {name: value for name, value in asdict(settings).items() if name not in left_out} | {"k": pairs.k},
+        "input": solved.described,
+        "settings": {name: value for name, value in asdict(solved.settings).items() if name not in left_out}
+        | {"k": pairs.k},
         "eigenpairs": describe_pairs(pairs),
         "volume": np.asarray(pairs.pencil.volume).item(),
         "eigenvalues": columns["eigenvalues"].tolist(),

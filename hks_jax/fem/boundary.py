@@ -74,8 +74,10 @@ def _pair(entry: str | Sides) -> Sides:
 def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     """Return the boundary that suits a domain, and why: the mean where it has a mask, whose rim else covers all.
 
+    The command line takes it where none is asked for; the functions of the library take ``"neumann"``.
+
     Args:
-        inside: the nodes of the domain.
+        inside: (*shape) the nodes of the domain, as `Grid.inside`.
     """
     if inside.all():
         return "neumann", "the domain has no mask"

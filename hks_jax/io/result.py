@@ -1,7 +1,8 @@
-"""A result: computed and saved by some commands, read back and drawn, explored, tabulated or fitted by others."""
+"""Results: what is computed and saved, to be read back and drawn, explored, tabulated or fitted."""
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,13 +26,14 @@ class Result:
     """A signature, or another scalar field, on a volume or slice whose mask is the domain, or on a mesh.
 
     Attributes:
-        place: the volume or slice, or the mesh. The tensors of a file that has none are unit ones.
+        place: the volume or slice, or the mesh. Where a file has no tensors they are the identity.
         values: (n_times, *shape).
         times: (n_times,), or (0,) for a result without.
         eigenvalues: (k,), or (0,) where they are not known.
         report: what is known about it; ``settings`` are those of the computation.
         arrays: more arrays by name, which are saved with it: ``deviation``, ``bias`` and ``noise_maps`` (n_draws,
-            n_times, *shape) of error bars; ``scaled_times`` λ₁t; ``input_tensors``, those of which it is.
+            n_times, *shape) of error bars; ``scaled_times`` λ₁t; ``input_tensors``, where they are known.
+        name: ``"hks"`` or ``"curvature"``.
         source: the file that it was read from.
     """
 
@@ -41,10 +43,11 @@ class Result:
     eigenvalues: Float[np.ndarray, " k"]
     report: Mapping[str, Any]
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    name: str = "hks"
     source: str = ""
 
     @classmethod
-    def read(cls, path: Path, name: str | None = None, over_times: bool = False) -> "Result":
+    def read(cls, path: str | os.PathLike[str], name: str | None = None, over_times: bool = False) -> "Result":
         """Read a result that `save` or the command line wrote as npz.
 
         Args:
@@ -56,7 +59,7 @@ class Result:
             FileNotFoundError: no such file.
             ValueError: no npz; arrays that are missing or of shapes that disagree.
         """
-        path = signature_file(path)
+        path = signature_file(Path(path))
         arrays = load_npz(path)
         name = name or next((n for n in NAMES if n in arrays), " or ".join(NAMES))
         on_mesh = "vertices" in arrays and ("faces" in arrays or "cells" in arrays)
@@ -86,24 +89,30 @@ class Result:
             place = SurfaceMesh(arrays["vertices"], arrays["faces"])
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
         more = {n: a for n, a in arrays.items() if n in ("deviation", "noise_maps", "scaled_times", "input_tensors")}
-        return cls(place, values, times, eigenvalues, report, more, str(path))
+        return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:
         """Write it as `stem` with ``.npz`` after it and, unless that is empty, with the suffix of an image or a mesh.
 
-        The former also has the times, the eigenvalues, the tensors that it is of, and all other arrays. Where the
-        tensors are of single precision the values are, too: more digits mean nothing and take room.
-        The files say the settings, the times, and the rest of their origin that is given.
+        The npz also has the times, the eigenvalues, the tensors, and all other arrays. Where the tensors
+        are of single precision the values are, too: more digits mean nothing and take room.
+
+        Args:
+            stem: the files' path without a suffix.
+            image: the suffix; see `hks_jax.io.save`.
+            origin: what the files say of its origin beside the settings and the times.
         """
-        origin = {**(origin or {}), "settings": plain(self.settings), "times": self.times}
         single = isinstance(self.place, TensorVolume) and self.place.tensors.dtype == np.float32
         values = self.values.astype(np.float32) if single else self.values
-        extra = {"times": self.times, "eigenvalues": self.eigenvalues, **self.arrays}
+        times = {"times": self.times} if self.times.size else {}
+        extra = {**times, **({"eigenvalues": self.eigenvalues} if self.eigenvalues.size else {}), **self.arrays}
+        record = {**(origin or {}), "settings": plain(self.settings), **times}
         for suffix in filter(None, (".npz", image)):
-            given: dict[str, Any] = {"times": self.times} if suffix == ".nii.gz" else extra
+            given: dict[str, Any] = times if suffix.startswith(".nii") else extra
             if suffix == ".npz" and isinstance(self.place, TensorVolume):
                 given = {**extra, "input_tensors": self.place.tensors.astype(np.float32)}
-            save(stem.with_name(stem.name + suffix), values, self.place, name="hks", extra=given, provenance=origin)
+            path, shown = stem.with_name(stem.name + suffix), values if self.times.size else values[0]
+            save(path, shown, self.place, name=self.name, extra=given, provenance=record)
 
     @property
     def volume(self) -> TensorVolume:
@@ -185,6 +194,8 @@ def _volume(
         None if affine is None else affine.astype(np.float64),
         int(arrays["slice_axis"]) if "slice_axis" in arrays else None,
         order=record.get("order", "matrix"),
+        frame=record.get("frame", "voxel"),
         notes=tuple(record.get("notes", ())),
         source=record.get("source") or "",
+        digest=record.get("sha256") or "",
     )

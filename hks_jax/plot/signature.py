@@ -1,11 +1,12 @@
 """The picture of a result: the signature over t, cropped to the domain and placed in space."""
 
 import math
+import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
 from scipy import ndimage
 
 from hks_jax import Grid
@@ -34,15 +35,15 @@ RIM = 5
 
 def signature_panels(
     result: Result,
-    path: Path,
+    path: str | os.PathLike[str] | None = None,
     *,
     titles: Sequence[str] | None = None,
     first: tuple[str, Float[np.ndarray, "*shape"]] | None = None,
     title: str = "",
     view: View = "neurological",
     through: tuple[int, int, int] | None = None,
-) -> None:
-    """Draw a signature for each time, with its own colours: the slice, or three orthogonal slices of a volume.
+) -> Figure:
+    """Return a figure of a signature for each time, with its own colours: a slice, or three slices of a volume.
 
     The colours span the values away from the boundary; arrows at a colour bar's ends say that some lie beyond. Under
     "flat" normalisation they diverge from 1, which the signature is where the metric is flat. With error bars, what
@@ -50,12 +51,15 @@ def signature_panels(
 
     Args:
         result: what to draw.
-        path: the picture's file.
+        path: where to save the figure; None: nowhere.
         titles: of a slice, one per time; None: “t = …”.
         first: a title and a scalar (*shape,), drawn before the signature of a slice in grey.
         title: of the whole picture of a slice.
-        view: what is on the left, see `placed`.
+        view: what lies in space has left on the left (``"neurological"``) or on the right (``"radiological"``).
         through: the voxel that slices run through, or the nearest one in the domain; None: one in the middle.
+
+    Raises:
+        ValueError: a result on a mesh.
     """
     volume, inside, z = result.volume, np.isfinite(result.values[0]), result.z
     grid, box = cropped(volume, inside)
@@ -64,7 +68,7 @@ def signature_panels(
     colours = _colours(result, inside)
     if volume.dimension == 3:
         node = None if through is None else _nearest(inside, through)
-        volume_panels(
+        return volume_panels(
             values,
             result.times,
             grid,
@@ -77,7 +81,6 @@ def signature_panels(
             z=z,
             path=path,
         )
-        return
     inside = inside[box]
     titles = titles or [f"$t$ = {number_text(t)} {result.unit}".rstrip() for t in result.times]
     faded = [None] * len(values) if z is None else list(z)
@@ -98,7 +101,9 @@ def signature_panels(
         ax.remove()
     if title:
         figure.suptitle(title)
-    save_figure(figure, path)
+    if path is not None:
+        save_figure(figure, path)
+    return figure
 
 
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:

@@ -16,7 +16,7 @@ DEFAULT_K = {2: 200, 3: 100}
 RESOLVED = {2: 4.6, 3: 5.7}
 """λ_k·t, by dimension, from which on the pairs beyond k are 1 % of the signature (see `hks_jax.truncation`)."""
 SHOWN = 1e-2
-"""To how much all but the constant has decayed at the largest time: a picture still shows it."""
+"""All but the constant has decayed to this at the largest time; a picture still shows it."""
 LAST = -math.log(SHOWN)
 """λ₁·t at that time."""
 COARSE = 6.0
@@ -24,7 +24,7 @@ COARSE = 6.0
 
 
 def default_k(dimension: int, unknowns: int) -> int:
-    """Return how many eigenpairs are computed unless it is said: `DEFAULT_K`, or a quarter of few unknowns."""
+    """Return the default number of eigenpairs: `DEFAULT_K`, or a quarter of the unknowns where these are few."""
     return max(1, min(DEFAULT_K[dimension], unknowns // 4))
 
 

@@ -86,6 +86,8 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
     """
     if n < 1:
         raise ValueError(f"n: got {n}; expected at least 1")
+    if not 0 < decay < 1:
+        raise ValueError(f"decay: got {decay}; expected a number between 0 and 1")
     first, last = positive_range(pairs)
     end = jnp.minimum(last, first * (math.log(1e-4) / math.log(decay)))
     return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, end, n)

@@ -42,12 +42,13 @@ import numpy as np
 from hks_jax.cli.info import describe
 from hks_jax.cli.job import ComputationError, Settings
 from hks_jax.cli.noise import require_spectral, second_scan
-from hks_jax.cli.options import READING, SOLVING, Times, parse_times, refuse
+from hks_jax.cli.options import READING, SOLVING, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.cli.study.folder import MAP, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
+from hks_jax.cli.values import Times, parse_times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import recorded_boundary
 from hks_jax.io.tables import read_json
@@ -75,10 +76,8 @@ def run(args: argparse.Namespace, _: Progress) -> None:
     from hks_jax.cli.study.tasks import run_all
 
     if second_scan(args) is not None:
-        raise ValueError(
-            f"--noise: {args.noise} is a scan of one subject; expected a number, residuals or roughness. Second scans "
-            "belong into a column noise of the table"
-        )
+        why = "is a scan of one subject; expected a number, residuals or roughness"
+        raise ValueError(f"--noise: {args.noise} {why}. Second scans belong into a column noise of the table")
     args.strict_unit = True
     times, settle = parse_times(args.times), args.boundary is None
     if settle:  # subjects are compared, and so have the same boundary, with or without a mask
@@ -116,10 +115,9 @@ def run(args: argparse.Namespace, _: Progress) -> None:
 
 
 def _is_there(study: Study, subject: Subject) -> bool:
-    try:
+    with suppress(Exception):
         return study.has(subject, MAP, study.fingerprint(subject))
-    except Exception:
-        return False
+    return False
 
 
 def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:

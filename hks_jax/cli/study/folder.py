@@ -15,9 +15,10 @@ from hks_jax import __version__
 from hks_jax.atomic import atomic_folder, atomic_path
 from hks_jax.cli.job import Settings
 from hks_jax.cli.noise import second_scan
-from hks_jax.cli.options import COLUMNS, Times
+from hks_jax.cli.options import COLUMNS
 from hks_jax.cli.reading import image_suffix
 from hks_jax.cli.study.subjects import Subject
+from hks_jax.cli.values import Times
 from hks_jax.io.components import is_one_of_six, siblings
 from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import is_nifti, sidecar_of
@@ -175,10 +176,7 @@ class Study:
     def write_group(self, subjects: list[Subject], problems: Mapping[str, str], with_regions: bool) -> list[Path]:
         """Write the table of all subjects and, of those that are done, that of all regions; return their paths.
 
-        Args:
-            subjects: in the order of the table.
-            problems: by the names of those that are not done, why.
-            with_regions: whether there are regions.
+        Of the others, `problems` says by their names why they are not done.
         """
         n = 1 + any(subject.session for subject in subjects)
         head, ids = ("participant_id", "session_id")[:n], {s.name: (s.participant, s.session)[:n] for s in subjects}
@@ -201,10 +199,9 @@ def reading_options(args: argparse.Namespace) -> dict[str, Any]:
 
     A second scan is one of the files, and said to be one alone: its path may change.
     """
-    reading = {option: getattr(args, option.replace("-", "_")) for option in COLUMNS}
-    if args.noise is None:
-        return {option: value for option, value in reading.items() if option not in ("noise", "draws")}
-    return {**reading, "noise": args.noise if second_scan(args) is None else "file"}
+    names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
+    reading = {option: getattr(args, option.replace("-", "_")) for option in names}
+    return reading if second_scan(args) is None else {**reading, "noise": "file"}
 
 
 def times_text(unit: str) -> str:

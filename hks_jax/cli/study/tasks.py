@@ -12,19 +12,17 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hks_jax import Eigenpairs, TensorField
 from hks_jax.atomic import claim
 from hks_jax.cli import INPUT_ERRORS
-from hks_jax.cli.job import ComputationError, compute_pairs
+from hks_jax.cli.job import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import signature_of
-from hks_jax.cli.options import Times
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.progress import StudyProgress, duration
 from hks_jax.cli.reading import image_suffix, read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
-from hks_jax.io import TensorVolume
+from hks_jax.cli.values import Times
 from hks_jax.io.tables import write_table
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
@@ -42,7 +40,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
     Other processes with the same study share the work: each subject is computed by the one that comes to it first. One
     that begins the study anew, with other settings, makes this one raise ValueError.
     """
-    problems: dict[str, str] = {}
+    problems, begun = dict[str, str](), time.perf_counter()
 
     def failed(subject: Subject, error: Exception) -> None:
         if debug:
@@ -87,8 +85,8 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
             waiting = True
             time.sleep(PATIENCE)
         pending = elsewhere
-    done = len(subjects) - len(problems)
-    progress.end(f"{progress.line()}: {done} of {len(subjects)} subjects are done, in {duration(progress.elapsed)}")
+    done, spent = f"{len(subjects) - len(problems)} of {len(subjects)}", duration(time.perf_counter() - begun)
+    progress.end(f"{progress.line()}: {done} subjects are done, in {spent}")
     return problems
 
 
@@ -139,32 +137,30 @@ class _Task(NamedTuple):
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
     """Compute and write the signature of a subject."""
     study.forget(subject)
-    settings, args = study.settings, subject.args
-    volume, field, pairs = _pairs(study, subject, progress)
+    args, solved = subject.args, _pairs(study, subject, progress)
     scaled: dict[str, np.ndarray] = {}
     if study.time_unit == "lambda1":
-        scaled["scaled_times"] = np.array(settings.times.explicit)
-        own = scaled["scaled_times"] / float(positive_range(pairs)[0])
-        settings = replace(settings, times=Times(tuple(own.tolist()), 0))
-    if args.noise == "residuals" and volume.covariance is None:  # pairs that were kept do not have it
+        scaled["scaled_times"] = np.array(study.settings.times.explicit)
+        own = scaled["scaled_times"] / float(positive_range(solved.pairs)[0])
+        solved = solved._replace(settings=replace(solved.settings, times=Times(tuple(own.tolist()), 0)))
+    if args.noise == "residuals" and solved.volume.covariance is None:  # pairs that were kept do not have it
         volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
-    result = signature_of(args, volume, field, pairs, settings, progress)
+        solved = solved._replace(volume=volume)
+    result = signature_of(args, solved, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
     drawing = partial(signature_panels, result, view=args.view)
     with progress.stage("writing"):
         study.write_signature(subject, fingerprint, result, progress.warnings, drawing)
 
 
-def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> tuple[TensorVolume, TensorField, Eigenpairs]:
-    """Return the volume, its metric and its eigenpairs: those that were kept, or computed, and kept if asked to."""
+def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
+    """Return the eigenpairs: those that were kept, or computed, and kept if asked to."""
     kept, fingerprint = study.path(subject, PAIRS), study.pairs_fingerprint(subject)
     if are_of(kept, fingerprint):
-        return read_pairs(kept, study.settings, progress)[:3]
+        return read_pairs(kept, study.settings, progress)[0]
     kept.unlink(missing_ok=True)
-    volume = read_volume(subject.args, progress)
-    field, pairs, _ = compute_pairs(volume, study.settings, progress)
+    solved = compute_pairs(read_volume(subject.args, progress), study.settings, progress)
     if study.save_pairs:
-        image, domain = image_suffix(subject.args.file), volume.with_mask(field.grid.mask)
         with progress.stage("writing"):
-            write_pairs(kept, domain, pairs, study.settings, image, progress.warnings, fingerprint)
-    return volume, field, pairs
+            write_pairs(kept, solved, image_suffix(subject.args.file), progress.warnings, fingerprint)
+    return solved

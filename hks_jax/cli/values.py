@@ -1,0 +1,123 @@
+"""How the command line writes slices, voxels, repairs, boundaries, times and folders."""
+
+import math
+import os
+import re
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hks_jax.domain.tensor_checks import MAPS
+from hks_jax.eigen.automatic import SOLVERS
+from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.io import ORDERS, UNITS
+from hks_jax.io.repair import REPAIRS
+
+
+def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Return a reader of texts whose error says what was expected where `read` returns None."""
+
+    def parse(text: str) -> Any:
+        if (value := read(text)) is None:
+            raise ArgumentTypeError(f"got {text!r}; expected {expected}")
+        return value
+
+    return parse
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Read finite numbers between commas; none where there is anything else."""
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        return ()
+    return numbers if all(map(math.isfinite, numbers)) else ()
+
+
+def _repair(text: str) -> tuple[str, float | None] | None:
+    name, colon, number = text.partition(":")
+    floor = _numbers(number) if colon else (None,)
+    return (name, floor[0]) if name in REPAIRS and len(floor) == 1 and (floor[0] is None or floor[0] > 0) else None
+
+
+def _positive(text: str) -> tuple[str, float] | None:
+    name, _, number = text.partition(":")
+    values = _numbers(number)
+    return (name, values[0]) if name in MAPS and len(values) == 1 and (name != "exp" or values[0] > 0) else None
+
+
+def parse_boundary(text: str) -> BoundarySpec:
+    """Read ``neumann``; ``neumann,periodic`` (one per axis); ``neumann:dirichlet,periodic`` (low side, high side)."""
+    entries: list[Any] = [tuple(one.split(":", 1)) if ":" in one else one for one in text.split(",")]
+    return text if entries == [text] else tuple(entries)
+
+
+class Times(NamedTuple):
+    """Explicit times, or the number of automatic ones."""
+
+    explicit: tuple[float, ...]
+    automatic: int
+
+
+DEFAULT_TIMES = Times((), 6)
+
+
+def parse_times(words: list[str] | None) -> Times:
+    """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``."""
+    text = ",".join(piece for word in words or ["auto"] for piece in word.split(",") if piece)
+    if auto := re.fullmatch(r"auto(?::0*([1-9]\d*))?", text):
+        return Times((), int(auto[1])) if auto[1] else DEFAULT_TIMES
+    times = _numbers(text)
+    if not times or min(times) <= 0:
+        raise ValueError(f"--times: got {' '.join(words or ())!r}; expected positive numbers, or auto, or auto:N")
+    return Times(tuple(sorted(times)), 0)
+
+
+def parse_folder(text: str) -> Path:
+    """Return a path, if it is a folder that may be written, or could become one."""
+    nearest = next(folder for folder in (Path(text), *Path(text).absolute().parents) if folder.exists())
+    if not nearest.is_dir():
+        raise ArgumentTypeError(f"{nearest} is a file; expected a folder, or a name that is free")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise ArgumentTypeError(f"{nearest} may not be written; choose another folder")
+    return Path(text)
+
+
+def parse_target(text: str) -> Path:
+    """Return the path of a file, if its folder may be written."""
+    return parse_folder(os.path.dirname(text) or ".") / os.path.basename(text)
+
+
+KINDS: dict[str, Callable[[str], Any] | Iterable[str]] = {
+    **dict.fromkeys(("FILE", "RESULT", "SUBJECTS", "TARGET"), Path),
+    **dict.fromkeys(("OUT", "DIR"), parse_folder),
+    **dict.fromkeys(("TABLE", "PAGE", "PICTURE"), parse_target),
+    **dict.fromkeys(("N", "K"), int),
+    **dict.fromkeys(("H", "C", "B", "DPI", "SIGMA", "LENGTH"), float),
+    "AXIS=N": _reader(
+        "an axis and an index from 0, such as z=14",
+        lambda text: (found[1], int(found[2])) if (found := re.fullmatch(r"([xyz])=(\d+)", text)) else None,
+    ),
+    "I,J,K": _reader(
+        "three indices from 0, such as 64,64,14",
+        lambda text: tuple(map(int, text.split(","))) if re.fullmatch(r"\d+,\d+,\d+", text) else None,
+    ),
+    "X,Y": _reader("coordinates, such as 1.5,2", lambda text: x if len(x := _numbers(text)) in (2, 3) else None),
+    "Q,Q": _reader(
+        "two numbers from 0 to 1, such as 0.01,0.99",
+        lambda text: x if len(x := _numbers(text)) == 2 and 0 <= x[0] < x[1] <= 1 else None,
+    ),
+    "R": _reader(
+        "own, shared, or two ascending numbers LOW,HIGH",
+        lambda t: t if t in ("own", "shared") else x if len(x := _numbers(t)) == 2 and x[0] < x[1] else None,
+    ),
+    "WEIGHT": _reader("a positive number", lambda text: x[0] if len(x := _numbers(text)) == 1 and x[0] > 0 else None),
+    "HOW[:FLOOR]": _reader(f"{', '.join(REPAIRS)}, or one with a floor, such as clip:1e-4", _repair),
+    "HOW:NUMBER": _reader(
+        "exp:S for exp(T/S), or shift:C for T + C·I, with a number in the tensors' units, such as exp:2e6", _positive
+    ),
+    "CONDITION": parse_boundary,
+    **{"ORDER": ORDERS, "UNIT": UNITS, "SOLVER": ("auto", *SOLVERS)},
+}
+"""By the words of the table of options: what reads a text, or the texts that are allowed. Other words are any text."""
