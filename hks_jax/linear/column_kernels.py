@@ -144,8 +144,8 @@ def agree(dtype: Any, interpret: bool = False) -> bool:
         squares = parts_of_products(jnp.asarray(x), jnp.asarray(x), interpret)
         (unit,), factor = orthonormal(squares, (jnp.asarray(x),), jnp.asarray(np.eye(b, dtype=dtype)), interpret)
         # By NumPy: on GPUs JAX multiplies matrices in single precision with three digits.
-        unit, factor = np.asarray(unit), np.asarray(factor)
-        return [*found, (unit.T @ unit, np.eye(b, dtype=dtype)), (unit @ factor.T, x)]
+        q, r = np.asarray(unit), np.asarray(factor).T
+        return [*found, (q.T @ q, np.eye(b, dtype=dtype)), (q @ r, x)]
 
     return kernels_agree("block Lanczos", dtype, compare)
 
