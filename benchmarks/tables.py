@@ -29,6 +29,12 @@ PICTURES = ROOT / "docs" / "images" / "measured"
 HEADINGS = {
     "seconds": "seconds",
     "first_call_s": "first call, s",
+    "first_s": "first, s",
+    "cached_s": "cached, s",
+    "later_s": "later, s",
+    "another_spacing_s": "another spacing, s",
+    "mask_s": "with a mask, s",
+    "another_mask_s": "another mask, s",
     "first_step_s": "first step, s",
     "step_s": "a step, s",
     "processor_s": "of all processors, s",
