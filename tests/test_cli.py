@@ -20,7 +20,7 @@ import hks_jax as hj
 from hks_jax import paper
 from hks_jax.cli import demo, fit, main
 from hks_jax.cli import outputs as outputs_module
-from hks_jax.cli.options import options_in
+from hks_jax.cli.options import Option, options_in
 from hks_jax.cli.progress import Progress, bar, duration
 from hks_jax.cli.values import Times, parse_boundary, parse_times
 from hks_jax.eigen.solver import Status
@@ -32,7 +32,6 @@ from hks_jax.inverse.search import OPTIMISERS
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.result import Result, recorded_boundary
 from hks_jax.plot import signature
-from hks_jax.plot.signature import away_from_rim, bounding_box
 
 SHAPE = (14, 12)
 QUIET_FILES = ["hks.npz", "hks.png", "report.json"]
@@ -209,7 +208,9 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
     np.save(tmp_path / "mask.npy", mask)
     arguments = ["--metric", "inverse", "--mask", str(tmp_path / "mask.npy"), "-k", "12", "--through", "8,5,3"]
     drawn, draw = [], signature.volume_panels
-    monkeypatch.setattr(signature, "volume_panels", lambda *args, **more: drawn.append(draw(*args, **more)))
+    monkeypatch.setattr(
+        signature, "volume_panels", lambda *args, **more: drawn.append(draw(*args, **more)) or drawn[-1]
+    )
     assert main(["hks", str(nifti), "-o", str(out), "-q", *arguments, "--times", "20000", "50000"]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["hks.json", "hks.nii.gz", *QUIET_FILES]
 
@@ -658,22 +659,13 @@ def test_the_help_of_a_command_is_in_groups_and_says_what_is_hard_to_guess(capsy
         assert ("t is then the time of diffusion, in s for D in mm2/s and voxels in mm" in text) == (command == "hks")
 
 
-def test_picture_helpers():
-    inside = np.zeros((40, 40), bool)
-    inside[5:35, 1:38] = True
-    assert bounding_box(inside) == (slice(3, 37), slice(0, 40))
-    assert not away_from_rim(inside)[5:10].any()
-    assert away_from_rim(inside)[10:30, 6:33].all()
-    flat = away_from_rim(inside[4:12])  # seven nodes wide: what leaves a third of them
-    assert inside.sum() > 3 * 7 > flat.sum() / 37 > 7 / 3
-    assert not flat[[1, 7]].any()
-    np.testing.assert_array_equal(away_from_rim(inside[4:7]), inside[4:7])  # too thin: all of it
-    solid = np.zeros((30, 30, 9), bool)
-    solid[4:26, 4:26, 1:8] = True
-    assert bounding_box(solid, 1) == (slice(3, 27), slice(3, 27), slice(0, 9))
-    deep = away_from_rim(solid)
-    assert deep.sum() > solid.sum() / 3
-    assert not deep[..., 1].any()
+def test_a_line_of_the_table_is_an_option():
+    option = Option.of("-b,--b-max B... = 900  leave out images\n  with larger b")
+    assert (option.flags, option.name) == (("-b", "--b-max"), "b_max")
+    said = "leave out images with larger b (default 900)"
+    assert option.settings == {"help": said, "default": "900", "nargs": "+", "type": float, "metavar": "B"}
+    assert Option.of("--of a|b!  50 %").settings == {"help": "50 %%", "required": True, "choices": ("a", "b")}
+    assert Option.of("--quick  or not").settings == {"help": "or not", "action": "store_true"}
 
 
 # ---------------------------------------------------------------------------------------------------- fits

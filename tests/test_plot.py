@@ -23,6 +23,7 @@ from hks_jax.plot import (
     surface,
     trace,
 )
+from hks_jax.plot.signature import away_from_rim, bounding_box
 
 
 def rotating_field(index, n=81, centre=(0.0, 0.0), mask=None):
@@ -449,3 +450,21 @@ def test_what_noise_could_make_fades_into_grey():
     grey = np.asarray(figure.axes[0].images[1].get_array())
     assert grey.shape == (2, 3, 4)
     np.testing.assert_allclose(grey[..., 3].T, [[1, 0.5], [0, 0], [0, 0]])
+
+
+def test_pictures_are_cropped_and_coloured_away_from_the_rim():
+    inside = np.zeros((40, 40), bool)
+    inside[5:35, 1:38] = True
+    assert bounding_box(inside) == (slice(3, 37), slice(0, 40))
+    assert not away_from_rim(inside)[5:10].any()
+    assert away_from_rim(inside)[10:30, 6:33].all()
+    flat = away_from_rim(inside[4:12])  # seven nodes wide: what leaves a third of them
+    assert inside.sum() > 3 * 7 > flat.sum() / 37 > 7 / 3
+    assert not flat[[1, 7]].any()
+    np.testing.assert_array_equal(away_from_rim(inside[4:7]), inside[4:7])  # too thin: all of it
+    solid = np.zeros((30, 30, 9), bool)
+    solid[4:26, 4:26, 1:8] = True
+    assert bounding_box(solid, 1) == (slice(3, 27), slice(3, 27), slice(0, 9))
+    deep = away_from_rim(solid)
+    assert deep.sum() > solid.sum() / 3
+    assert not deep[..., 1].any()

@@ -259,7 +259,7 @@ def resolving(share: float, dimension: int) -> float:
 
 def _exponent(xp: Any, mean: Any) -> Any:
     """Return the exponent of a counting function from the mean of λ/Λ below Λ."""
-    return xp.clip(mean / xp.maximum(1 - mean, 1e-3), _EXPONENTS[0], _EXPONENTS[-1])
+    return xp.clip(mean / xp.maximum(1 - mean, 1e-3), float(_EXPONENTS[0]), float(_EXPONENTS[-1]))
 
 
 @nan_is_meant
