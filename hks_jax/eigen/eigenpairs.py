@@ -182,8 +182,9 @@ class Eigenpairs(eqx.Module):
         """
         if not self.k:
             return jnp.zeros((), bool)
+        optional = self.lowest and (self.pencil is None or all(part.bounded for part in self.pencil.parts))
         known = self.eigenvalues, self.kept, self.complete_below, self.spectral_origin, self.multiplet_tolerance
-        return _unconfirmed(*known, self.lowest and all(part.bounded for part in self.pencil.parts))
+        return _unconfirmed(*known, optional)
 
     @property
     def result(self) -> RESULTS:
