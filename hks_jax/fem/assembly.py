@@ -76,8 +76,8 @@ def assemble(
         midpoints: of degree 2, where the middles of the edges are, (E, 3), which curves the sides; or a function of a
             place in space that moves the middles of straight sides there, on a `TetMesh` those of its boundary alone.
         quadrature: ``"gauss"``, or on grids ``"cancelling"``: points at which the leading error of heat kernel
-            signatures cancels, at the same cost (docs/accuracy.md). The mass is consistent, and nodal values are no
-            longer the unknowns φ: they are read from ½(I + D⁻¹M)φ, D the row sums of M, by all signatures.
+            signatures cancels (docs/accuracy.md). The mass is consistent, and nodal values are no longer the unknowns
+            φ: all signatures read them from ½(I + D⁻¹M)φ, D the row sums of M.
 
     Returns:
         The pencil (stiffness, mass); with ``"mirror"`` and ``"mean"`` the `MirrorPencil` of the problems that make it

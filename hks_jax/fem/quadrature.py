@@ -59,7 +59,7 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
 #
 # On a cell a function is a sum of products of coordinates, one for every set of axes, and a derivative along one axis
 # leaves the coordinates of the others, which grow with ξ. So the stiffness at other points is Gauss's with products of
-# m coordinates times (ξ/ξ₀)^(m−1).
+# m coordinates times (ξ/ξ₀)^(m−1). By their values at the corners, 1 or −1, the products are orthogonal.
 def moved(
     stiffness: Float[Array, "n n"], metric: Float[Array, "q d d"], spacing: Float[np.ndarray | Array, " d"]
 ) -> Float[Array, "n n"]:
@@ -71,16 +71,16 @@ def moved(
         spacing: the sides of the cell.
     """
     ratio = jnp.sqrt(stiffness_point(jnp.mean(metric, axis=0), spacing)) / GAUSS
-    plain, *others = (jnp.asarray(each, stiffness.dtype) for each in _by_degree(len(spacing)))
-    scaling = plain + sum(ratio ** (m + 1) * each for m, each in enumerate(others))
-    return jnp.einsum("ij,jk,kl->il", scaling, stiffness, scaling, precision="highest")
+    basis, powers = (jnp.asarray(each, stiffness.dtype) for each in _products(len(spacing)))
+    factors = ratio**powers
+    inner = jnp.matmul(stiffness.ravel(), basis, precision="highest") * jnp.outer(factors, factors).ravel()
+    return jnp.matmul(inner, basis, precision="highest").reshape(stiffness.shape)
 
 
 @lru_cache(maxsize=2)
-def _by_degree(dimension: int) -> list[Float[np.ndarray, "n n"]]:
-    """Return the projectors on products of at most one coordinate, of two, and so on, by the values at the corners."""
-    constant, linear = np.full((2, 2), 0.5), np.array([[0.5, -0.5], [-0.5, 0.5]])
-    projectors = [np.zeros((2**dimension,) * 2) for _ in range(dimension)]
-    for axes in np.ndindex(*(2,) * dimension):
-        projectors[max(sum(axes) - 1, 0)] += reduce(np.kron, [linear if axis else constant for axis in axes])
-    return projectors
+def _products(dimension: int) -> tuple[Float[np.ndarray, "nn nn"], Float[np.ndarray, " n"]]:
+    """Return what takes matrices to the basis of products of coordinates and back, and m − 1 for each; 0 for m = 0."""
+    one = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
+    basis = reduce(np.kron, [one] * 2 * dimension)
+    degrees = np.indices((2,) * dimension).sum(axis=0).ravel()
+    return basis, np.maximum(degrees - 1.0, 0.0)
