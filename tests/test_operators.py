@@ -123,9 +123,12 @@ def test_solvers_for_positive_matrices_count_from_the_potential_s_minimum(rng, s
 
 
 @pytest.mark.slow
-def test_a_density_with_other_solvers_and_without_a_spectrum():
-    pencil = hj.assemble(euclidean(25, 2.0), density=lambda x: 1.5 + jnp.sin(x[0]))
-    everything = hj.eigenpairs(pencil, 25**2)
+@pytest.mark.parametrize("boundary", ["neumann", "mirror"])
+@pytest.mark.parametrize("potential", [None, lambda x: 3 * x[0] - 2])
+def test_densities_and_potentials_with_other_solvers_and_without_a_spectrum(potential, boundary):
+    density = {"density": lambda x: 1.5 + jnp.sin(x[0])}
+    pencil = hj.assemble(euclidean(25, 2.0), boundary, potential=potential, **density)
+    everything = hj.eigenpairs(pencil, sum(part.size for part in pencil.parts))
     some = hj.eigenpairs(pencil, 10, solver="chebyshev-filter")
     np.testing.assert_allclose(some.eigenvalues, everything.eigenvalues[:10], rtol=1e-6, atol=1e-12)
     for method in ("colouring", "selected-inversion"):
@@ -317,7 +320,9 @@ def test_what_is_true_of_the_laplacian_alone_is_left_out():
     with pytest.raises(ValueError, match="solver: 'shift-invert' needs a stiffness that is positive semidefinite"):
         hj.eigenpairs(own, 3, solver="shift-invert")
     with pytest.raises(ValueError, match="nothing is known of the null space"):
-        hj.hks_spectrum_free(pencil, [0.1])
+        hj.hks_spectrum_free(own, [0.1])
+    without = hj.hks_spectrum_free(pencil, [0.1, 0.3], method="selected-inversion")
+    np.testing.assert_allclose(without, hj.hks(hj.eigenpairs(pencil, 17**2), [0.1, 0.3]), rtol=1e-8)
 
 
 def first_order(u, v, w):

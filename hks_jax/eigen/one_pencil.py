@@ -19,7 +19,7 @@ from hks_jax.eigen.origin import locate, translated
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Eigensolver, Report
 from hks_jax.fem.pencil import Pencil
-from hks_jax.linear.pencil import NullSpace, SymmetricPencil, tabulated
+from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 _FAR = 30
@@ -83,9 +83,7 @@ def _from_bound(
     """Return the lowest pairs by a solver for K ⪰ 0: those of K − σM, σ a lower bound of the spectrum."""
 
     def solve(origin: Float[Array, ""]) -> tuple[Pencil, tuple[Any, ...]]:
-        stiffness = pencil.stiffness.with_flat(pencil.shifted(origin))
-        nothing = NullSpace(jnp.zeros((0, pencil.size), origin.dtype))
-        moved = Pencil(stiffness, pencil.mass, pencil.metric, pencil.volume, pencil.space, null_space=nothing)
+        moved = pencil.counted_from(origin)
         return moved, solved(solver, moved, k, extra, False, throw, report)
 
     assert pencil.lower_bound is not None

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from hks_jax.fem.resolution import Resolution, SampledMetric, resolution_of
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
-from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 
 
 class Pencil(SymmetricPencil):
@@ -82,6 +82,12 @@ class Pencil(SymmetricPencil):
             raise ValueError("stiffness: got a matrix with another pattern; use `sparse_pencil` for any two matrices")
         return Pencil(stiffness, self.mass, self.metric, self.volume, self.space, row_sums=self.row_sums)
 
+    def counted_from(self, origin: Float[Array, ""]) -> "Pencil":
+        """Return K − σM and M, σ a lower bound of the spectrum; of the null space nothing is known beforehand."""
+        moved = self.stiffness.with_flat(self.shifted(origin))
+        nothing = NullSpace(jnp.zeros((0, self.size), origin.dtype))
+        return Pencil(moved, self.mass, self.metric, self.volume, self.space, null_space=nothing)
+
     @property
     def parts(self) -> tuple["Pencil", ...]:
         """The pencil itself: one problem."""
@@ -139,3 +145,13 @@ class MirrorPencil(eqx.Module):
 
 
 AnyPencil: TypeAlias = Pencil | MirrorPencil
+
+
+def from_lower_bound(pencil: AnyPencil) -> tuple[AnyPencil, Float[Array, ""]]:
+    """Return a pencil whose stiffness is not negative, and the origin that its eigenvalues count from, 0 or a bound."""
+    bounds = [part.lower_bound for part in pencil.parts if part.lower_bound is not None]
+    if not bounds:
+        return pencil, jnp.zeros((), pencil.parts[0].stiffness.dtype)
+    origin = jnp.min(jnp.stack(bounds))
+    parts = tuple(part.counted_from(origin) for part in pencil.parts)
+    return (MirrorPencil(parts, pencil.including) if isinstance(pencil, MirrorPencil) else parts[0]), origin

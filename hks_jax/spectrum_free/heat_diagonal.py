@@ -13,7 +13,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.nodal import nodal_pencil
-from hks_jax.fem.pencil import AnyPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, Pencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.chebyshev import heat_coefficients
@@ -51,8 +51,8 @@ def hks_spectrum_free(
             with the memory of factors in complex numbers. ``"auto"``: whichever takes less work. Or a `Colouring` that
             `colouring` made beforehand, which is what colouring needs under `jax.jit`.
         tolerance: what the error of colouring stays below at every node, relative to the smaller of (4πt)^(−d/2) and
-            the largest value that a node can have (`Colouring.error` says how far that is proven). Selected inversion
-            does not use it.
+            the largest value that a node can have (`Colouring.error` says how far that is proven); of a potential times
+            exp(−vt), v its least value. Selected inversion does not use it.
 
     Returns:
         (n_times, *shape) in 1/(metric length)^d; NaN outside the mask, 0 at Dirichlet nodes. NaN throughout where a
@@ -65,13 +65,13 @@ def hks_spectrum_free(
             `jax.jit`.
         TypeError: colouring on a mesh.
     """
-    pencil = _read_as_unknowns(pencil_of(domain, boundary, mass))
+    pencil, origin = from_lower_bound(_read_as_unknowns(pencil_of(domain, boundary, mass)))
     times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     settings = choose_method(pencil, times, method, tolerance)
     values = [_diagonal(part, times, settings, checked=isinstance(method, Colouring)) for part in pencil.parts]
     # On a doubled domain, heat that starts at a node is even and odd by halves.
-    return jnp.mean(jnp.stack(values), axis=0)
+    return jnp.exp(-origin * times).reshape(-1, *[1] * (values[0].ndim - 1)) * jnp.mean(jnp.stack(values), axis=0)
 
 
 def colouring(

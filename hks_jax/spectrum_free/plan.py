@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.fem.pencil import AnyPencil
+from hks_jax.fem.pencil import AnyPencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.selected_inversion import inversion_cost
@@ -47,7 +47,7 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
         raise ValueError(
             f'method: got {method!r}; expected "auto", "colouring", "selected-inversion" or what `colouring` returns'
         )
-    if any(part.null_space is None for part in pencil.parts):
+    if not all(part.bounded for part in pencil.parts):
         raise ValueError(
             "domain: nothing is known of the null space of its stiffness, which may be indefinite, and the exponential "
             "is approximated for K ⪰ 0. Give `sparse_pencil` the null vectors, or use eigenpairs"
@@ -114,7 +114,7 @@ def plan(
         Unattainable: a tolerance below what rounding leaves.
         ValueError: traced values.
     """
-    pencil, times = jax.lax.stop_gradient((pencil, times))
+    pencil, times = jax.lax.stop_gradient((from_lower_bound(pencil)[0], times))
     if is_traced((pencil, times)):
         raise ValueError(
             "method: spacing and degree depend on values, which are traced here (jax.jit, vmap). Choose them "
