@@ -39,7 +39,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
         ValueError: times that are not positive; functions of another shape, or not finite inside the mask.
 
     Warns:
-        AccuracyWarning: what of a function lies beyond the k pairs has not decayed at some time to 1 % of its norm.
+        AccuracyWarning: the part of a function beyond the k pairs has not decayed at some time to 1 % of its norm.
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
     times, shape = checked_times("times", times, dtype), pairs.space.node_shape
