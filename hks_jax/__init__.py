@@ -42,9 +42,6 @@ from hks_jax.fem.assembly import assemble as assemble
 from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import default_boundary as default_boundary
 from hks_jax.fem.boundary import reflect as reflect
-from hks_jax.fem.factorise import Multifrontal as Multifrontal
-from hks_jax.fem.factorise import SparseLinearOperator as SparseLinearOperator
-from hks_jax.fem.factorise import factorise as factorise
 from hks_jax.fem.pencil import MirrorPencil as MirrorPencil
 from hks_jax.fem.pencil import Pencil as Pencil
 from hks_jax.fem.sparse_input import sparse_pencil as sparse_pencil
@@ -91,13 +88,18 @@ from hks_jax.uncertainty import uncertainty as uncertainty
 __version__ = "0.2.0"
 
 
+_LATER = dict.fromkeys(("fit_metric", "identifiability"), "hks_jax.inverse") | dict.fromkeys(
+    ("factorise", "Multifrontal", "SparseLinearOperator"), "hks_jax.fem.factorise"
+)
+
+
 def __getattr__(name: str) -> Any:
-    # Several devices, fits and the outside world (files, pictures) are imported when first asked for: slow to import,
-    # often not needed.
+    # Several devices, fits, what needs lineax, and the outside world (files, pictures) are imported when first asked
+    # for: slow to import, often not needed.
     if name in ("devices", "inverse", "io", "plot"):
         return importlib.import_module(f"hks_jax.{name}")
-    if name in ("fit_metric", "identifiability"):
-        return getattr(importlib.import_module("hks_jax.inverse"), name)
+    if name in _LATER:
+        return getattr(importlib.import_module(_LATER[name]), name)
     if name == "examples":
         return importlib.import_module("hks_jax.domain.examples")
     raise AttributeError(f"module 'hks_jax' has no attribute {name!r}")

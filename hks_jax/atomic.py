@@ -35,7 +35,7 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
     Args:
         path: the folder.
-        stale: returns the files that belong to what is replaced. They are removed before the new ones are moved, so
+        stale: returns the files that belong to the replaced ones. They are removed before the new ones are moved, so
             that never two results are mixed.
 
     Raises:

@@ -38,7 +38,7 @@ def documented():
 
 
 def test_the_reference_has_every_public_name_once():
-    names = [f"hks_jax.{name}" for name in facade()]
+    names = [f"hks_jax.{name}" for name in (*facade(), *(later for later, at in hj._LATER.items() if ".fem." in at))]
     for module in ("plot", "io", "inverse", "devices"):
         assert getattr(hj, module)  # imported when asked for, so not in the façade
         names += [f"hks_jax.{module}.{name}" for name in facade(module)]

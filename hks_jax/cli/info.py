@@ -48,7 +48,7 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
 
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
-    """Return what there is to say of a volume, in plain numbers; without a boundary for that which suits it."""
+    """Return the facts about a volume, in plain numbers; without a boundary, for the one that suits it."""
     inside, bad = volume.inside, find_invalid(volume)
     boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad

@@ -1,4 +1,4 @@
-"""Error bars on the command line: where the noise comes from, and what of the signature exceeds it."""
+"""Error bars on the command line: the source of the noise, and the part of the signature above it."""
 
 import argparse
 import warnings

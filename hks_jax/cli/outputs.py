@@ -96,7 +96,7 @@ def _are_pairs(path: Path, eigenvalues: np.ndarray) -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what took part, and the device."""
+    """Return the versions of the libraries that took part, and the device."""
     import jax
 
     python, system, device = platform.python_version(), platform.platform(), jax.devices()[0].device_kind

@@ -24,7 +24,7 @@ _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that belong to the pairs."""
 _ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit", "notes", "repair")
-"""What of a volume is kept as text beside its arrays."""
+"""The entries of a volume that are kept as text beside its arrays."""
 
 
 def is_saved_pairs(path: Path) -> bool:

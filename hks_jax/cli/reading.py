@@ -118,7 +118,7 @@ def _without_filling(volume: TensorVolume, background: str | None, progress: Pro
 
 
 def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str], None]) -> TensorVolume:
-    """Ask what the tensors give reason to; return them with notes of what their fibres tell."""
+    """Ask the questions that the tensors raise; return them with notes on their fibres."""
     if args.positive is not None:  # of no diffusion
         return volume
     volume, asked = reviewed(volume)

@@ -80,7 +80,7 @@ def differentiate(
         index = (nodes + shifts[rows, column]) % n
         total += table[rows, column] * jnp.take_along_axis(values, index, axis=axis)
     valid = np.broadcast_to(valid, inside.shape)
-    # Zero and not NaN where nothing is known: NaN here would survive, as 0·NaN, in the gradient of what is known.
+    # Zero and not NaN where nothing is known: NaN here would survive, as 0·NaN, in the gradient of known values.
     return jnp.where(np.expand_dims(valid, expand), total, 0), valid
 
 

@@ -3,8 +3,8 @@
 from itertools import product
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Int
-from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -56,7 +56,7 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
     nodes = element_nodes(elements, periodic)
     # Elements that share a node hang together; on the nodes this is the labelling of the elements' union,
     # except that two nodes may be neighbours without sharing an element. So label elements, then hand down.
-    labels, count = ndimage.label(elements, structure=everything)
+    labels, count = scipy.ndimage.label(elements, structure=everything)
     padded = np.zeros([n + 1 for n in elements.shape], dtype=labels.dtype)
     for corner in product(*[(slice(None, -1), slice(1, None))] * mask.ndim):
         np.maximum(padded[corner], labels, out=padded[corner])

@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from hks_jax.domain.components import active_elements
 from hks_jax.domain.tensor_field import TensorField
@@ -66,7 +66,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     if len(cells) == 0:
         return DegeneratePoints(np.zeros((0, 2)), np.zeros(0))
 
-    near = cKDTree(cells).query_pairs(merge, p=np.inf, output_type="ndarray")
+    near = scipy.spatial.cKDTree(cells).query_pairs(merge, p=np.inf, output_type="ndarray")
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]

@@ -4,8 +4,8 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.triangulation import Triangulation
@@ -190,7 +190,7 @@ def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangul
         return
     start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
     length = np.linalg.norm(end - start, axis=1)
-    near = cKDTree(vertices[rim]).query_ball_point((start + end) / 2, length * (0.5 + _ON_EDGE))
+    near = scipy.spatial.cKDTree(vertices[rim]).query_ball_point((start + end) / 2, length * (0.5 + _ON_EDGE))
     which = np.repeat(np.arange(len(edges)), [len(found) for found in near])
     vertex = rim[np.concatenate(near).astype(int)]
     along = (end - start)[which] / length[which, None]

@@ -140,7 +140,7 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-# What else were kept for the transpose would be copies of the eigenvectors.
+# Without the checkpoint, the transpose would keep copies of the eigenvectors.
 @jit_quickly(static_argnames=("adjoint", "telling"))
 @partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(

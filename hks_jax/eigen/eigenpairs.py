@@ -40,7 +40,7 @@ class RESULTS(eqx.Enumeration):
 def result_of(
     pencil: SymmetricPencil | MirrorPencil, converged: Bool[Array, " k"], unconfirmed: Bool[Array, ""]
 ) -> RESULTS:
-    """Return what came of eigenpairs, the gravest of what failed."""
+    """Return the outcome of a computation of eigenpairs: the gravest failure."""
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(pencil) if eqx.is_inexact_array(leaf)]
     code: Any = RESULTS  # whose members are strings until the class is made
     result = code.where(unconfirmed, code.unconfirmed, code.successful)

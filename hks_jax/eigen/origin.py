@@ -74,10 +74,10 @@ class _Descent(NamedTuple):
 
 
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Return how far to lower an origin, and how many eigenvalues it passes: at most so many, and half of them or more.
+    """Return a distance by which to lower an origin, and the number of eigenvalues passed: `most`/2 to `most`.
 
     Fewer only where there are no more, or where the next is a multiple one that would be too many. Each factorisation
-    is tried out on so many random right-hand sides.
+    is tried out on `probes` random right-hand sides.
     """
     dissection, dtype = _dissected(pencil), pencil.stiffness.dtype
     tried = jax.random.normal(jax.random.key(0), (pencil.size, probes), dtype)
@@ -144,7 +144,8 @@ def locate(
     """Return an origin below all eigenvalues, a number above some of them, 1 … 2·wanted, and how many that are.
 
     A bracket is halved, or divided in proportion to the counts, until there are few enough eigenvalues in it. Each
-    factorisation is tried out on so many random right-hand sides. Where many are equal within rounding there are more.
+    factorisation is tried out on `probes` random right-hand sides. Where many eigenvalues are equal within rounding
+    there are more than 2·wanted.
     NaN where nothing succeeds.
     """
     size, dissection = scale(pencil), _dissected(pencil)

@@ -27,7 +27,7 @@ class Element:
     weights: Float[np.ndarray | Array, " q"]
 
     def stretched(self, sides: tuple[float, ...]) -> "Element":
-        """Return the element whose sides are so many times as long."""
+        """Return the element with its sides multiplied by these lengths."""
         return Element(self.values, self.gradients / np.array(sides), self.weights * math.prod(sides))
 
 

@@ -41,9 +41,9 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
     if operator.components > 1:
         own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
-        gathered = [gathered(own, each[kept]) for each in matrices]
+        one, other = (gathered(own, each[kept]) for each in matrices)
         sums = row_sums_of(own, matrices[1][kept])
-        return assembled(gathered[0], gathered[1], sums, None, volume, own, operator, fields)
+        return assembled(one, other, sums, None, volume, own, operator, fields)
     stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in matrices)
     return assembled(stiffness, consistent, lumped, metric, volume, space, operator, fields)
 

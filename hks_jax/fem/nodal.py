@@ -49,7 +49,7 @@ class NodalPencil(eqx.Module):
         return jnp.where(self.free, self.lumped, 0)
 
     def cut(self, mesh: Mesh | None) -> Slabs | None:
-        """Return how the grid is cut for so many devices; None for one."""
+        """Return the cuts of the grid for a number of devices; None for one."""
         return None if mesh is None else Slabs(mesh, self.shape, self.periodic)
 
     def own(self, slabs: Slabs | None) -> "NodalPencil":

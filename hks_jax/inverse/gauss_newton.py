@@ -24,7 +24,7 @@ _FREE = 0.01
 
 
 def remaining_change(last: Array, before: Array) -> Array:
-    """Return the larger of the last step and of what would still follow if the last two began a geometric series."""
+    """Return the last step, or the sum of the steps to come if it is larger, were the last two a geometric series."""
     ratio = last / jnp.where(before > 0, before, jnp.inf)
     ratio = jnp.where(before > 0, ratio, jnp.inf)
     return jnp.where(ratio < 1, last * jnp.maximum(1, ratio / jnp.where(ratio < 1, 1 - ratio, 1)), jnp.inf)
@@ -53,7 +53,7 @@ class DampedDescent(eqx.Module):
     damping: Float[Array, ""]  # μ at step size 1
     inner_product: InnerProduct  # B
     inner_tolerance: Float[Array, ""]  # reduction of the residual, in the norm of the preconditioner's inverse
-    inner_steps: Int[Array, ""]  # at most so many products with JᵀJ
+    inner_steps: Int[Array, ""]  # the most products with JᵀJ
     preconditioner: Preconditioner  # of the conjugate gradients
 
     def init(self, y: Values) -> _State:
@@ -143,7 +143,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         growth: by what μ is divided after a step that kept what the linearisation promised.
         inner_product: B, in which steps are small.
         inner_tolerance: reduction of the linear residual in each step; steps that may be the last go 30 times further.
-        inner_steps: at most so many products with JᵀJ in each step; in steps that may be the last three times as many.
+        inner_steps: the most products with JᵀJ in each step; in steps that may be the last three times as many.
         preconditioner: of the conjugate gradients; B by default.
     """
 

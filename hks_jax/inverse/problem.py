@@ -28,7 +28,7 @@ TAIL = 1e-6
 _LOST = 0.05
 """What part makes a time unresolvable."""
 _NEAR = 0.1
-"""A misfit is near to what truncation leaves where that is more than this part of it: a third of the residuals."""
+"""The share of truncation in a misfit from which on it is told: a third of the residuals."""
 _ENOUGH = 1e-5
 """The accuracy of the solver's derivative for which single precision will do. Measured at 64² nodes, it costs 1e-6 in J
 and 1e-5 to 3e-5 in Jᵀ; solves to this tolerance cost 5e-6 and 5e-5, where nothing is smooth."""
@@ -181,7 +181,7 @@ def truncation_misfit(observation: Observation, pairs: Eigenpairs) -> Float[Arra
 
 
 def truncation_shows(misfit: float, left: float) -> bool:
-    """Tell whether a misfit is near to what truncation leaves, and that is more than `TAIL`."""
+    """Tell whether truncation makes a large share of a misfit, and is itself more than `TAIL`."""
     return left > (2 * TAIL) ** 2 / 2 and left > _NEAR * misfit
 
 

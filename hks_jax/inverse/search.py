@@ -102,7 +102,7 @@ class Search:
     log: Log  # what happens is told to it
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
-        """Solve one problem, beginning at some unknowns, to so many tolerances."""
+        """Solve one problem from given unknowns; the tolerances are multiplied by a factor."""
         tolerance = tolerances * self.tolerance
         method = choose_optimiser(self.optimiser, problem, tolerance, self.noise, self.inner_product, step_size)
         with jax.debug_nans(False):  # what nobody computed is told as NaN

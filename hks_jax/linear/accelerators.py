@@ -47,7 +47,7 @@ def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[An
 
     Args:
         name: of the kernels.
-        dtype: of what they compute with.
+        dtype: of their numbers.
         compare: runs each of them on a small problem, and returns its results beside those that are expected.
 
     Warns:

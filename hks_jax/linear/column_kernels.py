@@ -234,7 +234,7 @@ def _identity(size: int) -> Bool[Array, "size size"]:
 
 
 def _square(size: int, b: int) -> Bool[Array, "size size"]:
-    """Return what of a padded matrix belongs to it."""
+    """Return which entries of a padded matrix belong to the matrix itself."""
     index = jax.lax.broadcasted_iota(jnp.int32, (size,), 0)
     return (index < b)[:, None] & (index < b)[None, :]
 

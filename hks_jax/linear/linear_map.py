@@ -40,8 +40,8 @@ def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any]
     Args:
         forward: maps x to y, pytrees of floating point arrays.
         backward: maps y to x.
-        x: to what it is applied.
-        at: what else the two depend on and are to be differentiated by, in rules of their own.
+        x: its argument.
+        at: other arguments of the two, by which they are differentiated in rules of their own.
     """
 
     # JAX transposes a solve all of whose right-hand side depends on what is linearised: x, or `at`.

@@ -1,4 +1,4 @@
-"""Dense symmetric pencils: checks of what users pass, and the reduction A − λB to a standard problem by Cholesky."""
+"""Dense symmetric pencils: checks of users' matrices, and the reduction A − λB to a standard problem by Cholesky."""
 
 from functools import partial, reduce
 from typing import Any

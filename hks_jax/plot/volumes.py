@@ -55,7 +55,7 @@ def orthogonal_slices(
         axes: three axes, for the planes xy, xz and yz in this order.
         values: (*shape,), NaN where there is nothing to draw.
         grid: the 3D grid of the values; its spacing makes the aspect.
-        node: indices (i, j, k) of the node; None: `middle_node` of what is finite.
+        node: indices (i, j, k) of the node; None: `middle_node` of the finite values.
         cross: whether thin lines show where the other two slices are.
         orientation: how the grid lies in space. The slices are then turned, have coordinates of space, and letters at
             their edges.
@@ -124,7 +124,7 @@ def volume_panels(
         values: (n_times, *shape), as `hks_jax.hks` returns them.
         times: (n_times,).
         grid: the 3D grid of the values.
-        node: indices (i, j, k) of the node that the slices run through; None: `middle_node` of what is finite.
+        node: indices (i, j, k) of the node that the slices run through; None: `middle_node` of the finite values.
         titles: one per time; None: “t = …”.
         unit: the unit of t, written after it.
         length_unit: the unit of the coordinates.

@@ -80,7 +80,7 @@ def _mean_or_quotient(
         fine: the mean, by a more accurate one.
         gap: the denominator of the quotient, not negative.
         change: the numerator of the quotient.
-        size: the magnitude of what the numerator is a difference of.
+        size: the magnitude of the two terms whose difference the numerator is.
     """
     eps = jnp.finfo(gap.dtype).eps
     apart = gap > 0

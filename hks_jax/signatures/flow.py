@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.ndimage import gaussian_filter1d
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import checked_times, require_real
@@ -39,7 +39,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
         ValueError: times that are not positive; functions of another shape, or not finite inside the mask.
 
     Warns:
-        AccuracyWarning: what of a function lies beyond the k pairs has not decayed at some time to 1 % of its norm.
+        AccuracyWarning: the part of a function beyond the k pairs has not decayed at some time to 1 % of its norm.
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
     times, shape = checked_times("times", times, dtype), pairs.space.node_shape
@@ -150,6 +150,6 @@ def _blur(u: np.ndarray, inside: np.ndarray, sigma: float, spacing: tuple[float,
     for axis, h in enumerate(spacing):
         # Three times the side, and nothing varies any more; wider kernels only take longer.
         nodes = min(sigma / h, 3.0 * inside.shape[axis])
-        weight = gaussian_filter1d(weight, nodes, axis=axis, mode="mirror")
-        u = gaussian_filter1d(u, nodes, axis=axis - len(spacing), mode="mirror")
+        weight = scipy.ndimage.gaussian_filter1d(weight, nodes, axis=axis, mode="mirror")
+        u = scipy.ndimage.gaussian_filter1d(u, nodes, axis=axis - len(spacing), mode="mirror")
     return u / np.where(inside, weight, 1)

@@ -24,7 +24,7 @@ from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, 
 from hks_jax.traced import is_traced
 
 _DEARER = 10.0
-"""The comparison may take so many times the work of the times that need it."""
+"""The most work of the comparison, as a multiple of the work of the times that need it."""
 
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
 HKSMethod = Literal["spectral", "spectrum-free", "auto"]
@@ -37,7 +37,7 @@ class AutomaticHKS(eqx.Module):
         values: (n_times, *shape).
         times: (n_times,).
         spectral: (n_times,) bool, which times are from the eigenpairs; the others are spectrum-free.
-        tail: (n_times,) the estimate of what the eigenpairs leave out (`truncation`), which decided.
+        tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), which decided.
         method: what the other times were computed by: ``"colouring"``, ``"selected-inversion"``, or ``"none"``.
         overlap_time: a time that both computed, NaN where there is none: the shortest from the eigenpairs.
         overlap_difference: the greatest difference there, relative to (4πt)^(−d/2).
@@ -120,7 +120,7 @@ def hks_auto(
 ) -> AutomaticHKS:
     """Compute the heat kernel signature, each time by the method that reaches it, and report on it.
 
-    A time is left to the eigenpairs where the estimated share of what they leave out is below the tolerance. The
+    A time is left to the eigenpairs where the estimated share beyond them is below the tolerance. The
     others come from `hks_spectrum_free`. Where there are times of both kinds, the shortest of the former is
     computed both ways, provided that this takes no more than ten times the work of the rest.
 

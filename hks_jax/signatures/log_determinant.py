@@ -24,7 +24,7 @@ _TIMES, _PER_DOUBLING = 12, 2
 _DOUBTFUL = 0.01
 """The error from which on a warning says so."""
 _SMALL, _TERMS, _NODES = 2.0, 20, 32
-"""Up to where E₁ is a series of so many terms; beyond it is an integral by so many points: 1e-14 for both."""
+"""Up to this argument E₁ is a series, with this many terms; beyond, an integral by as many points: 1e-14 for both."""
 
 
 class LogDeterminant(NamedTuple):
@@ -32,7 +32,7 @@ class LogDeterminant(NamedTuple):
 
     Attributes:
         value: log det′ Δ.
-        error: an estimate of its error: that of the elements, and of what the coefficients leave out of the heat trace.
+        error: an estimate of its error: that of the elements, and of the terms of the heat trace without a coefficient.
             Constant to derivatives.
         time: T, before which the heat trace is taken from its coefficients, and after which from the eigenvalues;
             likewise constant.

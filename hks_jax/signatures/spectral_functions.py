@@ -162,7 +162,7 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
     return rows, own[rows]
 
 
-# The transpose computes again what it needs: kept, that would be two copies of the eigenvectors.
+# The transpose computes its intermediate results again: kept, they would be two copies of the eigenvectors.
 @jit_quickly(static_argnames=("fixed", "copies"))
 @partial(jax.checkpoint, static_argnums=(4, 5))
 def _tangent(

@@ -4,8 +4,8 @@ import math
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Bool
-from scipy import ndimage
 
 from hks_jax.domain.components import label_nodes
 from hks_jax.eigen.weyl import weyl, weyl_number
@@ -39,7 +39,7 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
     """
     metric, spacing = np.asarray(metric), np.asarray(spacing)
     d, share = len(spacing), inside.sum() / len(metric)
-    boxes = ndimage.find_objects(label_nodes(inside, (False,) * d)[0].astype(int))
+    boxes = scipy.ndimage.find_objects(label_nodes(inside, (False,) * d)[0].astype(int))
     steps = np.array([[part.stop - part.start - 1 for part in box] for box in boxes])  # how long each component is
     along = np.einsum("naa->na", metric) * spacing**2  # squared distances of neighbours, per axis
     volume = float(np.sqrt(np.linalg.det(metric)).sum() * np.prod(spacing) * share)

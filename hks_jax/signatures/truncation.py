@@ -284,7 +284,7 @@ def truncation_map(
         times: (n_times,) positive, in (metric length)².
 
     Returns:
-        (n_times, *shape), 0 … 1, relative to what all pairs would give; NaN outside the mask, 0 at Dirichlet nodes and
+        (n_times, *shape), 0 … 1, relative to the signature of all pairs; NaN outside the mask, 0 at Dirichlet nodes and
         where all pairs were computed. Constant to derivatives.
 
     Raises:

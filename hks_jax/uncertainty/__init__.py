@@ -1,4 +1,4 @@
-"""Error bars: what the noise of measured tensors does to what is computed of them."""
+"""Error bars: the noise of measured tensors, carried to results."""
 
 from hks_jax.uncertainty.noise import TensorNoise as TensorNoise
 from hks_jax.uncertainty.propagate import uncertainty as uncertainty

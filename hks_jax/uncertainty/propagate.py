@@ -1,4 +1,4 @@
-"""From noise of tensors to noise of what is computed of them."""
+"""From noise of tensors to noise of results."""
 
 import math
 import os
@@ -30,7 +30,7 @@ _PAIRS = 4
 _SCALE = 0.5
 """The size of the noise that is added to the measured tensors, which have some already, relative to the true one."""
 _FLOOR = 0.01
-"""To what part of the mean eigenvalue those of indefinite noisy tensors are raised."""
+"""The floor of eigenvalues of indefinite noisy tensors, as a share of the mean eigenvalue."""
 _LOUD = 3.0
 """The deviation of a component over the mean diffusivity, its median over the nodes, that no measurement has."""
 

@@ -28,8 +28,8 @@ class Uncertainty(eqx.Module):
         deviation: the standard deviation that noise gives it.
         bias: the mean over noise less the value without: what noise adds to it on average.
         bias_error: the standard deviation of that estimate, from few draws.
-        beyond_linear: the variance of what is of second order in the noise over that of what is linear.
-        smear: with smoothing, what smoothing once more changes: an estimate of what smoothing did to the map itself.
+        beyond_linear: the variance of second order in the noise, over that of first order.
+        smear: with smoothing, the change by smoothing once more: an estimate of the blur of the map.
             Else None.
         indefinite: the share of tensors that noise of its full size makes indefinite.
         sampling_error: the relative standard deviation of ``deviation``, from few draws; 0 if it is exact.

@@ -28,7 +28,7 @@ from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
 
 FORGETFUL = 8
-"""After so many subjects what was compiled is forgotten: domains differ, and each leaves 70 MiB that no other uses."""
+"""Subjects after which compiled programs are forgotten: domains differ, and each leaves 70 MiB that no other uses."""
 
 PATIENCE = 0.5
 """Seconds between two looks at what other processes compute."""

@@ -26,7 +26,7 @@ SINGULAR = 1e-8
 """The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
 
 _LEAST = 100
-"""What rounding leaves of a row that should vanish, in units of ε of what the row was; and the finest tolerance."""
+"""The size of a row that vanishes but for rounding, in units of ε times its former size; and the finest tolerance."""
 _FACTORISATION = 200
 """What one factorisation costs, in solves of one row: about 100, doubled as small rows take few steps."""
 _MOST_GROUPS = 16
@@ -41,8 +41,8 @@ class Adjoint(eqx.Module, Generic[P]):
     Every eigensolver has one in its field ``adjoint``, and takes any other that can solve with the pencil.
 
     Attributes:
-        warns: whether `solve` itself warns of what does not converge, traced or not.
-        tolerance: to what the error is reduced, in the energy norm, relative to the largest row; not below what the
+        warns: whether `solve` itself warns of rows that do not converge, traced or not.
+        tolerance: of the error in the energy norm, relative to the largest row; not below what the
             eigenvectors' dtype allows.
     """
 
@@ -116,7 +116,7 @@ def amplification(values: Float[Array, " p"], k: int) -> Float[Array, " k"]:
 # MΦ, where it was taken out. It is zero. So it is in reverse mode, whose bᵢ are the cotangents of the solutions:
 # where all nodes count alike, for instance, they are multiples of Mφᵢ again.
 #
-# Small rows need fewer digits, or none: their share in what is summed over all rows is small. Where the operator
+# Small rows need fewer digits, or none: their share in sums over all rows is small. Where the operator
 # amplifies more, because λᵢ is near Λ, they count for more.
 def wanted_errors(
     before: Float[Array, " b"],
@@ -130,7 +130,7 @@ def wanted_errors(
 
     Args:
         before: the `norms` of the right-hand sides bᵢ.
-        after: those of what the projection leaves of them, Qbᵢ.
+        after: those of their projections Qbᵢ.
         largest: the largest of all right-hand sides, other blocks included.
         amplified: how much larger the solution of a row becomes than that of another as large.
         tolerance: the accuracy of the largest row.
@@ -152,7 +152,7 @@ def norms(rows: Float[Array, "b n"], lumped: Float[Array, " n"]) -> Float[Array,
 def group_numbers(
     distance: Float[np.ndarray, " m"], rows: int, tolerance: float, most: int = _MOST_GROUPS
 ) -> Int[np.ndarray, " m"]:
-    """Return the group of each distance from Λ, of at most so many groups in geometric progression.
+    """Return the group of each distance from Λ, of a limited number of groups in geometric progression.
 
     Rows count as often as they are solved for.
 
@@ -199,7 +199,7 @@ def middles_of_gaps(
 
 
 def unsolved(failed: int | str, total: int) -> str:
-    """Say that solves for so many of all rows did not converge."""
+    """Say that solves did not converge, and for how many of all rows."""
     return (
         f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, and their part is NaN. k, "
         "or an end of the interval, may cut a cluster of eigenvalues, or the eigenpairs themselves did not converge: "

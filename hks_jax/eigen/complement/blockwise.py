@@ -100,7 +100,7 @@ def solve_in_blocks(
         first: the first row of each group of blocks.
         rhs: the right-hand sides.
         wanted: the error wanted of each; where it is infinite there is nothing to solve.
-        of_rows: what else there is of each row.
+        of_rows: more arrays, with an entry for each row.
     """
     size = min(size, len(rhs))
     starts, _ = row_blocks(len(rhs), size)

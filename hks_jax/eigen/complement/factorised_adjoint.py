@@ -73,7 +73,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     For any pencil that can be factorised: grids, above all in 2D, meshes, sparse matrices.
 
     Attributes:
-        tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
+        tolerance: of the error in the energy norm, relative to the largest row.
         solves: how often one preparation serves, about. Many solves are worth more factorisations.
     """
 
@@ -181,7 +181,7 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Float[Array, "n b"]) -> tuple[Float[Array, "n b"], Float[Array, " b"]]:
             return factor.solve_columns(stiffness(x) - eigenvalues * mass(x)), SINGULAR * inner(x, x)
 
-        # Of what rounding leaves of the known eigenvectors, A amplifies those next to σ alone.
+        # Of the traces of known eigenvectors that rounding leaves, A amplifies those next to σ alone.
         right = factor.solve_columns(b)
         return conjugate_gradients(product, takes.near, right, wanted, inner, takes.all).converged
 

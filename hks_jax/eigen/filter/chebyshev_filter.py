@@ -162,19 +162,19 @@ class Pace:
     """
 
     def __init__(self, excess: float) -> None:
-        """Begin with the largest residual, as a multiple of what counts as converged."""
+        """Begin with the largest residual, as a multiple of the residual that counts as converged."""
         self._excess, self._factor = excess, math.nan
         self._work, self._seconds = math.nan, math.nan
         self._begin = time.perf_counter()
 
     def round_done(self, excess: float, work: int) -> None:
-        """Remember a round of so many products, and the residual after it."""
+        """Remember the products of a round, and the residual after it."""
         now = time.perf_counter()
         self._factor, self._excess = self._excess / excess if excess > 0 else math.inf, excess
         self._work, self._seconds, self._begin = work, now - self._begin, now
 
     def seconds_left(self, done: int = 0, work: int = 0) -> float | None:
-        """Return what is left, a round with so many products done of so many being under way; None where unknown.
+        """Return the seconds left, with `done` of `work` products of the present round done; None where unknown.
 
         Of a round that is not under way, nothing is done, and the work is taken for that of the last.
         """

@@ -33,7 +33,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
     """Conjugate gradients, preconditioned with a Chebyshev polynomial: no factorisation. For grids, above all in 3D.
 
     Attributes:
-        tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
+        tolerance: of the error in the energy norm, relative to the largest row.
         block: right-hand sides solved at once.
     """
 

@@ -132,7 +132,7 @@ class GridFilter(eqx.Module):
 
     @jax.jit
     def excess(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, ""]:
-        """Return the largest residual of the wanted pairs, as a multiple of what counts as converged."""
+        """Return the largest residual of the wanted pairs, as a multiple of the one that counts as converged."""
         return jnp.max((state.residuals / self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit

@@ -45,7 +45,7 @@ class HostAdjoint(Adjoint[Pencil]):
     Under `jit` and `vmap` it runs through a host callback, one problem at a time.
 
     Attributes:
-        tolerance: to what the error is reduced, in the energy norm, relative to the largest row.
+        tolerance: of the error in the energy norm, relative to the largest row.
     """
 
     warns: ClassVar[bool] = True
@@ -59,7 +59,7 @@ class HostAdjoint(Adjoint[Pencil]):
         vectors: Float[Array, "p n_dof"],
         rhs: Float[Array, "k n_dof"],
     ) -> Float[Array, "k n_dof"]:
-        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`. It warns of what does not converge."""
+        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`. It warns of rows that do not converge."""
         data, matrices = host_matrices(pencil)
         tolerance = attainable(self.tolerance, rhs.dtype)
 

@@ -171,7 +171,7 @@ def orthonormal(
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
     The inner products are factorised by their eigenvalues; in kernels, for which these take long, by a pivoted Cholesky
-    factorisation. Of what rounding leaves nothing becomes infinite.
+    factorisation. Nothing becomes infinite by dividing by rounding errors.
     """
     identity = jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, which no kernel has to compute
 

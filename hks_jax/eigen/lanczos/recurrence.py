@@ -103,7 +103,7 @@ def block_lanczos(
 def _begin(
     pencil: SymmetricPencil, start: Float[Array, "n_dof b"], known: Float[Array, "w n_dof"], room: int
 ) -> _Recurrence:
-    """Return the state before the first step: the first block is orthogonal to what is known."""
+    """Return the state before the first step: the first block is orthogonal to the known vectors."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2 if len(known) else 0):
         block = block - combine(products_with_columns(known, mass(block)).T, known).T

@@ -75,7 +75,7 @@ def _consider(
     # Another shift costs a factorisation, refined solves more: they are for where it is no better.
     moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
 
-    # Beyond a wide gap there may be very many at once: then the bracket of what is complete and what is too far is cut.
+    # Beyond a wide gap there may be very many at once: then the bracket between complete and too far is cut.
     start = jnp.maximum(state.reached, state.complete_below)
     share = jnp.maximum(plan.slice_size / (2.5 * jnp.maximum(missing, 1).astype(state.shift.dtype)), 1 / 4)
     nearer = start + share * (state.shift - start)

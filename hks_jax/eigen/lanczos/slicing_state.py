@@ -76,7 +76,7 @@ class Plan(NamedTuple):
 
 
 def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
-    """Return how many Lanczos blocks, an even number, find so many eigenvalues.
+    """Return the number of Lanczos blocks, even, that finds a number of eigenvalues.
 
     Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
     """
@@ -102,7 +102,7 @@ class SlicingState(NamedTuple):
         slices: factorisations so far.
         moved: how often in a row the shift was moved because the factorisation was inaccurate there.
         passes: how often to solve: once, or again with the residual.
-        stuck: whether the last search found nothing of what is missing.
+        stuck: whether the last search found none of the missing pairs.
         finished: whether all is found and certified.
     """
 
@@ -158,7 +158,7 @@ def unfinished(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
 
 
 def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
-    """Return whether to forget some of what is known: there is no room for what a search may find, or it is stuck."""
+    """Return whether to forget some known pairs: there is no room for those of a search, or it is stuck."""
     return state.stuck | (state.known > plan.capacity - plan.ritz)
 
 
