@@ -3,12 +3,13 @@
 from typing import Any, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from hks_jax.fem.resolution import Resolution, SampledMetric, resolution_of
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
+from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator
 from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 
 
@@ -60,9 +61,7 @@ class Pencil(SymmetricPencil):
 
     def read(self, functions: Float[Array, "... n_dof"], part: Any = None) -> Float[Array, "... n_dof"]:
         """Return the values at the free nodes of functions that are given by their unknowns (`assemble`)."""
-        if self.row_sums is None:
-            return functions
-        return (functions + self.mass.apply(functions) / self.row_sums) / 2
+        return functions if self.row_sums is None else _read(self.mass, self.row_sums, functions)
 
     def integrals(self, values: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Return the functional ∫φu of values that are `read` from φ, for functions u given by theirs."""
@@ -92,6 +91,12 @@ class Pencil(SymmetricPencil):
     def parts(self) -> tuple["Pencil", ...]:
         """The pencil itself: one problem."""
         return (self,)
+
+
+@jax.jit
+def _read(mass: Operator, row_sums: Float[Array, " n_dof"], functions: Float[Array, "... n_dof"]) -> Array:
+    columns = functions.reshape(-1, mass.size).T
+    return (functions + mass.of_columns()(columns).T.reshape(functions.shape) / row_sums) / 2
 
 
 class MirrorPencil(eqx.Module):

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import real_array
-from hks_jax.compilation import jit_quickly
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
 from hks_jax.linear.operators import DiagonalOperator, OfColumns, PatternedOperator
@@ -154,20 +153,12 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
     pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))
     known = jax.lax.stop_gradient(pencil)
     dissection = jax.tree.map(jnp.asarray, dissect(matrix.pattern))
-    fields, sound, error = _factorised(dissection, known)
-    factor = Factorisation(dissection, *fields)
-    if not is_traced(sound) and not sound:
+    factor, trial, tries = certain_factorisation(dissection, known, jnp.zeros((), matrix.dtype))
+    if not is_traced(trial) and not trial.sound:
         raise ValueError(_failure(name, known, factor))
-    return FactorisedMatrix(pencil.stiffness, factor, sound, error)
-
-
-@jit_quickly()
-def _factorised(dissection: Dissection, pencil: SymmetricPencil) -> tuple[Fields, Bool[Array, ""], Float[Array, ""]]:
-    """Return a factorisation, whether it is sound, and its error."""
-    factor, trial, tries = certain_factorisation(dissection, pencil, jnp.zeros((), pencil.stiffness.dtype))
     # A random vector is as long in the image of a matrix as the matrix in Frobenius' norm, over √n.
-    error = jnp.where(trial.sound & (tries == 1), trial.rate * math.sqrt(pencil.size), jnp.inf)
-    return (factor.downward, factor.upward, factor.pivots), trial.sound, error
+    error = jnp.where(trial.sound & (tries == 1), trial.rate * math.sqrt(matrix.size), jnp.inf)
+    return FactorisedMatrix(pencil.stiffness, factor, trial.sound, error)
 
 
 def certain_factorisation(
@@ -182,13 +173,17 @@ def certain_factorisation(
         factor = factorise(dissection, matrix, least)
         return (factor.downward, factor.upward, factor.pivots), try_out(factor, pencil, shift, probes)
 
-    def step(state: tuple[Array, tuple[Fields, Trial]]) -> tuple[Array, tuple[Fields, Trial]]:
-        return state[0] + 1, attempt(state[0])
-
-    # A loop, so that the factorisation is compiled once.
     none = jnp.zeros((), int)
-    start = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(attempt, none))
-    tries, (fields, trial) = jax.lax.while_loop(lambda s: (s[0] < 2) & ~s[1][1].sound, step, (none, start))
+    if is_traced((pencil, shift, none)):
+        # A loop, so that the factorisation is compiled once.
+        start = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(attempt, none))
+        tries, (fields, trial) = jax.lax.while_loop(
+            lambda s: (s[0] < 2) & ~s[1][1].sound, lambda s: (s[0] + 1, attempt(s[0])), (none, start)
+        )
+    else:
+        tries, (fields, trial) = none + 1, attempt(none)
+        if not trial.sound:
+            tries, (fields, trial) = none + 2, attempt(none + 1)
     return Factorisation(dissection, *fields), trial, tries
 
 
