@@ -69,9 +69,10 @@ def hks_spectrum_free(
     times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     settings = choose_method(pencil, times, method, tolerance)
-    values = [_diagonal(part, times, settings, checked=isinstance(method, Colouring)) for part in pencil.parts]
+    scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
+    values = [_diagonal(part, times, settings, scale, checked=given) for part in pencil.parts]
     # On a doubled domain, heat that starts at a node is even and odd by halves.
-    return jnp.exp(-origin * times).reshape(-1, *[1] * (values[0].ndim - 1)) * jnp.mean(jnp.stack(values), axis=0)
+    return jnp.mean(jnp.stack(values), axis=0)
 
 
 def colouring(
@@ -124,12 +125,15 @@ def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
 
 
 def _diagonal(
-    part: Pencil, times: Float[Array, " m"], settings: Colouring | None, checked: bool
+    part: Pencil, times: Float[Array, " m"], settings: Colouring | None, scale: Float[Array, " m"], checked: bool
 ) -> Float[Array, "m *shape"]:
+    # Scales come before NaN outside, which would reach their derivatives as 0·NaN.
     space = part.space
     if settings is None:
-        return space.extend(selected_inversion(part.stiffness, part.mass, times, dissect(part.pattern)))
-    values = _by_colours(settings, part, times)
+        return space.extend(
+            scale[:, None] * selected_inversion(part.stiffness, part.mass, times, dissect(part.pattern))
+        )
+    values = scale.reshape(-1, *[1] * len(space.node_shape)) * _by_colours(settings, part, times)
     if checked:
         # A factor, so that the derivatives are NaN too.
         fits = _fits(settings, *jax.lax.stop_gradient((part, times)))
