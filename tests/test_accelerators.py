@@ -126,6 +126,7 @@ def test_kernels_of_columns(rng, n, b, dtype):
     np.testing.assert_allclose(rest, x - y @ total - z @ mix, rtol=tolerance, atol=n * tolerance)
 
 
+@pytest.mark.slow
 def test_the_recurrence_by_kernels_is_the_plain_one(rng, monkeypatch):
     pencil = pencil_of(rng, "mask")
     mass = pencil.mass.of_columns()
@@ -177,7 +178,7 @@ def test_dependent_columns_become_orthonormal_in_two_passes(rng):
     assert np.abs(products).max() < 10
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_kernels_prove_themselves_at_the_first_use(dtype, monkeypatch):
     monkeypatch.setattr(accelerators, "_PROVED", {})
     assert not column_kernels.agree(dtype)  # no GPU here, and nothing to prove

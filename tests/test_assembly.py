@@ -42,7 +42,7 @@ def test_agrees_with_scikit_fem(rng, shape):
         assert abs(ours.to_scipy() - theirs).max() <= 1e-12 * abs(theirs).max()
 
 
-@pytest.mark.parametrize("shape", [(4, 5), (3, 3, 4)])
+@pytest.mark.parametrize("shape", [(4, 5), pytest.param((3, 3, 4), marks=pytest.mark.slow)])
 def test_log_euclidean_interpolation_agrees_with_scikit_fem_and_commutes_with_inversion(rng, shape):
     grid = hj.Grid(shape, (0.3, 0.7, 0.5)[: len(shape)])
     D = random_spd(rng, shape)

@@ -119,6 +119,7 @@ def test_multiplicities_beyond_the_block_are_complete():
     np.testing.assert_array_equal(multiplicities, [12, 24, 12, 24])
 
 
+@pytest.mark.slow
 def test_torus_multiplets_and_certificate():
     pencil = hj.assemble(flat((32, 32), (1.0, 1.0), (True, True)), "periodic")
     pairs = hj.eigenpairs(pencil, 57, solver="block-lanczos")

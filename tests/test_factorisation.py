@@ -77,6 +77,7 @@ def by_dense(pencil, shift, b):
     return inverse @ b, jnp.linalg.slogdet(matrix)[1], jnp.diag(inverse)
 
 
+@pytest.mark.slow
 def test_derivatives_by_entries_shift_and_right_hand_sides_of_first_and_second_order(rng):
     """In both modes, at an indefinite pencil, beside JAX's own of the dense matrix."""
     pencil = hj.sparse_pencil(*indefinite(70))

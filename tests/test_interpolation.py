@@ -30,7 +30,7 @@ def energy(grid):
 @pytest.mark.parametrize(
     ("shape", "isotropic"),
     [
-        ((4, 5), True),
+        pytest.param((4, 5), True, marks=pytest.mark.slow),
         ((4, 5), False),
         pytest.param((3, 4, 3), True, marks=pytest.mark.slow),
         pytest.param((3, 4, 3), False, marks=pytest.mark.slow),
@@ -58,6 +58,7 @@ def test_batches_agree_with_a_loop(rng):
     np.testing.assert_allclose(jax.vmap(stiffness)(batch), jnp.stack([stiffness(T) for T in batch]), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_mirror_is_the_reflected_domain(rng):
     grid = hj.Grid((7, 6), (0.2, 0.25))
     x, y = np.moveaxis(grid.nodes, -1, 0)

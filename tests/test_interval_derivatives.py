@@ -153,7 +153,7 @@ def test_solves_between_what_is_left(rng):
     assert jnp.isfinite(x[jnp.arange(k) != 3]).all()
 
 
-@pytest.mark.parametrize("most", [3, 8])
+@pytest.mark.parametrize("most", [pytest.param(3, marks=pytest.mark.slow), 8])
 def test_an_origin_is_lowered_past_few_eigenvalues(most):
     values = np.sort(np.r_[np.arange(20.0), 25.0 + 0.1 * np.arange(40), [30.0] * 12, 33.0])
     pencil = hj.sparse_pencil(sp.diags(values).tocsr() + 0 * lattice_pattern(values.size))

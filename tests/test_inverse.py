@@ -266,6 +266,7 @@ def test_unobserved_entries_may_be_nan_and_do_not_count(rng):
     assert error(fit, CONFORMAL) < 1e-2
 
 
+@pytest.mark.slow
 def test_gauss_newton_needs_fewer_signatures_than_lbfgs():
     target = signature(CONFORMAL)
     newton = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, max_steps=4)

@@ -39,7 +39,9 @@ def operators(kind, matrix):
         yield (half * 6 + negative * 4 - lx.MatrixLinearOperator(matrix, tag)) / 2 + half * 2
 
 
-@pytest.mark.parametrize("kind", ["real", "tridiagonal", "hermitian", "complex"])
+@pytest.mark.parametrize(
+    "kind", ["real", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("tridiagonal", "hermitian", "complex"))]
+)
 def test_solutions_transposes_and_conjugates(rng, kind):
     matrix = matrix_of(kind, rng)
     b = jnp.asarray(matrix @ rng.standard_normal(N))
@@ -58,7 +60,7 @@ def test_solutions_transposes_and_conjugates(rng, kind):
     np.testing.assert_allclose(SOLVER.compute(state, b, options)[0], np.linalg.solve(matrix.conj().T, b), atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["real", "hermitian"])
+@pytest.mark.parametrize("kind", ["real", pytest.param("hermitian", marks=pytest.mark.slow)])
 def test_derivatives_under_vmap_of_first_and_second_order(rng, kind):
     """By operator and vector, beside those of `jnp.linalg.solve`."""
     matrices, changes = (jnp.asarray([matrix_of(kind, rng) for _ in range(3)]) for _ in range(2))

@@ -102,6 +102,7 @@ def flat_torus(scale, n=24):
     return hj.TensorField(hj.Grid((n, n), 1 / n), metric)
 
 
+@pytest.mark.slow
 def test_of_elements_with_the_derivative_by_the_metric():
     """A torus √s × 1, periodic: the value within its estimate, which the spacing makes; the slope by differences."""
 

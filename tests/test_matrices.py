@@ -96,7 +96,9 @@ def cut(spectrum, least):
     return next(k for k in range(least, len(spectrum)) if spectrum[k] - spectrum[k - 1] > 1e-3 * np.ptp(spectrum[:k]))
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name", [n if n in ("truss", "K − V") else pytest.param(n, marks=pytest.mark.slow) for n in PROBLEMS]
+)
 def test_hks_and_its_derivative_by_the_entries(name, rng):
     matrices, zeros = PROBLEMS[name]
     K, M = matrices()
@@ -139,6 +141,7 @@ def test_zeros_are_counted(name):
     assert pairs.converged.all()
 
 
+@pytest.mark.slow
 def test_potentials_from_every_solver(rng):
     """Changing the stiffness of an assembled pencil: the right spectrum, or a refusal."""
     pencil = hj.assemble(hj.TensorField(hj.Grid((26, 25), 1 / 25), random_spd(rng, (26, 25))))

@@ -136,6 +136,7 @@ def test_densities_and_potentials_with_other_solvers_and_without_a_spectrum(pote
         np.testing.assert_allclose(found, hj.hks(everything, [0.1, 0.3]), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_of_signatures_by_potential_and_density(rng):
     """Forward and reverse, under jit and vmap, against differences; V in the nodes, ρ on the elements."""
     field = hj.TensorField(hj.Grid((7, 8)), random_spd(rng, (7, 8), 0.5))
@@ -156,7 +157,7 @@ def test_derivatives_of_signatures_by_potential_and_density(rng):
     np.testing.assert_allclose(jnp.einsum("t...ij,...ij->t", by_tensors, turn), slope, rtol=1e-5)
 
 
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("sign", [-1, pytest.param(1, marks=pytest.mark.slow)])
 def test_doubled_domain_with_a_potential(rng, sign):
     """The four problems of "mirror", each with an origin of its own, make up the torus with the potential reflected."""
     n = 9
@@ -228,7 +229,7 @@ def elasticity(u, v, w):
     return 2 * w["mu"] * jnp.sum(strain * other) + w["lam"] * jnp.trace(u.grad) * jnp.trace(v.grad)
 
 
-@pytest.mark.parametrize("domain", ["grid", "tetrahedra"])
+@pytest.mark.parametrize("domain", ["grid", pytest.param("tetrahedra", marks=pytest.mark.slow)])
 def test_elasticity_agrees_with_scikit_fem_and_has_rigid_modes(rng, domain):
     fields = {"mu": 1.3, "lam": 0.7}
     if domain == "grid":

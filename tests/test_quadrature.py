@@ -203,7 +203,7 @@ def reading(grid, boundary, interpolation="linear", k=6):
     [
         (hj.Grid((5, 4), (0.8, 1.1), mask=MASK), "neumann", "linear"),
         pytest.param(hj.Grid((5, 4), mask=MASK), "mean", "log-euclidean", marks=pytest.mark.slow),
-        (hj.Grid((3, 4)), ("mirror", "dirichlet"), "linear"),
+        pytest.param(hj.Grid((3, 4)), ("mirror", "dirichlet"), "linear", marks=pytest.mark.slow),
         pytest.param(
             hj.Grid((3, 3, 3), (1.0, 0.7, 1.2)), ("periodic", *["neumann"] * 2), "linear", marks=pytest.mark.slow
         ),
