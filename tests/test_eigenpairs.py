@@ -249,3 +249,16 @@ def test_bad_settings_are_named():
     np.testing.assert_allclose(
         hj.eigenpairs(hj.assemble(field, "dirichlet"), 3).eigenvalues, hj.eigenpairs(field, 3, "dirichlet").eigenvalues
     )
+
+
+@pytest.mark.parametrize(("boundary", "mass"), [("neumann", "consistent"), ("mean", "lumped")])
+def test_equations_of_masked_nodes_are_not_among_the_pairs(rng, boundary, mass):
+    """Most nodes being inside, the rest have equations of their own; few pairs or nearly all, none is of them."""
+    mask = np.ones((12, 13), bool)
+    mask[:3, :4] = mask[9:, 10:] = False
+    field = hj.TensorField(hj.Grid(mask.shape, mask=mask), random_spd(rng, mask.shape))
+    exact = hj.eigenpairs(field, 120, boundary, "dense", mass)
+    for k in (15, 120):
+        pairs = hj.eigenpairs(field, k, boundary, "shift-invert", mass)
+        assert pairs.vectors.shape == (k, mask.sum())
+        np.testing.assert_allclose(pairs.eigenvalues, exact.eigenvalues[:k], rtol=1e-9, atol=1e-11)

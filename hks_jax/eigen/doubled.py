@@ -29,7 +29,7 @@ def solve_doubled(
     a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask for all that there can be.
     """
     parts, total = pencil.parts, k + extra
-    whole = pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil)
+    whole = pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, total)
     limits = _limits(pencil, total)
     traced = is_traced(jax.lax.stop_gradient(pencil))
     wanted = limits if traced else [*map(min, limits, _shares(pencil, total))]

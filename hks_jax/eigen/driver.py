@@ -174,7 +174,7 @@ def _lowest(
     if isinstance(pencil, MirrorPencil):
         pairs = solve_doubled(pencil, choices, size, extra, name, throw, report)
     else:
-        whole = pencil if isinstance(choices[0], Dense) else on_all_nodes(pencil)
+        whole = pencil if isinstance(choices[0], Dense) else on_all_nodes(pencil, size + extra)
         assert isinstance(whole, Pencil)
         pairs = solve_lowest(whole, choices[0], size, extra, name, throw, report)
     return truncate(pairs, k, multiplet)
@@ -192,7 +192,9 @@ def _in_interval(
         raise ValueError("k: the problems of a doubled domain are counted one by one; leave k out")
     checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
-    whole = pencil if any(isinstance(method, Dense) for method in solvers) else on_all_nodes(pencil)
+    whole = pencil
+    if not (is_traced([each.below for each in checked]) or any(isinstance(method, Dense) for method in solvers)):
+        whole = on_all_nodes(pencil, max(int(each.below) + each.k for each in checked))
     problems = zip(whole.parts, checked, solvers, strict=True)
     solved = tuple(solve_interval(part, each, method, throw, report) for part, each, method in problems)
     if not isinstance(whole, MirrorPencil):

@@ -132,7 +132,7 @@ class Eigenpairs(eqx.Module):
 
     def on(self, pencil: AnyPencil) -> "Eigenpairs":
         """Return the pairs as those of a pencil on the same nodes, of which others are free; see `on_all_nodes`."""
-        if pencil.space == self.space:
+        if pencil is self.pencil:
             return self
         rows = (self.space.transfer(each, pencil.space) for each in (self.vectors, self.frame))
         return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (*rows, pencil))

@@ -17,16 +17,19 @@ _FILLED = 0.6
 """The share of nodes that must be free: below it the others would cost more than compilation for the mask."""
 
 
-def on_all_nodes(pencil: AnyPencil) -> AnyPencil:
+def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
     """Return a pencil on all nodes of a grid, whose lowest eigenpairs are those of the pencil given, if that pays.
 
-    Each node that is not free is an equation of its own, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above those that anybody asks
-    for; eigenvectors of others vanish there. Where values are traced the computation is compiled for its mask in any
-    case, and the pencil is returned as it is.
+    Each node that is not free is an equation of its own, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
+    the spectrum; eigenvectors of others vanish there. Where values are traced the computation is compiled for its mask
+    in any case, and the pencil is returned as it is.
+
+    Args:
+        pencil: on any domain.
+        k: how many of its lowest pairs are to be computed; where they are more than a quarter, it is returned as it is.
     """
-    if isinstance(pencil, Pencil):
-        return _of_one(pencil)
-    return MirrorPencil(tuple(map(_of_one, pencil.parts)), pencil.including)
+    parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
+    return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)
 
 
 def _of_one(pencil: Pencil) -> Pencil:
@@ -58,9 +61,9 @@ def _of_one(pencil: Pencil) -> Pencil:
 
 
 # A Rayleigh quotient, the largest Kᵢᵢ/Mᵢᵢ is no more than the largest eigenvalue: the spectrum becomes no wider. It is
-# more than the lowest quarter of the spectrum, beyond which no solver but the dense one goes: on a uniform grid with
-# the consistent mass it is 6/h² in 2D and 9/h² in 3D, where by Weyl's law that quarter ends at 3.1/h² and 6/h². With a
-# lumped mass it is 2.7/h² in both, hence the factor.
+# more than the lowest quarter of the spectrum: on a uniform grid with the consistent mass it is 6/h² in 2D and 9/h² in
+# 3D, where by Weyl's law that quarter ends at 3.1/h² and 6/h². With a lumped mass it is 2.7/h² in both, hence the
+# factor.
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]
