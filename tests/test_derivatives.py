@@ -280,7 +280,10 @@ def test_every_signature_against_differences(rng, name, at):
     check(f, tensors, 0.1 * symmetric(rng, SHAPE), step=5e-4 if kink else 2e-3, rtol=1e-5 if kink else 1e-7)
 
 
-@pytest.mark.parametrize("name", ["hks by trace", "hks by volume", "wks", "diffusion distance"])
+@pytest.mark.parametrize(
+    "name",
+    ["hks by volume", *(pytest.param(n, marks=pytest.mark.slow) for n in ("hks by trace", "wks", "diffusion distance"))],
+)
 def test_masked_signatures_in_reverse_mode(rng, name):
     """NaN outside the mask must not leak into the cotangents of what a signature is scaled by."""
     mask = np.ones((8, 9), dtype=bool)

@@ -151,7 +151,7 @@ def test_nan_outside_the_mask_zero_on_dirichlet_nodes(rng):
 
 
 @pytest.mark.parametrize("solver", ["dense", "shift-invert"])
-@pytest.mark.parametrize("boundary", ["dirichlet", "mirror"])
+@pytest.mark.parametrize("boundary", ["dirichlet", pytest.param("mirror", marks=pytest.mark.slow)])
 def test_jit_and_vmap_give_the_looped_result(rng, solver, boundary):
     grid = hj.Grid((7, 8))
     batch = jnp.asarray(np.stack([random_spd(rng, (7, 8)) for _ in range(3)]))

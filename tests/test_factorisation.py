@@ -107,6 +107,7 @@ def test_derivatives_by_entries_shift_and_right_hand_sides_of_first_and_second_o
         np.testing.assert_allclose(found, np.full(len(found), expected[0]), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_gradient_by_the_tensors_of_a_grid_against_differences(rng):
     grid, tensors = hj.Grid((8, 9), 0.2), jnp.eye(2) + jnp.zeros((8, 9, 2, 2))
     change = rng.standard_normal((8, 9, 2, 2))

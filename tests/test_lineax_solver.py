@@ -99,6 +99,7 @@ def test_sparse_operators_of_which_one_is_large(rng):
     assert np.abs(K @ x - 0.53 * x - b).max() < 1e-12 * np.abs(x).max()
 
 
+@pytest.mark.slow
 def test_gradient_by_the_entries_of_a_sparse_operator_and_a_state_used_twice(rng):
     K, M = indefinite(60)
     pencil, b = hj.sparse_pencil(K, M), jnp.asarray(rng.standard_normal(60))

@@ -31,7 +31,7 @@ def square(x):
     return x @ x
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_harmonic_oscillator(d):
     """−Δ + |x|² has the eigenvalues d + 2n, with the multiplicities of the monomials of degree n."""
     sizes, levels, errors = {2: (19, 37), 3: (9, 13)}[d], 3 if d == 2 else 2, []
@@ -101,7 +101,7 @@ def test_gaussian_weight_has_hermite_polynomials_for_eigenfunctions():
     np.testing.assert_allclose(hj.eigenpairs(nodal, 6).eigenvalues, exact[:6], atol=0.3)
 
 
-@pytest.mark.parametrize("mass", ["consistent", "lumped"])
+@pytest.mark.parametrize("mass", ["consistent", pytest.param("lumped", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("solver", ["shift-invert", pytest.param("chebyshev-filter", marks=pytest.mark.slow)])
 def test_solvers_for_positive_matrices_count_from_the_potential_s_minimum(rng, solver, mass):
     """Also where it is far below the spectrum, and where all of it is far above zero; with derivatives."""

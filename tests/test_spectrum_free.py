@@ -53,7 +53,7 @@ def flat_scale(times, d):
     [
         pytest.param((26, 23), "neumann", "lumped", [0.005, 0.01], marks=pytest.mark.slow),
         pytest.param((26, 23), MIXED, "consistent", [0.005, 0.01], marks=pytest.mark.slow),
-        ((14, 12), "mirror", "lumped", [0.01]),
+        pytest.param((14, 12), "mirror", "lumped", [0.01], marks=pytest.mark.slow),
         pytest.param((6, 7, 5), "neumann", "consistent", [0.005], marks=pytest.mark.slow),
         ((9, 10, 8), ("periodic", "dirichlet", "neumann"), "lumped", [0.005, 0.02]),
     ],

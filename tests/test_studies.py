@@ -621,6 +621,7 @@ def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit
     assert main(command(study, "kept", "--replace", "--interpolation", "log-euclidean", *other)) == 1
 
 
+@pytest.mark.slow
 def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(study, monkeypatch, capsys, rng):
     monkeypatch.setattr(
         "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
