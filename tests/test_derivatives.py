@@ -282,7 +282,10 @@ def test_every_signature_against_differences(rng, name, at):
 
 @pytest.mark.parametrize(
     "name",
-    ["hks by volume", *(pytest.param(n, marks=pytest.mark.slow) for n in ("hks by trace", "wks", "diffusion distance"))],
+    [
+        "hks by volume",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("hks by trace", "wks", "diffusion distance")),
+    ],
 )
 def test_masked_signatures_in_reverse_mode(rng, name):
     """NaN outside the mask must not leak into the cotangents of what a signature is scaled by."""
