@@ -72,7 +72,10 @@ TRUNCATIONS = [("generic", 60), ("identity", 58)]
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize(("name", "k"), [(name, 20) for name in FIELDS] + TRUNCATIONS)
+@pytest.mark.parametrize(
+    ("name", "k"),
+    [pytest.param(name, 20, marks=pytest.mark.slow if "1e-" in name else []) for name in FIELDS] + TRUNCATIONS,
+)
 def test_hks_against_differences(rng, name, solver, k):
     tensors = FIELDS[name](rng)
     assert hj.eigenpairs(hj.TensorField(GRID, tensors), k, solver="dense").cut_multiplet == 0
@@ -264,7 +267,7 @@ QUICK = ["heat kernel", "wks", "diffusion distance", "custom"]
 @pytest.mark.parametrize(
     ("name", "at"),
     [pytest.param(name, "generic", marks=[] if name in QUICK else pytest.mark.slow) for name in SIGNATURES]
-    + [(name, "rotational") for name in MULTIPLE],
+    + [pytest.param(n, "rotational", marks=[] if n == "heat kernel" else pytest.mark.slow) for n in MULTIPLE],
 )
 def test_every_signature_against_differences(rng, name, at):
     signature = SIGNATURES[name]

@@ -324,6 +324,7 @@ def test_a_regulariser_smooths_what_noise_roughens(rng):
     assert roughness(H1(1e-4)) < 0.5 * roughness()
 
 
+@pytest.mark.slow
 def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
     target, file = signature(CONFORMAL), tmp_path / "deep" / "fit.npz"
 

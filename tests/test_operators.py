@@ -268,6 +268,7 @@ def test_elasticity_agrees_with_scikit_fem_and_has_rigid_modes(rng, domain):
     assert jnp.vdot(jax.jit(jax.grad(stiff))(jnp.asarray(mu)), direction) == pytest.approx(float(slope), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_components_know_masks_and_boundaries(rng):
     """Functions whose components do not mix have every scalar eigenvalue once for each."""
     mask = np.ones((8, 7), bool)

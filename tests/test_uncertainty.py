@@ -50,6 +50,7 @@ def test_neighbours_share_noise_as_blurred_white_noise_does():
     np.testing.assert_allclose(C[12, 12:18], np.exp(-(r**2) / (4 * 0.9**2)), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_numbers_are_exact(rng):
     grid = hj.Grid((4, 3))
     D, m = random_spd(rng, grid.shape, 0.2), 3
