@@ -33,7 +33,7 @@ LIBRARIES := $(addprefix tests/,test_import.py test_io.py test_nrrd.py test_mesh
     test_signatures.py::test_hks_and_kernel_against_the_matrix_exponential \
     test_signatures.py::test_everything_runs_under_jit \
     test_plot.py::test_hks_panels_has_one_panel_and_bar_per_time \
-    test_inverse.py::test_gauss_newton_needs_fewer_signatures_than_lbfgs \
+    test_inverse.py::test_solvers_of_optimistix_are_taken_as_they_are \
     test_cli.py::test_npz_end_to_end_equals_the_library)
 LOWEST := $(VENV)/lowest
 
