@@ -31,7 +31,7 @@ TIMES = np.array([1.5, 3.0, 6.0, 12.0])
 """In h² |T|^(1/d), h the geometric mean of the spacings and |T| the median."""
 PATCH, FINER = 44, 4
 DEPTH = 5
-"""From so many nodes off the rim on, none of it is felt at most times."""
+"""The distance from the rim, in nodes, from which on the rim is not felt at most times."""
 LEAST = 1e-4
 """Diffusivities below this, in mm²/s, are noise, and raised to it."""
 NUMBERS = (3, 10, 30)
@@ -229,7 +229,7 @@ def brain(name: str, plane: Any) -> Iterator[dict]:
         weight = np.prod([np.where(c, p, 1 - p) for c, p in zip(corner, part, strict=True)], axis=0)
         there = tuple(i + c for i, c in zip(low, corner, strict=True))
         fine += weight[..., None, None] * tensors[there]
-    # A fine node belongs to a cell, or to several, of which one is enough.
+    # A fine node may belong to several cells; one of them is enough.
     for shift in corners:
         own = [
             np.clip(np.where(p == 0, i - s, i), 0, n - 2)

@@ -30,7 +30,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
 
 COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
-"""Each has its help (the docstring), its `OPTIONS`, and `run`, which returns what is to be printed."""
+"""Each module has a docstring, which is its help, its `OPTIONS`, and `run`, which returns the text to print."""
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 

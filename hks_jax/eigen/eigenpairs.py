@@ -134,8 +134,10 @@ class Eigenpairs(eqx.Module):
         """Return the pairs as those of a pencil on the same nodes, of which others are free; see `on_all_nodes`."""
         if pencil is self.pencil:
             return self
-        rows = (self.space.transfer(each, pencil.space) for each in (self.vectors, self.frame))
-        return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (*rows, pencil))
+        vectors = self.space.transfer(self.vectors, pencil.space)
+        # The frame has the same numbers: it is moved for its derivative alone.
+        frame = self.space.transfer(self.frame, pencil.space) if is_traced(self.frame) else vectors
+        return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (vectors, frame, pencil))
 
     @property
     def null_space_known(self) -> bool:
