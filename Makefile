@@ -26,15 +26,15 @@ BIN := $(VENV)/bin
 STAMPS := $(VENV)/.stamps
 BRAIN := mdt==1.2.7
 # What rounding and the order of operations reach first: solvers, factorisations and derivatives.
-CORE := $(patsubst %,tests/test_%.py,eigenpairs block_lanczos derivatives float32)
+CORE := $(addprefix tests/,$(patsubst %,eigen/test_%.py,eigenpairs block_lanczos derivatives) signatures/test_float32.py)
 
 # What calls the libraries that the package stands on: those for files, jax and scipy, matplotlib, lineax and optimistix.
-LIBRARIES := $(addprefix tests/,test_import.py test_io.py test_nrrd.py test_mesh_io.py \
-    test_signatures.py::test_hks_and_kernel_against_the_matrix_exponential \
-    test_signatures.py::test_everything_runs_under_jit \
-    test_plot.py::test_hks_panels_has_one_panel_and_bar_per_time \
-    test_inverse.py::test_solvers_of_optimistix_are_taken_as_they_are \
-    test_cli.py::test_npz_end_to_end_equals_the_library)
+LIBRARIES := $(addprefix tests/,project/test_import.py io/test_io.py io/test_nrrd.py io/test_mesh_io.py \
+    signatures/test_signatures.py::test_hks_and_kernel_against_the_matrix_exponential \
+    signatures/test_signatures.py::test_everything_runs_under_jit \
+    plot/test_plot.py::test_hks_panels_has_one_panel_and_bar_per_time \
+    inverse/test_inverse.py::test_solvers_of_optimistix_are_taken_as_they_are \
+    cli/test_cli.py::test_npz_end_to_end_equals_the_library)
 LOWEST := $(VENV)/lowest
 
 .PHONY: browser demo test test-slow test-optimised test-lowest stress lint notebooks docs tables dist clean

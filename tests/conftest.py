@@ -1,4 +1,4 @@
-"""The suite runs in float64, with shapes checked; tests/test_float32.py runs the whole path in float32."""
+"""The suite runs in float64, with shapes checked; tests/signatures/test_float32.py runs the whole path in float32."""
 
 import gc
 import os

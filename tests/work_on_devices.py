@@ -1,4 +1,4 @@
-"""What tests/test_devices.py runs in processes of its own, where the number of devices can be chosen.
+"""What tests/project/test_devices.py runs in processes of its own, where the number of devices can be chosen.
 
     python work_on_devices.py devices                      on the (virtual) devices of this process
     python work_on_devices.py process INDEX PORT           as one of two processes that talk over loopback

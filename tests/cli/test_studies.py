@@ -33,7 +33,7 @@ from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.pairs import pairs_of
 from hks_jax.io.tables import read_table, write_table
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 BRAINS = ROOT.parent / "shared" / "data"
 SHAPE = (9, 8, 3)
 AFFINE = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])

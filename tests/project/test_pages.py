@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 # Files of the reader's, and addresses of other machines, are not here.
 NOT_HERE = ("heart.vtu", "lh.white", "dwi.nii.gz", "jax.distributed.initialize")

@@ -8,7 +8,7 @@ import pytest
 
 import hks_jax as hj
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 TENSORS, MASK = DATA / "brain_tensor.nii.gz", DATA / "brain_mask.nii.gz"
 
 pytestmark = pytest.mark.skipif(not TENSORS.exists(), reason=f"no brain data in {DATA}")

@@ -1,6 +1,6 @@
 """The finite element HKS against the short-time expansion: the error falls at the order of the first missing term.
 
-The grid's bias, O(h²/t), is removed by Richardson extrapolation from two grids. tests/test_curvature.py holds the
+The grid's bias, O(h²/t), is removed by Richardson extrapolation from two grids. `test_curvature.py` holds the
 coefficients themselves against a spectrally exact heat kernel.
 """
 

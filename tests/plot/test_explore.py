@@ -23,7 +23,7 @@ from hks_jax.io import TensorVolume, save
 from hks_jax.plot import explore
 from hks_jax.plot.explore import page as page_module
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SHAPE, TIMES = (24, 18), np.geomspace(0.01, 1, 7)
 EVIL = '</script><script>console.error("escaped")</script> <b>&amp; @@SCRIPT@@'
 needs_browser = pytest.mark.skipif(

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from concurrent_programs import PROGRAMS, run
 
-PACKAGE = Path(__file__).parent.parent / "hks_jax"
+PACKAGE = Path(__file__).parents[2] / "hks_jax"
 
 
 @pytest.mark.slow

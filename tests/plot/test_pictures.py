@@ -236,7 +236,7 @@ COMPUTATIONS = {"evenly_spaced_lines", "lic_texture", "middle_node", "number_tex
 
 @pytest.fixture(scope="module")
 def gallery():
-    path = Path(__file__).parents[1] / "docs" / "gallery.py"
+    path = Path(__file__).parents[2] / "docs" / "gallery.py"
     spec = importlib.util.spec_from_file_location("gallery", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
