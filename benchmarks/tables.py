@@ -3,7 +3,7 @@
     python benchmarks/tables.py            writes the tables, and the plots whose results have changed
     python benchmarks/tables.py --check    tells of what differs from the results, and fails (a test does the same)
 
-In README.md, benchmarks/README.md and the pages in docs/ stand comments that say what follows them, up to
+README.md, the pages in docs/ and those in benchmarks/ hold comments that say what follows them, up to
 ``<!-- end -->``:
 
     <!-- measured: machine FILE -->                          what it was measured on, and the file
@@ -11,7 +11,9 @@ In README.md, benchmarks/README.md and the pages in docs/ stand comments that sa
     <!-- measured: table FILE ROWS | COLUMNS | VALUE -->     values of one column in the rows and columns of others
     <!-- measured: plot NAME -->                             one of `plots.PLOTS`
 
-A column written ``nodes³`` is that of cubes, ``nodes²`` that of squares: 64³ and 512² are the same number.
+A column written ``nodes³`` is that of cubes, ``nodes²`` that of squares: 64³ and 512² are the same number. Among the
+columns ``NAME=PATTERN,PATTERN…`` chooses rows by their entry as one reads it; ``*`` and ``?`` stand for any characters,
+spaces and commas included.
 """
 
 import json
@@ -19,6 +21,7 @@ import math
 import os
 import re
 import sys
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +88,7 @@ MARKED = re.compile(r"<!-- measured: (.*?) -->(?:\n\n(?:(?!<!-- measured).)*?<!-
 
 def pages() -> list[Path]:
     """Return the pages that may show results."""
-    return [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [ROOT / "README.md", *sorted((ROOT / "benchmarks").rglob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def filled(page: Path) -> str:
@@ -203,13 +206,30 @@ def grid_of(head: list[str], body: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def table(name: str, columns: list[str]) -> str:
+def chosen(name: str, request: list[str]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the rows of a result that a request chooses, and the columns that it names.
+
+    Raises:
+        ValueError: no row matches.
+    """
+    filters = [item.split("=", 1) for item in request if "=" in item]
+    rows = [
+        row
+        for row in rows_of(name)
+        if all(any(fnmatchcase(entry(row, of), pattern) for pattern in known.split(",")) for of, known in filters)
+    ]
+    if not rows:
+        raise ValueError(f"measured: no row of {name} matches {filters}")
+    return rows, [item for item in request if "=" not in item]
+
+
+def table(name: str, request: list[str]) -> str:
     """Return a table of some columns.
 
     Raises:
         ValueError: a column that no row has.
     """
-    rows = rows_of(name)
+    rows, columns = chosen(name, request)
     for column in columns:
         if not any(column.rstrip("²³") in row for row in rows):
             raise ValueError(f"measured: no row of {name} has {column!r}; there are {', '.join(rows[0])}")
@@ -218,8 +238,8 @@ def table(name: str, columns: list[str]) -> str:
 
 def pivot(name: str, request: str) -> str:
     """Return one column's values in the rows and columns of others."""
-    left, (top,), (value,) = (part.split() for part in request.split("|"))
-    rows = rows_of(name)
+    before, (top,), (value,) = (part.split() for part in request.split("|"))
+    rows, left = chosen(name, before)
     tops = list(dict.fromkeys(row[top] for row in rows))
     cells: dict[tuple[str, ...], dict[Any, dict[str, Any]]] = {}
     for row in rows:
@@ -244,7 +264,7 @@ def differences() -> list[str]:
     found = [f"{page.relative_to(ROOT)}: its tables" for page in pages() if filled(page) != page.read_text("utf-8")]
     found += [f"docs/images/measured/{name}.svg" for name in PLOTS if not is_current(name)]
     unseen = {path.stem for path in RESULTS.glob("*.json")} - named()
-    return found + [f"benchmarks/README.md: {name}.json is shown nowhere" for name in sorted(unseen)]
+    return found + [f"benchmarks/results/{name}.json is shown nowhere" for name in sorted(unseen)]
 
 
 def main() -> None:

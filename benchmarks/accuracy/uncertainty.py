@@ -1,6 +1,6 @@
 """Error bars: how often intervals hold the truth, and what they cost.
 
-    python benchmarks/uncertainty.py [--repeats 200] [--only coverage|cost]
+    python benchmarks/accuracy/uncertainty.py [--repeats 200] [--only coverage|cost]
 
 Coverage: smooth fields with known truth on a square, a disc in its box, a cube and a sphere; four signatures of them;
 tensors measured with independent noise, of 1 to 20 % of the mean diffusivity; each measurement has intervals of its
@@ -8,10 +8,13 @@ own, which hold the truth or not. Cost: a slice of 128² nodes at eight times.
 """
 
 import argparse
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,6 @@
 """Heat kernel signatures without eigenpairs: time and error beside 500 pairs, small times in 3D, gradients.
 
-    python benchmarks/spectrum_free.py [--cases small agree inversion gradient volume] [-o FILE]
+    python benchmarks/spectrum_free/spectrum_free.py [--cases small agree inversion gradient volume] [-o FILE]
 
 ``agree``: 256² nodes, a smooth field of eigenvalues 0.8 and 1.25, at a time that 500 pairs resolve to 1e-8 (selected
 inversion) and one that they resolve to 1e-5 (colouring, lumped mass). ``small``: the same nodes at t = 4h², colouring
@@ -12,9 +12,12 @@ Seconds include compilation, where nothing else is said.
 
 import argparse
 import resource
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import equinox as eqx
 import jax

@@ -1,14 +1,17 @@
 """Many small problems: the eigenpairs of a batch of fields, one after another, mapped and vectorised.
 
-    python benchmarks/batch.py [--fields 100] [--nodes 64] [--pairs 100] [--float32] [-o FILE]
+    python benchmarks/accelerators/batch.py [--fields 100] [--nodes 64] [--pairs 100] [--float32] [-o FILE]
 
 On whatever device JAX finds. The result file holds fields per second, the compilation apart, and the machine.
 """
 
 import argparse
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp

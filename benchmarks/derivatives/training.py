@@ -1,6 +1,6 @@
 """Steps of training: a batch of fields from a small network, the loss on their signatures, and its gradient.
 
-    python benchmarks/training.py [--fields 8] [--nodes 64] [--pairs 50] [--solvers auto block-lanczos …] [-o FILE]
+    python benchmarks/derivatives/training.py [--fields 8] [--nodes 64] [--pairs 50] [--solvers auto …] [-o FILE]
 
 Each row is one solver in float32 or float64: the first step, which compiles, and the later ones, of which none does.
 Beside them stands the same step with the fields one after another (`jax.lax.map`) in place of `jax.vmap`. The result
@@ -8,10 +8,13 @@ file holds seconds, seconds of all processors together, the accuracy of the grad
 """
 
 import argparse
+import sys
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import equinox as eqx
 import jax

@@ -1,7 +1,7 @@
 """Eigensolvers of two versions of this package, in turn: whether a change made a case slower.
 
     git worktree add /tmp/before SOME_COMMIT
-    python benchmarks/versions.py /tmp/before [--cases 256²/500 48³/200 …] [--repeats 5] [-o FILE]
+    python benchmarks/first_answer/versions.py /tmp/before [--cases 256²/500 48³/200 …] [--repeats 5] [-o FILE]
 
 Each version has a process of its own for a case. They solve by turns, so that what else the machine does meets both; a
 ratio is that of the shortest times, in all and of the processors. Random and flat metrics: the flat one has
@@ -15,6 +15,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
@@ -115,7 +117,7 @@ def main() -> None:
     arguments = parser.parse_args()
     commit = ["git", "-C", str(arguments.before), "rev-parse", "--short", "HEAD"]
     before = subprocess.run(commit, capture_output=True, text=True, check=True).stdout.strip()
-    checkouts = [arguments.before.resolve(), Path(__file__).resolve().parents[1]]
+    checkouts = [arguments.before.resolve(), Path(__file__).resolve().parents[2]]
     rows = []
     for case in arguments.cases:
         for field_name in arguments.fields:

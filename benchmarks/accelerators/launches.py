@@ -1,6 +1,6 @@
 """What a GPU would have to do: kernel launches, waits of the host and peak memory of the programs that XLA makes.
 
-    python benchmarks/launches.py [--only NAME ...] [--before FILE] [-o FILE]
+    python benchmarks/accelerators/launches.py [--only NAME ...] [--before FILE] [-o FILE]
 
 XLA compiles for an NVIDIA H200 without there being one; nothing runs. Needs the wheels of ``pip install "jax[cuda13]"``
 in an environment of its own, and says so without them. The least time is for each kernel the longest of 4 µs for its
@@ -12,10 +12,13 @@ result file, of a version before.
 import argparse
 import json
 import os
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # what is needed of arrays is computed here, if there is a GPU or not
 

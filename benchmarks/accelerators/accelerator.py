@@ -1,6 +1,6 @@
 """Everything this project measures on a GPU, in one call: large grids and volumes, a batch, a gradient, small times.
 
-    python benchmarks/accelerator.py [--cases 256/500 ...] [--volumes 128/500 ...] [--float32] [-o FILE]
+    python benchmarks/accelerators/accelerator.py [--cases 256/500 ...] [--volumes 128/500 ...] [--float32] [-o FILE]
 
 Runs on whatever device JAX finds, prints a table, and writes a result file with the device's name. "host-driven" is the
 solver as it is called plainly, "whole" the same compiled into one computation. Volumes, and signatures without a
@@ -10,9 +10,12 @@ one before, take less than ten minutes.
 
 import argparse
 import math
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import batch
 import jax

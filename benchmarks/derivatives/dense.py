@@ -1,6 +1,6 @@
 """How exact derivatives of dense symmetric matrices are where eigenvalues are equal, or nearly so, and what they cost.
 
-    python benchmarks/dense.py [-o benchmarks/results/dense.json]
+    python benchmarks/derivatives/dense.py [-o benchmarks/results/dense.json]
 
 Gradients of two functions of a 12×12 matrix with eigenvalues of multiplicity 4, 3, 1, 2, 1, 1, to which noise is added:
 tr(W e^A) against SciPy's `expm_frechet`, and tr(W P), P the projector on the cluster of three, against a contour
@@ -8,8 +8,11 @@ integral of resolvents.
 """
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp

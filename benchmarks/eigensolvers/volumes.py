@@ -1,6 +1,6 @@
 """Eigensolvers on volumes: the matrix-free one beside those that factorise, the same matrices, one run.
 
-    python benchmarks/volumes.py [--cases 32/200 64/200 ...] [--solvers NAME ...] [--limit SECONDS] [-o FILE]
+    python benchmarks/eigensolvers/volumes.py [--cases 32/200 ...] [--solvers NAME ...] [--limit SECONDS] [-o FILE]
 
 Every measurement is a process of its own, so that its peak memory is its own too; one that takes longer than the limit,
 or more memory than there is, is reported as such. Timed is the eigensolver alone, from assembled matrices to
@@ -15,6 +15,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 

@@ -1,14 +1,17 @@
 """Where does the sparse solver overtake the dense one? The measurement behind ``solver="auto"``.
 
-    python benchmarks/solvers.py [-o benchmarks/results/solvers.json]
+    python benchmarks/first_answer/solvers.py [-o benchmarks/results/solvers.json]
 
 Both solvers get the same matrices in the same process. Each case is compiled, then timed, best of three; what is
 compared is the ratio. The result file holds times, the largest relative difference of the eigenvalues, and the machine.
 """
 
 import argparse
+import sys
 import warnings
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import numpy as np

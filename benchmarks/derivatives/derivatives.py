@@ -1,6 +1,6 @@
 """What a gradient costs over the value alone, and how exact it is beside the usual rules.
 
-    python benchmarks/derivatives.py [--problems 64² 32³ surface …] [-o benchmarks/results/derivatives.json]
+    python benchmarks/derivatives/derivatives.py [--problems 64² 32³ surface …] [-o benchmarks/results/derivatives.json]
 
 Cost: value-and-gradient of a loss on the HKS at eight times over the value, by all tensors of a grid or all vertices of
 a surface, same solver, same process, in turn, the first calls apart; peak memory of each in a process of its own.
@@ -18,6 +18,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +28,7 @@ from machine import RESULTS, field, timed_once, write
 
 import hks_jax as hj
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from differences import directional, heat_kernel_by_contour
 
 PROBLEMS = {

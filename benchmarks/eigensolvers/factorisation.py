@@ -1,6 +1,6 @@
 """Factorisations of sparse symmetric matrices, solves, and log-determinants with gradients, beside SuperLU and CHOLMOD.
 
-    python benchmarks/factorisation.py [--cases 128 512 s65000] [-o benchmarks/results/factorisation.json]
+    python benchmarks/eigensolvers/factorisation.py [--cases 128 512 s65000] [-o benchmarks/results/factorisation.json]
 
 Matrices K − σM of anisotropic tensors on n² nodes, or of a closed surface with bumps, definite (σ = −1) and indefinite
 (σ above about 100 eigenvalues). CHOLMOD is that of sparsax, where it is installed, and takes definite ones alone. Every
@@ -9,11 +9,14 @@ call has other numbers: it keeps factors of those it has seen.
 
 import argparse
 import os
+import sys
 from collections.abc import Callable
 from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp

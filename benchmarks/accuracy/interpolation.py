@@ -1,6 +1,6 @@
 """Linear and log-Euclidean interpolation of tensors between the nodes: errors, orders, and the estimate beside them.
 
-    python benchmarks/interpolation.py [--brain TENSORS MASK SLICE] [-o FILE]
+    python benchmarks/accuracy/interpolation.py [--brain TENSORS MASK SLICE] [-o FILE]
 
 Fields: eigenvalues (r, 1), in 3D (r, 1, √r), which turn on [−1, 1]^d; the error is the median over the coarse nodes of
 the signature's relative error against a grid several times finer. Brains: every second voxel is kept, and the signature
@@ -9,9 +9,12 @@ installed, and any other given. What is not there is left out.
 """
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import numpy as np

@@ -1,6 +1,6 @@
 """The first answer: what a new process takes from its start to the first signature, imports and compilation included.
 
-    python benchmarks/first_answer.py [--cases plane-64 …] [-o FILE]
+    python benchmarks/first_answer/first_answer.py [--cases plane-64 …] [-o FILE]
 
 Every first call runs in a process of its own: once without a cache of programs, and once with the cache that the run
 before it filled. The calls that follow in the same process are the same again, one on a grid of another spacing, one
@@ -18,6 +18,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 START = time.perf_counter()
 CASES = {

@@ -1,6 +1,6 @@
 """How many factorisations and searches block Lanczos takes, over the number that an ideal run would.
 
-    python benchmarks/slices.py [--fields 20] [-o FILE]
+    python benchmarks/eigensolvers/slices.py [--fields 20] [-o FILE]
 
 Ideal are as many searches as slices, and one factorisation more for the certificate. Fields: random smooth ones of
 anisotropies from mild to strong, and one that stalled an earlier version, whose certificate fell on a twin of the last
@@ -8,8 +8,11 @@ eigenvalue.
 """
 
 import argparse
+import sys
 from collections import Counter
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,6 @@
 """The work of each device, as counts: what it computes and what it sends, on 1, 2, 4 and 8 virtual devices.
 
-    python benchmarks/devices.py [--nodes 64 48 40] [-o FILE]
+    python benchmarks/accelerators/devices.py [--nodes 64 48 40] [-o FILE]
 
 Virtual devices share the machine's cores, so that their wall time says nothing: what is counted is what the compiler
 says of one device's program (flops of the stencil product) and what the traced program hands to collectives, loops
@@ -9,9 +9,12 @@ multiplied out. One number is a time: node·columns a second of the stencil prod
 
 import argparse
 import os
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # Before JAX starts.
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"

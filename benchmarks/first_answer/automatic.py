@@ -1,6 +1,6 @@
 """What ``solver="auto"`` chooses, beside every solver that it could have chosen: the first call, and those after it.
 
-    python benchmarks/automatic.py [--cases 128²/100 16³/50 mesh16384/100 ...] [-o benchmarks/results/automatic.json]
+    python benchmarks/first_answer/automatic.py [--cases 128²/100 16³/50 mesh16384/100 ...] [-o FILE]
 
 Each measurement is a process of its own: a whole `eigenpairs`, assembly included, of the random tensors of the other
 benchmarks or of a closed surface; the first call compiles. Single precision is JAX's default, without float64.
@@ -12,6 +12,8 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,6 @@
 """The quadrature "cancelling" beside "gauss": errors of signatures and eigenvalues, and seconds at equal error.
 
-    python benchmarks/quadrature.py [--tensors TENSORS MASK SLICE]… [--dwi IMAGES BVAL BVEC SLICE]… [-o FILE]
+    python benchmarks/accuracy/quadrature.py [--tensors TENSORS MASK SLICE]… [--dwi IMAGES BVAL BVEC SLICE]… [-o FILE]
 
 Fields: constant tensors, by what the matrices do to plane waves; on tori, flat metrics in bent coordinates, whose
 signature is a sum over images, and metrics that are curved, whose signature comes from trigonometric polynomials, in 3D
@@ -9,10 +9,13 @@ Errors are relative, root mean squares over the nodes; those of brains also for 
 """
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp

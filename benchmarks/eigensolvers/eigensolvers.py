@@ -1,6 +1,6 @@
 """The eigensolver for grids and surfaces beside its peers: the same matrices, tolerance and threads, in one run.
 
-    python benchmarks/eigensolvers.py [--cases 64/100 256/500 s65000/100 ...] [--solvers NAME ...] [-o FILE]
+    python benchmarks/eigensolvers/eigensolvers.py [--cases 64/100 s65000/100 ...] [--solvers NAME ...] [-o FILE]
 
 64/100 stands for 64² nodes of a grid and 100 pairs, s65000/100 for a closed surface with 65 000 vertices.
 
@@ -23,6 +23,8 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """Fits of a metric to its signature: how near they come, and what they cost.
 
-    python benchmarks/inverse.py                           # everything
-    python benchmarks/inverse.py --cases curve optimisers  # these; the others stay as they are in the file
+    python benchmarks/derivatives/inverse.py                           # everything
+    python benchmarks/derivatives/inverse.py --cases curve optimisers  # these; the others stay as they are in the file
 
 Fields are smooth, on the unit square; fits start from the flat metric; seven times. Errors are relative, of the
 tensors, in the Frobenius norm over all nodes.
@@ -9,11 +9,14 @@ tensors, in the Frobenius norm over all nodes.
 
 import argparse
 import json
+import sys
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import jax
 import jax.numpy as jnp
