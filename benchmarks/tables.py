@@ -1,12 +1,12 @@
 """Tables of the stored results, written into the pages that show them.
 
     python benchmarks/tables.py            writes the tables, and the plots whose results have changed
-    python benchmarks/tables.py --check    tells of what differs from the results, and fails (a test does the same)
+    python benchmarks/tables.py --check    names pages that differ from the results, and fails (a test does the same)
 
-README.md, the pages in docs/ and those in benchmarks/ hold comments that say what follows them, up to
+README.md, the pages in docs/ and those in benchmarks/ hold comments that name their content, up to
 ``<!-- end -->``:
 
-    <!-- measured: machine FILE -->                          what it was measured on, and the file
+    <!-- measured: machine FILE -->                          the machine, and the file
     <!-- measured: table FILE[/PART] COLUMN COLUMN … -->     one line per row of the results
     <!-- measured: table FILE ROWS | COLUMNS | VALUE -->     values of one column in the rows and columns of others
     <!-- measured: plot NAME -->                             one of `plots.PLOTS`
@@ -92,7 +92,7 @@ def pages() -> list[Path]:
 
 
 def filled(page: Path) -> str:
-    """Return a page with what its comments ask for."""
+    """Return a page with the content that its comments name."""
 
     def fill(found: re.Match) -> str:
         return f"<!-- measured: {found[1]} -->\n\n{section(found[1], page)}\n\n<!-- end -->"
@@ -101,7 +101,7 @@ def filled(page: Path) -> str:
 
 
 def section(request: str, page: Path) -> str:
-    """Return what a comment in a page asks for, as Markdown.
+    """Return the content that a comment names, as Markdown.
 
     Raises:
         ValueError: a request of another kind.
@@ -160,7 +160,7 @@ def flat(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def machine(name: str, page: Path) -> str:
-    """Return what a result was measured on, and a link to it."""
+    """Return the machine of a result, and a link to it."""
     content = load(name)
     on, versions = content["machine"], content["versions"]
     note = f" {content['note'][0].upper()}{content['note'][1:]}." if "note" in content else ""
@@ -258,7 +258,7 @@ def named() -> set[str]:
 
 
 def differences() -> list[str]:
-    """Return what a reader would see that is not what the results say."""
+    """Return the pages and pictures that differ from the results."""
     from plots import PLOTS, is_current
 
     found = [f"{page.relative_to(ROOT)}: its tables" for page in pages() if filled(page) != page.read_text("utf-8")]
@@ -271,7 +271,7 @@ def main() -> None:
     """Write all tables and plots, or tell which differ."""
     if sys.argv[1:] == ["--check"]:
         if found := differences():
-            sys.exit("\n".join(["error: not what benchmarks/results/ say; run `make tables`:", *found]))
+            sys.exit("\n".join(["error: these differ from benchmarks/results/; run `make tables`:", *found]))
         return
     from plots import PLOTS, is_current, write
 

@@ -2,7 +2,7 @@
 
     python benchmarks/accelerators/accelerator.py [--cases 256/500 ...] [--volumes 128/500 ...] [--float32] [-o FILE]
 
-Runs on whatever device JAX finds, prints a table, and writes a result file with the device's name. "host-driven" is the
+Runs on the device that JAX finds, prints a table, and writes a result file with the device's name. "host-driven" is the
 solver as it is called plainly, "whole" the same compiled into one computation. Volumes, and signatures without a
 spectrum on the largest of them, are in float32 in any case; of these signatures only those that, by the speed of the
 one before, take less than ten minutes.

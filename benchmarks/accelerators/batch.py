@@ -2,7 +2,7 @@
 
     python benchmarks/accelerators/batch.py [--fields 100] [--nodes 64] [--pairs 100] [--float32] [-o FILE]
 
-On whatever device JAX finds. The result file holds fields per second, the compilation apart, and the machine.
+Runs on the device that JAX finds. The result file holds fields per second, the compilation apart, and the machine.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""Compiling for a GPU that is not there, and counting what the compiled program would do on it.
+"""Compiling for an absent GPU, and counting the work of the compiled program.
 
-XLA compiles for a chip that it knows only by a description. What comes back is the optimised program, with the kernels
+XLA compiles for a chip that it knows only by a description. The result is the optimised program, with the kernels
 that it would launch and the memory that it would take. Nothing runs, so that all of this is an estimate. It needs the
 wheels of ``pip install "jax[cuda13]"``, 4.6 GB, in an environment of their own: beside a GPU JAX would use it.
 """
@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 LAUNCH = 4e-6
-"""Seconds from one kernel to the next, whatever it does: 3 to 5 µs."""
+"""Seconds from one kernel to the next, at least: 3 to 5 µs."""
 BANDWIDTH = 4.8e12
 """Bytes of memory traffic a second."""
 FLOPS = {"f64": 34e12, "f32": 67e12}
@@ -113,13 +113,13 @@ def compile_for_chip(function: Callable, *args: Any, **static: Any) -> Any:
 
 
 class Cost(NamedTuple):
-    """What a part of a program does.
+    """The work of a part of a program.
 
     Attributes:
-        launches: kernels, copies and calls of libraries, each counted once, whatever the library launches.
+        launches: kernels, copies and calls of libraries, each counted once.
         waits: how often the host waits for a number: for each turn of a loop whose length only the device knows, and
             for each conditional.
-        seconds: the least time, each launch by its bytes, its operations and what a launch takes.
+        seconds: the least time, each launch by its bytes, its operations and its overhead.
         libraries: which libraries were called, and how often.
     """
 
@@ -129,7 +129,7 @@ class Cost(NamedTuple):
     libraries: dict[str, float]
 
     def plus(self, other: "Cost", times: float = 1.0) -> "Cost":
-        """Return this and another, so many times."""
+        """Return the sum of this and another, the latter taken `times` times."""
         names = {**self.libraries, **other.libraries}
         libraries = {name: self.libraries.get(name, 0) + times * other.libraries.get(name, 0) for name in names}
         numbers = (a + times * b for a, b in zip(self[:3], other[:3], strict=True))
@@ -140,7 +140,7 @@ NOTHING = Cost(0, 0, 0, {})
 
 
 def peak_bytes(compiled: Any) -> int:
-    """Return the most memory in use at once: arguments, results and what lies between."""
+    """Return the most memory in use at once: arguments, results and temporaries."""
     memory = compiled.memory_analysis()
     own = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
     return own - memory.alias_size_in_bytes
@@ -150,7 +150,7 @@ class Program:
     """A compiled program, read from its text."""
 
     def __init__(self, compiled: Any, turns: float = 1.0) -> None:
-        """Read it; loops whose length it does not know take so many turns, conditions the mean of their branches."""
+        """Read it; loops of unknown length take a given number of turns, conditions the mean of their branches."""
         self.turns, self.bodies, self.entry = turns, {}, ""
         self.shapes: dict[str, str] = {}
         body: list[tuple[str, str, str, str]] = []
@@ -203,7 +203,7 @@ class Program:
         return Cost(1, 0, seconds, {target[1]: 1} if target else {})
 
     def _bytes(self, shape: str, kind: str, rest: str) -> float:
-        """Return what a kernel reads and writes, of arrays of which it takes slices only these."""
+        """Return the bytes that a kernel reads and writes; of arrays that it slices, only the slices."""
         operands = _operands(rest)
         called = re.search(r"calls=%?([\w.\-]+)", rest)
         if not called:
@@ -213,7 +213,7 @@ class Program:
                 return 2 * _size(self.shapes.get(operands[1], ""))
             return _size(shape) + sum(_size(self.shapes.get(operand, "")) for operand in operands)
         body = self.bodies[called[1]]
-        # What only has another shape has its own users.
+        # Arrays that only change their shape have users of their own.
         root = {name: _operands(r)[0] for name, _, k, r in body if k == "bitcast"}
 
         def origin(name: str) -> str:

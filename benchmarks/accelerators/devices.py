@@ -1,10 +1,10 @@
-"""The work of each device, as counts: what it computes and what it sends, on 1, 2, 4 and 8 virtual devices.
+"""The work of each device, as counts of operations and bytes sent, on 1, 2, 4 and 8 virtual devices.
 
     python benchmarks/accelerators/devices.py [--nodes 64 48 40] [-o FILE]
 
-Virtual devices share the machine's cores, so that their wall time says nothing: what is counted is what the compiler
-says of one device's program (flops of the stencil product) and what the traced program hands to collectives, loops
-multiplied out. One number is a time: node·columns a second of the stencil product on one device.
+Virtual devices share the machine's cores, so that their wall time says nothing. The compiler counts the flops of one
+device's stencil product, and the traced program gives the bytes of collectives, loops multiplied out. One number is a
+time: node·columns a second of the stencil product on one device.
 """
 
 import argparse
@@ -36,7 +36,7 @@ COLLECTIVES = ("ppermute", "all_to_all", "psum")
 
 
 def sent(jaxpr: Any, times: int = 1) -> dict[str, int]:
-    """Return the bytes that one device hands to each kind of collective: its share, not what algorithms make of it."""
+    """Return the bytes that one device hands to each kind of collective: its share, not the traffic of algorithms."""
     found = dict.fromkeys(COLLECTIVES, 0)
     for equation in jaxpr.eqns:
         kind = next((c for c in COLLECTIVES if equation.primitive.name.startswith(c)), None)
@@ -47,14 +47,14 @@ def sent(jaxpr: Any, times: int = 1) -> dict[str, int]:
             inner = getattr(inner, "jaxpr", inner)
             if hasattr(inner, "eqns"):
                 below = sent(inner, times * loops)
-                # How often these loops run is not known before: what they exchange could not be counted.
+                # The length of these loops is unknown, and so is their traffic.
                 assert equation.primitive.name != "while" or not any(below.values())
                 found = {c: found[c] + below[c] for c in COLLECTIVES}
     return found
 
 
 def counts(shape: tuple[int, ...], devices: int) -> dict:
-    """Return the counts of one device out of so many, an inner one."""
+    """Return the counts of an inner device of `devices`."""
     others = min(devices - 1, 1)  # to send anything to
     mesh = jax.make_mesh((devices,), ("devices",), devices=jax.devices()[:devices])
     slabs = Slabs(mesh, shape, (False,) * len(shape))

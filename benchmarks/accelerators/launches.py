@@ -1,4 +1,4 @@
-"""What a GPU would have to do: kernel launches, waits of the host and peak memory of the programs that XLA makes.
+"""The work of a GPU, estimated: kernel launches, waits of the host and peak memory of the programs that XLA makes.
 
     python benchmarks/accelerators/launches.py [--only NAME ...] [--before FILE] [-o FILE]
 
@@ -20,7 +20,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # what is needed of arrays is computed here, if there is a GPU or not
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # arrays are computed on the CPU, also beside a GPU
 
 import equinox as eqx
 import jax
@@ -57,7 +57,7 @@ GRIDS = ((256, 500), (1024, 500))
 VOLUMES = ((64, 200), (128, 500), (256, 500))
 COLUMNS = ("launches", "waits", "peak_GB", "least_ms")
 Task = tuple[str, str, int, Callable[[], tuple]]
-"""What is compiled, for which nodes and how many pairs, and how to get the function and its arguments."""
+"""The compiled functions by name, with nodes and numbers of pairs, and how to get each with its arguments."""
 
 
 def shapes_of(n: int, d: int, dtype: type) -> Pencil:
@@ -129,7 +129,7 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
 def whole(rows: list[dict], n: int, k: int) -> Iterator[dict]:
     """Yield rows for a slice, and for all pairs: as many slices as are planned, and one factorisation more.
 
-    They are the sums of what the solver, called plainly, does one after another.
+    They are the sums of the steps that the solver, called plainly, takes one after another.
     """
     plan = hj.BlockLanczos().plan(k, 1)
     parts = {row["what"]: row for row in rows if (row["nodes"], row["k"]) == (f"{n}²", k)}

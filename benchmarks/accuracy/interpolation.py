@@ -5,7 +5,7 @@
 Fields: eigenvalues (r, 1), in 3D (r, 1, √r), which turn on [−1, 1]^d; the error is the median over the coarse nodes of
 the signature's relative error against a grid several times finer. Brains: every second voxel is kept, and the signature
 there compared with that of all voxels, interpolated either way; the one that the wheel mdt carries, where it is
-installed, and any other given. What is not there is left out.
+installed, and any other given. Absent ones are left out.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def rotation(angle: np.ndarray, a: int, b: int, d: int) -> np.ndarray:
 
 
 def solve(given: hj.TensorField, k: int, times: np.ndarray) -> tuple[np.ndarray, hj.Truncation, float]:
-    """Return the signature, what the estimates say of it, and the volume."""
+    """Return the signature, its estimated errors, and the volume."""
     pairs = hj.eigenpairs(given, k)
     return np.asarray(hj.hks(pairs, times)), hj.truncation(pairs, times), float(pairs.pencil.volume)
 
@@ -93,7 +93,7 @@ def at(d: int, n: int, r: float, way: Any) -> hj.TensorField:
 
 
 def brain(name: str, volume: hj.io.TensorVolume) -> Iterator[dict[str, Any]]:
-    """Measure what the interpolation of a brain slice's metric makes of every second voxel."""
+    """Measure the error of a brain slice's interpolation from every second voxel."""
     assert volume.mask is not None
     diffusivity = np.median(np.trace(volume.tensors[volume.mask], axis1=-2, axis2=-1)) / 2
     lengths = np.array(LENGTHS) * min(volume.spacing)

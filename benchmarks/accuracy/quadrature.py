@@ -2,7 +2,7 @@
 
     python benchmarks/accuracy/quadrature.py [--tensors TENSORS MASK SLICE]… [--dwi IMAGES BVAL BVEC SLICE]… [-o FILE]
 
-Fields: constant tensors, by what the matrices do to plane waves; on tori, flat metrics in bent coordinates, whose
+Fields: constant tensors, by the action of the matrices on plane waves; on tori, flat metrics in bent coordinates, whose
 signature is a sum over images, and metrics that are curved, whose signature comes from trigonometric polynomials, in 3D
 times a circle. Brains: a patch of a slice, its tensors interpolated to a grid four times as fine for the reference.
 Errors are relative, root mean squares over the nodes; those of brains also for the nodes from the fifth off the rim on.

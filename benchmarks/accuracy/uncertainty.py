@@ -1,4 +1,4 @@
-"""Error bars: how often intervals hold the truth, and what they cost.
+"""Error bars: how often intervals hold the truth, and their cost.
 
     python benchmarks/accuracy/uncertainty.py [--repeats 200] [--only coverage|cost]
 
@@ -118,7 +118,7 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def measurements(compute: Callable[[Any], Any], D: Any, seeds: Any) -> Callable[[float], dict[str, Any]]:
-    """Return a function from a level of noise to what many measurements of these tensors had, in the mean over all."""
+    """Return a function from a level of noise to the mean over many measurements of these tensors."""
     truth = compute(D)
 
     @jax.jit
@@ -153,7 +153,7 @@ def relative(D: Any, level: Any) -> hj.TensorNoise:
 def judged(
     true: Any, first: Any, second: Any, value: Any, deviation: Any, bias: Any, beyond: Any, claimed: Any
 ) -> dict[str, Any]:
-    """Return for each entry what part of the nodes has the truth inside, and the medians of what decides on claims."""
+    """Return for each entry the share of nodes with the truth inside, and the medians that decide on claims."""
     known = (jnp.isfinite(true) & (deviation > 1e-12)).reshape(len(true), -1)
 
     def share(hit: Any) -> Any:

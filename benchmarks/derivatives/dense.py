@@ -1,4 +1,4 @@
-"""How exact derivatives of dense symmetric matrices are where eigenvalues are equal, or nearly so, and what they cost.
+"""Errors and cost of derivatives of dense symmetric matrices at equal and nearly equal eigenvalues.
 
     python benchmarks/derivatives/dense.py [-o benchmarks/results/dense.json]
 

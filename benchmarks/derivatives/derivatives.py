@@ -1,4 +1,4 @@
-"""What a gradient costs over the value alone, and how exact it is beside the usual rules.
+"""Cost of a gradient over the value alone, and its error beside the usual rules.
 
     python benchmarks/derivatives/derivatives.py [--problems 64² 32³ surface …] [-o benchmarks/results/derivatives.json]
 
@@ -44,7 +44,7 @@ N_TIMES = 8
 
 
 def loss_on(name: str) -> tuple[Callable, jax.Array]:
-    """Return a loss on the HKS at eight times, and what it is a function of."""
+    """Return a loss on the HKS at eight times, and its argument."""
     make, k, solver = PROBLEMS[name]
     domain = make()
     dimension = hj.assemble(domain).space.dimension
@@ -83,7 +83,7 @@ def cost(name: str, memory: bool) -> dict:
     """Measure one problem."""
     loss, x = loss_on(name)
     seconds, gradients, gradient = [], [], None
-    for _ in range(3):  # value and gradient in turn, so that they share what else the machine does; the first compiles
+    for _ in range(3):  # value and gradient in turn, so that other work on the machine meets both; the first compiles
         seconds.append(timed_once(loss, x)[0])
         spent, (_, gradient) = timed_once(jax.value_and_grad(loss), x)
         gradients.append(spent)

@@ -1,4 +1,4 @@
-"""Fits of a metric to its signature: how near they come, and what they cost.
+"""Fits of a metric to its signature: their errors and their cost.
 
     python benchmarks/derivatives/inverse.py                           # everything
     python benchmarks/derivatives/inverse.py --cases curve optimisers  # these; the others stay as they are in the file
@@ -47,11 +47,11 @@ KINDS: dict[str, tuple[Callable, float, int]] = {
     "conformal": (conformal, 0.0045, 139),
     "log-euclidean": (full, 0.0023, 267),
 }
-"""Tensors, the smallest time, and k: the same for target and fit, so that what lies beyond does not matter."""
+"""Tensors, the smallest time, and k: the same for target and fit, so that the rest of the spectrum does not matter."""
 
 
 def setting(n: int, kind: str, refined: int = 1) -> tuple[hj.TensorField, np.ndarray, np.ndarray, int]:
-    """Return the truth on n² nodes, times, the target (made on a grid refined so many times), and k."""
+    """Return the truth on n² nodes, times, the target (made on a grid `refined` times as fine), and k."""
     tensors, smallest, k = KINDS[kind]
     k = min(k, n * n // 4)  # more are far from those of the manifold
     times = np.geomspace(smallest, 0.13, 7)
@@ -113,7 +113,7 @@ def crime() -> list[dict]:
 
 
 def curve() -> list[dict]:
-    """The error against the weight of a penalty, with noise, and what the discrepancy principle makes of it."""
+    """The error against the weight of a penalty, with noise, and the error by the discrepancy principle."""
     rows = [run(32, "log-euclidean", 0.01)]
     for weight in (1e-9, 1e-8, 1e-7, 1e-6, 1e-5):
         row = run(32, "log-euclidean", 0.01, regularisers=[H1(weight)], max_steps=8)

@@ -2,7 +2,7 @@
 
     python benchmarks/derivatives/training.py [--fields 8] [--nodes 64] [--pairs 50] [--solvers auto …] [-o FILE]
 
-Each row is one solver in float32 or float64: the first step, which compiles, and the later ones, of which none does.
+Each row is one solver in float32 or float64: the first step, which compiles, and the later ones, which do not.
 Beside them stands the same step with the fields one after another (`jax.lax.map`) in place of `jax.vmap`. The result
 file holds seconds, seconds of all processors together, the accuracy of the gradient, and the machine. It needs optax.
 """
@@ -50,7 +50,7 @@ class Network(eqx.Module):
 
 
 def training(fields: int, n: int, k: int, solver: str, one_by_one: bool) -> tuple[Callable, Callable, tuple]:
-    """Return a step of Adam, the loss, and what they begin with."""
+    """Return a step of Adam, the loss, and their first arguments."""
     grid, dtype = hj.Grid((n, n), 1 / (n - 1)), jnp.result_type(float)
     nodes, times = jnp.asarray(grid.nodes, dtype), jnp.asarray(TIMES, dtype)
     keys = jax.random.split(jax.random.key(0), 3)

@@ -55,7 +55,7 @@ def domain(name: str) -> "hj.TensorField | hj.SurfaceMesh":
 
 
 def ours(name: str, k: int) -> tuple[Callable[[], tuple], dict]:
-    """Block Lanczos of this package, compiled: it returns also below what eigenvalue all are known."""
+    """Block Lanczos of this package, compiled: it also returns the eigenvalue below which all are known."""
     import jax
 
     import hks_jax as hj
@@ -160,7 +160,7 @@ def quality(name: str, pairs: Sequence[np.ndarray]) -> dict:
 
 
 def peak_memory() -> float:
-    """Return this process's peak memory in GB (Linux). What `resource` tells is inherited from the parent."""
+    """Return this process's peak memory in GB (Linux). The number of `resource` is inherited from the parent."""
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1e6
 
@@ -173,7 +173,7 @@ def timed(run: Callable[[], tuple]) -> tuple[float, tuple]:
 
 
 def measure_here(solver: str, name: str, k: int, compiling: bool) -> None:
-    """Run one solver in this process and print what it took as JSON; or what compiling it took, alone."""
+    """Run one solver in this process and print its cost as JSON; or the cost of its compilation alone."""
     if compiling:
         import jax
 
@@ -196,7 +196,7 @@ def measure_here(solver: str, name: str, k: int, compiling: bool) -> None:
 
 
 def measure(solver: str, name: str, k: int, reference: list[float], slepc_python: str, limit: float) -> dict | str:
-    """Run one solver in a process of its own; return what it took, or why it did not run."""
+    """Run one solver in a process of its own; return its cost, or why it did not run."""
     if solver in SLEPC:
         if not reference:
             return "needs the interval's end, from another solver"

@@ -24,7 +24,7 @@ def matrix(name: str) -> PETSc.Mat:
 
 
 def main() -> None:
-    """Solve, and print what it took as JSON."""
+    """Solve, and print the cost as JSON."""
     method, package, n, k, end, tolerance = sys.argv[1:]
     K, M = matrix(f"K{n}_csr.npz"), matrix(f"M{n}_csr.npz")
     start = time.perf_counter()

@@ -26,7 +26,7 @@ SOLVERS = ("chebyshev-filter", "block-lanczos", "eigsh, SuperLU")
 
 
 def measure_here(name: str, n: int, k: int, memory: float) -> None:
-    """Run one solver in this process, and print what it took as JSON."""
+    """Run one solver in this process, and print its cost as JSON."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -70,7 +70,7 @@ def eigsh(K, M, k: int) -> tuple[np.ndarray, np.ndarray, dict]:
 
 
 def measure(name: str, n: int, k: int, limit: float, memory: float) -> dict:
-    """Run one solver in a process of its own; return what it took, or why it did not run."""
+    """Run one solver in a process of its own; return its cost, or why it did not run."""
     command = [sys.executable, __file__, "--here", name, str(n), str(k), str(memory)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=limit)

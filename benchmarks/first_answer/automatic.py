@@ -1,4 +1,4 @@
-"""What ``solver="auto"`` chooses, beside every solver that it could have chosen: the first call, and those after it.
+"""Times of all solvers among which ``solver="auto"`` chooses: the first call, and later ones.
 
     python benchmarks/first_answer/automatic.py [--cases 128²/100 16³/50 mesh16384/100 ...] [-o FILE]
 

@@ -1,4 +1,4 @@
-"""The first answer: what a new process takes from its start to the first signature, imports and compilation included.
+"""The first answer: seconds from the start of a process to its first signature, imports and compilation included.
 
     python benchmarks/first_answer/first_answer.py [--cases plane-64 …] [-o FILE]
 

@@ -2,8 +2,8 @@
 
     python benchmarks/first_answer/solvers.py [-o benchmarks/results/solvers.json]
 
-Both solvers get the same matrices in the same process. Each case is compiled, then timed, best of three; what is
-compared is the ratio. The result file holds times, the largest relative difference of the eigenvalues, and the machine.
+Both solvers get the same matrices in the same process. Each case is compiled, then timed, best of three;
+the ratio is compared. The result file holds times, the largest relative difference of the eigenvalues, and the machine.
 """
 
 import argparse

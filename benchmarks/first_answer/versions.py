@@ -3,7 +3,7 @@
     git worktree add /tmp/before SOME_COMMIT
     python benchmarks/first_answer/versions.py /tmp/before [--cases 256²/500 48³/200 …] [--repeats 5] [-o FILE]
 
-Each version has a process of its own for a case. They solve by turns, so that what else the machine does meets both; a
+Each version has a process of its own for a case. They solve by turns, so that other work on the machine meets both; a
 ratio is that of the shortest times, in all and of the processors. Random and flat metrics: the flat one has
 multiplets.
 """
@@ -57,7 +57,7 @@ def parsed(case: str) -> tuple[int, int, int]:
 
 
 def compare(case: str, field_name: str, checkouts: list[Path], repeats: int) -> dict:
-    """Return what both versions take for a case, the older one first."""
+    """Return the times of both versions for a case, the older one first."""
     command = [sys.executable, __file__, "--answer", case, field_name]
     running = [
         subprocess.Popen(
