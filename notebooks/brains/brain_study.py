@@ -1,6 +1,6 @@
 """A study of public brains: from tensors and scans to one table of regions, for two boundaries (docs/studies.md).
 
-    python docs/brain_study.py BRAINS [-o brains]
+    python notebooks/brains/brain_study.py BRAINS [-o brains]
 
 BRAINS is a folder with what there is of brain_tensor.nii.gz and brain_mask.nii.gz (tensors and their mask) and of
 brain_dwi.nii.gz, .bval and .bvec (a scan); the brain of ``hks-jax demo`` joins them where the wheel mdt==1.2.7 is

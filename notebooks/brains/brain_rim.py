@@ -1,6 +1,6 @@
 """Draw a brain slice's signature around 1, with natural conditions on the rim and with the mean (docs/choices.md).
 
-    python docs/brain_rim.py [-k 300] [-o docs/images]
+    python notebooks/brains/brain_rim.py [-k 300] [-o docs/images]
 
 The brain is that of ``hks-jax demo``: it takes the wheel mdt==1.2.7 and DIPY.
 """

@@ -1,6 +1,6 @@
 """Test and retest on one brain: the halves of a scan, their difference, and what error bars predict of it.
 
-    python docs/brain_noise.py [-o brain-noise]
+    python notebooks/brains/brain_noise.py [-o brain-noise]
 
 The brain is the one of ``hks-jax demo`` (the wheel mdt==1.2.7): 13 images without weighting and 30 directions at
 b = 1000 s/mm². Every second image makes one half, the others make the other (docs/error-bars.md). Writes halves.json,

@@ -1,6 +1,6 @@
 """Draw a brain's signature in the whole volume, and one slice of it beside the slice alone (docs/volumes.md).
 
-    python docs/brain_volume.py TENSORS MASK [--slice 14] [-k 100] [-o docs/images]
+    python notebooks/brains/brain_volume.py TENSORS MASK [--slice 14] [-k 100] [-o docs/images]
 
 TENSORS and MASK are NIfTI files of diffusion tensors, mm²/s, and of the brain.
 """

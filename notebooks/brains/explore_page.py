@@ -1,6 +1,6 @@
 """Draw docs/images/explore.png: the page of the demo's brain, in a headless Chromium (docs/explore.md).
 
-python docs/explore_page.py [-o docs/images/explore.png]
+python notebooks/brains/explore_page.py [-o docs/images/explore.png]
 """
 
 import argparse
@@ -15,7 +15,7 @@ import numpy as np
 import hks_jax as hj
 from hks_jax.cli.demo import B_MAX, RIM
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from browser import Browser
 
 BOUNDARY, PAIRS = "mean", 400
