@@ -61,7 +61,7 @@ def panels() -> Figure:
 
 
 def glyphs() -> Figure:
-    """Ellipses show the unit circles of the metric. Their colour is the anisotropy or the orientation."""
+    """Ellipses show the unit circles of the metric; their colour is the anisotropy or the orientation."""
     field = brain_like()
     figure = plot.new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2)
@@ -110,7 +110,7 @@ def degenerate() -> Figure:
 
 
 def curves() -> Figure:
-    """Solid curves are HKS(t) at two points, dashed curves its expansion. Shading marks the unresolved times."""
+    """Solid curves show HKS(t) at two points; dashed curves show its expansion. Shading marks unresolved times."""
     field = hj.examples.sphere_field(41, 1.5)
     pairs = hj.eigenpairs(field, 150, multiplet="drop")
     times = jnp.geomspace(0.005, 3, 60)
@@ -170,7 +170,7 @@ def around_one() -> Figure:
 
 
 def ball() -> Figure:
-    """In (4πt)^(3/2)·HKS of a ball, a natural rim hides two inclusions. The mean shows them and the rim's curvature."""
+    """In (4πt)^(3/2)·HKS of a ball, a natural rim hides two inclusions; the mean shows them and the rim's curvature."""
     n = 24
     grid = hj.Grid((n, n, n), 2 / (n - 1), -1.0)
     x, y, z = np.moveaxis(grid.nodes, -1, 0)
