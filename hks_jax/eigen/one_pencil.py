@@ -103,21 +103,13 @@ def _is_far(pencil: SymmetricPencil, values: Float[Array, " k"]) -> bool:
 
 
 class Interval(NamedTuple):
-    """An interval of the spectrum of one pencil.
+    """An interval of the spectrum of one pencil."""
 
-    Attributes:
-        low: its lower end, which belongs to it.
-        high: its upper end, which does not.
-        below: how many eigenvalues lie under ``low``.
-        held: how many lie in it.
-        k: how many to compute; the same where values are concrete.
-    """
-
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-    below: Int[Array, ""]
-    held: Int[Array, ""]
-    k: int
+    low: Float[Array, ""]  # its lower end, which belongs to it
+    high: Float[Array, ""]  # its upper end, which does not
+    below: Int[Array, ""]  # how many eigenvalues lie under ``low``
+    held: Int[Array, ""]  # how many lie in it
+    k: int  # how many to compute; the same where values are concrete
 
 
 def solve_interval(

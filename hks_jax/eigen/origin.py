@@ -25,20 +25,11 @@ _NARROW = 8
 
 
 class LocatedPencil(SymmetricPencil):
-    """K − σ₀M and M, and what inertia says of the spectrum above the origin σ₀.
+    """K − σ₀M and M, and what inertia says of the spectrum above the origin σ₀; of null vectors nothing is known."""
 
-    Attributes:
-        stiffness: K − σ₀M.
-        mass: M.
-        null_space: None: that of K belongs to another eigenvalue here.
-        negative: how many eigenvalues lie below the origin.
-        first: a number above the origin with about as many eigenvalues below it as were asked for.
-        spacing: the mean distance of eigenvalues between the two.
-    """
-
-    negative: Int[Array, ""]
-    first: Float[Array, ""]
-    spacing: Float[Array, ""]
+    negative: Int[Array, ""]  # how many eigenvalues lie below the origin
+    first: Float[Array, ""]  # a number above the origin with about as many eigenvalues below it as were asked for
+    spacing: Float[Array, ""]  # the mean distance of eigenvalues between the two
 
 
 def translated(
@@ -54,23 +45,14 @@ def translated(
 
 
 class _Descent(NamedTuple):
-    """What is known of the eigenvalues next below an origin.
+    """What is known of the eigenvalues next below an origin."""
 
-    Attributes:
-        near: the largest distance tried within which there are few enough; 0 at first.
-        number: how many those are.
-        far: the least distance tried within which there are too many; ∞ before there is one.
-        far_number: how many those are.
-        next: what to try next.
-        tries: counts so far.
-    """
-
-    near: Float[Array, ""]
-    number: Int[Array, ""]
-    far: Float[Array, ""]
-    far_number: Int[Array, ""]
-    next: Float[Array, ""]
-    tries: Int[Array, ""]
+    near: Float[Array, ""]  # the largest distance tried within which there are few enough; 0 at first
+    number: Int[Array, ""]  # how many those are
+    far: Float[Array, ""]  # the least distance tried within which there are too many; ∞ before there is one
+    far_number: Int[Array, ""]  # how many those are
+    next: Float[Array, ""]  # what to try next
+    tries: Int[Array, ""]  # counts so far
 
 
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Float[Array, ""], Int[Array, ""]]:
@@ -119,23 +101,14 @@ def _descended(
 
 
 class _Search(NamedTuple):
-    """What is known between two counts.
+    """What is known between two counts."""
 
-    Attributes:
-        low: the highest number tried below which there is no eigenvalue; −∞ before there is one.
-        high: the lowest number tried below which there are some; ∞ before there is one.
-        number: how many lie below ``high``.
-        first: the highest number tried with as many below it: far from them, solves are accurate.
-        next: what to try next.
-        tries: counts so far.
-    """
-
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-    number: Int[Array, ""]
-    first: Float[Array, ""]
-    next: Float[Array, ""]
-    tries: Int[Array, ""]
+    low: Float[Array, ""]  # the highest number tried below which there is no eigenvalue; −∞ before there is one
+    high: Float[Array, ""]  # the lowest number tried below which there are some; ∞ before there is one
+    number: Int[Array, ""]  # how many lie below ``high``
+    first: Float[Array, ""]  # the highest number tried with as many below it: far from them, solves are accurate
+    next: Float[Array, ""]  # what to try next
+    tries: Int[Array, ""]  # counts so far
 
 
 def locate(

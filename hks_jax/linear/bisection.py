@@ -31,18 +31,12 @@ random closed surfaces, the factors are then as large as where the vertices' pos
 
 
 class Parts(NamedTuple):
-    """A recursive bisection of a graph: part q of a level is separated into parts 2q and 2q + 1 of the next.
+    """A recursive bisection of a graph: part q of a level is separated into parts 2q and 2q + 1 of the next."""
 
-    Attributes:
-        level: (n,) at which level each vertex belongs to a separator; what is separated no further, the cells, is the
-            last level.
-        part: (n,) the part of that level which it separates.
-        depth: the number of levels.
-    """
-
+    # at which level each vertex belongs to a separator; what is separated no further, the cells, is the last level
     level: Int[np.ndarray, " n"]
-    part: Int[np.ndarray, " n"]
-    depth: int
+    part: Int[np.ndarray, " n"]  # the part of that level which it separates
+    depth: int  # the number of levels
 
 
 def bisect_graph(n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> Parts:

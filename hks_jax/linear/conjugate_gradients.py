@@ -19,61 +19,29 @@ _KEPT, _MEMORY = 400, 4e8
 
 
 class Solution(NamedTuple):
-    """What conjugate gradients have come to.
+    """The state of conjugate gradients for one block of columns; r and p are zero for those that are done."""
 
-    Attributes:
-        x: the solutions so far; NaN where a product is.
-        errors: estimates of their relative errors, in units of those wanted; above 1 an iteration did not converge.
-        rhs: the right-hand sides.
-        steps: how many there were.
-    """
-
-    x: Float[Array, "n b"]
-    errors: Float[Array, " b"]
-    rhs: Float[Array, "n b"]
-    steps: Int[Array, ""]
+    x: Float[Array, "n b"]  # the solutions so far; at the end NaN where a product is
+    rhs: Float[Array, "n b"]  # the right-hand sides
+    r: Float[Array, "n b"]  # their residuals
+    z: Float[Array, "n b"]  # these, preconditioned
+    p: Float[Array, "n b"]  # the next directions
+    first: Float[Array, " b"]  # rᵀz at the beginning,
+    energy: Float[Array, " b"]  # and now
+    change: Float[Array, " b"]  # the energy relative to that before
+    errors: Float[Array, " b"]  # estimates, relative, in units of those wanted; above 1 an iteration did not converge
+    going: Bool[Array, " b"]  # which columns go on
+    fresh: Bool[Array, ""]  # whether the next step is the first, or the first after a restart
+    starts: Int[Array, ""]  # how many restarts there were
+    steps: Int[Array, ""]  # how many steps; −1 before the right-hand side is known
+    # the residuals of all steps, divided by √(rᵀz), and z likewise; None where none are kept
+    kept: tuple[Float[Array, "m n"], Float[Array, "m n"]] | None
 
     @property
     def converged(self) -> Float[Array, "n b"]:
         """The solutions; NaN where the error asked for is not reached."""
         xp = self.x.__array_namespace__()
         return xp.where(self.errors <= 1, self.x, xp.nan)
-
-
-class _Iteration(NamedTuple):
-    """The state of conjugate gradients for one block of columns; r and p are zero for those that are done.
-
-    Attributes:
-        x: the solutions so far.
-        rhs: the right-hand sides.
-        r: their residuals.
-        z: these, preconditioned.
-        p: the next directions.
-        first: rᵀz at the beginning,
-        energy: and now.
-        change: the energy relative to that before.
-        errors: see `Solution`.
-        going: which columns go on.
-        fresh: whether the next step is the first, or the first after a restart.
-        starts: how many restarts there were.
-        steps: how many steps; −1 before the right-hand side is known.
-        kept: the residuals of all steps, divided by √(rᵀz), and z likewise; None where none are kept.
-    """
-
-    x: Float[Array, "n b"]
-    rhs: Float[Array, "n b"]
-    r: Float[Array, "n b"]
-    z: Float[Array, "n b"]
-    p: Float[Array, "n b"]
-    first: Float[Array, " b"]
-    energy: Float[Array, " b"]
-    change: Float[Array, " b"]
-    errors: Float[Array, " b"]
-    going: Bool[Array, " b"]
-    fresh: Bool[Array, ""]
-    starts: Int[Array, ""]
-    steps: Int[Array, ""]
-    kept: tuple[Float[Array, "m n"], Float[Array, "m n"]] | None
 
 
 def _dot(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
@@ -116,7 +84,7 @@ def conjugate_gradients(
     def relative(energy: Array, first: Array) -> Array:
         return xp.sqrt(xp.abs(energy) / xp.where(first > 0, first, 1)) / wanted
 
-    def direct(state: _Iteration) -> _Iteration:
+    def direct(state: Solution) -> Solution:
         z = precondition(state.r)
         energy, begin = inner(state.r, z), state.steps == 0
         change = xp.where(state.going & ~state.fresh, energy / state.energy, 0)
@@ -124,7 +92,7 @@ def conjugate_gradients(
         z = z if orthogonal else state.z
         return state._replace(z=z, p=p, first=xp.where(begin, energy, state.first), energy=energy, change=change)
 
-    def advance(state: _Iteration) -> tuple[_Iteration, Bool[Array, " b"]]:
+    def advance(state: Solution) -> tuple[Solution, Bool[Array, " b"]]:
         p, begin = state.p, state.steps < 0
         image, least = product(p, begin) if orthogonal else product(p)
         curvature = inner(p, image)
@@ -150,7 +118,7 @@ def conjugate_gradients(
         starts = state.starts + xp.where(again, 1, 0)
         return state._replace(x=x, r=r, rhs=rhs, fresh=again, starts=starts, steps=state.steps + 1, kept=kept), regular
 
-    def step(before: _Iteration) -> _Iteration:
+    def step(before: Solution) -> Solution:
         if orthogonal:
             state, regular = advance(before)
             state = direct(state)
@@ -169,7 +137,7 @@ def conjugate_gradients(
 
     asked, one, zero = xp.isfinite(wanted), xp.ones_like(wanted), xp.zeros_like(rhs)
     room = max(min(n, _KEPT, int(_MEMORY / (2 * n * rhs.dtype.itemsize))), 1)
-    start = _Iteration(
+    start = Solution(
         x=zero,
         rhs=rhs,
         r=zero if orthogonal else xp.where(asked, rhs, 0),
@@ -187,4 +155,4 @@ def conjugate_gradients(
     )
     end = while_loop(lambda state: xp.any(state.going) & (state.steps < most), step, start)
     failed = xp.isnan(end.errors) & (most > 0)
-    return Solution(xp.where(failed, xp.nan, end.x), end.errors, end.rhs, end.steps)
+    return end._replace(x=xp.where(failed, xp.nan, end.x))

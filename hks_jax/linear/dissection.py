@@ -20,25 +20,19 @@ from hks_jax.linear.pattern import Pattern
 
 
 class Dissection(NamedTuple):
-    """The elimination tree.
+    """The elimination tree."""
 
-    Attributes:
-        levels: from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1.
-        order: (n_dof,) the place of each degree of freedom among the levels' own nodes, concatenated.
-        entries: (m,) the matrix entries, as indices into the array of entries; None: all of them, in order.
-        places: (m,) their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column,
-            unless its row is eliminated before. Out of range, where all are listed, for those that are not needed:
-            of two that are equal by symmetry one is enough.
-        padding: (p,) the places of the diagonal entries that belong to no node.
-        merged: what solves go along on accelerators; None where it is the tree itself.
-    """
-
+    # from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1
     levels: tuple[Level, ...]
-    order: Int[np.ndarray, " n_dof"]
+    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' own nodes, concatenated
+    # the matrix entries, as indices into the array of entries; None: all of them, in order
     entries: Int[np.ndarray, " m"] | None
+    # their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column, unless its row
+    # is eliminated before. Out of range, where all are listed, for those that are not needed: of two that are equal by
+    # symmetry one is enough
     places: Int[np.ndarray, " m"]
-    padding: Int[np.ndarray, " p"]
-    merged: Merged | None
+    padding: Int[np.ndarray, " p"]  # the places of the diagonal entries that belong to no node
+    merged: Merged | None  # what solves go along on accelerators; None where it is the tree itself
 
 
 def dissect(pattern: Pattern) -> Dissection:

@@ -32,18 +32,14 @@ class Factorisation(eqx.Module):
 
     A front with its own block A and the coupling B to its boundary leaves there the Schur complement C − BA⁻¹Bᵀ. A
     stack of them, for several σ, has one more axis in front.
-
-    Attributes:
-        dissection: the elimination tree.
-        downward: A⁻¹ above BA⁻¹ for each level, of the tree or merged, (fronts, s + r, s).
-        upward: (BA⁻¹)ᵀ, (fronts, s, r).
-        pivots: numbers whose product is the determinant, as many of them negative as eigenvalues; others than those of
-            degrees of freedom are 1.
     """
 
-    dissection: Dissection
+    dissection: Dissection  # the elimination tree
+    # A⁻¹ above BA⁻¹ for each level, of the tree or merged, (fronts, s + r, s)
     downward: tuple[Float[Array, "... _fronts _s_plus_r _s"], ...]
-    upward: tuple[Float[Array, "... _fronts _s _r"], ...]
+    upward: tuple[Float[Array, "... _fronts _s _r"], ...]  # (BA⁻¹)ᵀ, (fronts, s, r)
+    # numbers whose product is the determinant, as many of them negative as eigenvalues; others than those of degrees of
+    # freedom are 1
     pivots: Float[Array, "... pivots"]
 
     @property
@@ -61,18 +57,14 @@ class Factorisation(eqx.Module):
 
 
 class Trial(NamedTuple):
-    """What a factorisation is good for.
+    """What a factorisation is good for."""
 
-    Attributes:
-        sound: whether its inertia is that of K − σM.
-        rate: ‖b − (K − σM)x‖/‖b‖ of its solutions x for random b: by how much a step of iterative refinement reduces
-            the error, about.
-        error: the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x: what the residuals of eigenpairs near σ
-            computed with it cannot go below. Measured, these are 1 to 15 times as large, rarely up to 40.
-    """
-
-    sound: Bool[Array, ""]
+    sound: Bool[Array, ""]  # whether its inertia is that of K − σM
+    # ‖b − (K − σM)x‖/‖b‖ of its solutions x for random b: by how much a step of iterative refinement reduces the error,
+    # about
     rate: Float[Array, ""]
+    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x: what the residuals of eigenpairs near σ computed
+    # with it cannot go below. Measured, these are 1 to 15 times as large, rarely up to 40
     error: Float[Array, ""]
 
 

@@ -27,15 +27,10 @@ Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts
 
 
 class Cost(NamedTuple):
-    """What selected inversion of one matrix takes.
+    """What selected inversion of one matrix takes."""
 
-    Attributes:
-        operations: floating-point operations in complex arithmetic.
-        entries: how many numbers are kept at once: the factors, and the inverse on two levels.
-    """
-
-    operations: float
-    entries: float
+    operations: float  # floating-point operations in complex arithmetic
+    entries: float  # how many numbers are kept at once: the factors, and the inverse on two levels
 
 
 def diagonal_of_inverse(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Inexact[Array, " n_dof"]:

@@ -49,15 +49,10 @@ Shifted = tuple[Factorisation, Float[Array, " groups"]]
 
 
 class Groups(NamedTuple):
-    """How rows are grouped; static.
+    """How rows are grouped; static."""
 
-    Attributes:
-        first: (groups,) the first row of each group.
-        last: (groups,) its last row.
-    """
-
-    first: Int[np.ndarray, " groups"]
-    last: Int[np.ndarray, " groups"]
+    first: Int[np.ndarray, " groups"]  # the first row of each group
+    last: Int[np.ndarray, " groups"]  # its last row
 
 
 class Takes(NamedTuple):

@@ -44,77 +44,44 @@ _MOST_TERMS = 15
 
 
 class Plan(NamedTuple):
-    """The sizes of a computation; static.
+    """The sizes of a computation; static."""
 
-    Attributes:
-        wanted: how many eigenpairs.
-        size: how many vectors, whole blocks.
-        block: vectors filtered together.
-        n_null: zero eigenvalues.
-        tolerance: relative residual that counts as converged.
-        single_precision: whether filters run in float32.
-        mesh: the devices that vectors are shared among; None for one.
-    """
-
-    wanted: int
-    size: int
-    block: int
-    n_null: int
-    tolerance: float
-    single_precision: bool
-    mesh: Mesh | None
+    wanted: int  # how many eigenpairs
+    size: int  # how many vectors, whole blocks
+    block: int  # vectors filtered together
+    n_null: int  # zero eigenvalues
+    tolerance: float  # relative residual that counts as converged
+    single_precision: bool  # whether filters run in float32
+    mesh: Mesh | None  # the devices that vectors are shared among; None for one
 
 
 class FilterState(NamedTuple):
-    """What is known between two rounds.
+    """What is known between two rounds."""
 
-    Attributes:
-        values: (m,) Ritz values θ, ascending.
-        vectors: (m, nodes) M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab.
-        residuals: (m,) ‖Kx − θMx‖/‖Mx‖.
-        lumped_values: (m,) xᵀKx / xᵀDx with the lumped mass D.
-        terms: further terms of the mass's inverse that were needed so far.
-        rounds: rounds so far on this grid.
-    """
-
-    values: Float[Array, " m"]
-    vectors: Float[Array, "m nodes"]
-    residuals: Float[Array, " m"]
-    lumped_values: Float[Array, " m"]
-    terms: Int[Array, ""]
-    rounds: Int[Array, ""]
+    values: Float[Array, " m"]  # Ritz values θ, ascending
+    vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab
+    residuals: Float[Array, " m"]  # ‖Kx − θMx‖/‖Mx‖
+    lumped_values: Float[Array, " m"]  # xᵀKx / xᵀDx with the lumped mass D
+    terms: Int[Array, ""]  # further terms of the mass's inverse that were needed so far
+    rounds: Int[Array, ""]  # rounds so far on this grid
 
 
 class Filtering(NamedTuple):
-    """The polynomials of a round.
+    """The polynomials of a round."""
 
-    Attributes:
-        band: what they damp.
-        terms: further terms of the mass's inverse.
-        degrees: by block; 0 where all has converged.
-        values: (m,) ψ of each vector, at which its polynomial is scaled.
-        factor: (m,) by which corrections are multiplied.
-    """
-
-    band: Band
-    terms: Int[Array, ""]
-    degrees: Int[Array, " blocks"]
-    values: Float[Array, " m"]
-    factor: Float[Array, " m"]
+    band: Band  # what they damp
+    terms: Int[Array, ""]  # further terms of the mass's inverse
+    degrees: Int[Array, " blocks"]  # by block; 0 where all has converged
+    values: Float[Array, " m"]  # ψ of each vector, at which its polynomial is scaled
+    factor: Float[Array, " m"]  # by which corrections are multiplied
 
 
 class GridFilter(eqx.Module):
-    """Subspace iteration on one grid. What is compiled for one serves all grids of its shape.
+    """Subspace iteration on one grid. What is compiled for one serves all grids of its shape."""
 
-    Attributes:
-        pencil: K and M.
-        high: a bound of the spectrum of D⁻¹K.
-        plan: static.
-    """
-
-    pencil: NodalPencil
-    high: Float[Array, ""]
-    plan: Plan = eqx.field(static=True)
+    pencil: NodalPencil  # K and M
+    high: Float[Array, ""]  # a bound of the spectrum of D⁻¹K
+    plan: Plan = eqx.field(static=True)  # static
 
     @property
     def slabs(self) -> Slabs | None:

@@ -22,17 +22,12 @@ _STRETCH = 16
 
 
 class ShiftedSolve(NamedTuple):
-    """How to apply (K − σM)⁻¹.
+    """How to apply (K − σM)⁻¹."""
 
-    Attributes:
-        factor: the factorisation of K − σM.
-        shift: σ.
-        passes: how often to solve: once, or twice, where the factorisation is inaccurate, then with the residual. None:
-            once, for which nothing else is compiled.
-    """
-
-    factor: Factorisation
-    shift: Float[Array, ""]
+    factor: Factorisation  # the factorisation of K − σM
+    shift: Float[Array, ""]  # σ
+    # how often to solve: once, or twice, where the factorisation is inaccurate, then with the residual. None: once, for
+    # which nothing else is compiled
     passes: Int[Array, ""] | None
 
 
@@ -46,16 +41,11 @@ class _Blocks(NamedTuple):
 
 
 class _Recurrence(NamedTuple):
-    """What has been computed so far.
+    """What has been computed so far."""
 
-    Attributes:
-        basis: known eigenvectors and the blocks so far, M-orthonormal rows; the rest is zero.
-        blocks: the last two blocks, of which the latter is not yet in the basis.
-        matrix: the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, and those below it.
-    """
-
-    basis: Basis
-    blocks: _Blocks
+    basis: Basis  # known eigenvectors and the blocks so far, M-orthonormal rows; the rest is zero
+    blocks: _Blocks  # the last two blocks, of which the latter is not yet in the basis
+    # the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, and those below it
     matrix: Float[Array, "steps two b b"]
 
 
