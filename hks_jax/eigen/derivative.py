@@ -14,14 +14,13 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import by_numpy, jit_quickly, known_and_few, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
 from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
-from hks_jax.eigen.interior import first_from_origin
+from hks_jax.eigen.lanczos.block_lanczos import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear import lapack
-from hks_jax.linear.batches import one_by_one
-from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.not_differentiable import first_order_only
+from hks_jax.linear.linear_map import first_order_only, with_transpose
+from hks_jax.linear.loops import one_by_one
 from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import combine, inner_products

@@ -11,7 +11,6 @@ from hks_jax.linear.products import products_with_columns, times
 
 Array = Any
 """NumPy's or JAX's, the same for all arguments and the result."""
-
 _MOST_STEPS = 200
 _RESTARTS = 3
 _KEPT, _MEMORY = 400, 4e8
@@ -49,27 +48,22 @@ def _dot(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
 
 
 def conjugate_gradients(
-    product: Callable[..., tuple[Array, Array]],
-    precondition: Callable[[Array], Array],
+    product: Callable[..., tuple[Array, Array]],  # x ↦ Aᵢxᵢ, and the energies below which Aᵢ counts as singular
+    precondition: Callable[[Array], Array],  # r ↦ an approximation of Aᵢ⁻¹rᵢ
     rhs: Float[Array, "n b"],
-    wanted: Float[Array, " b"],
+    wanted: Float[Array, " b"],  # the error in the energy norm, relative; columns of which it is infinite stay zero
     inner: Callable[[Array, Array], Array] = _dot,
     clean: Callable[[Array], Array] | None = None,
-    most: Int[Array, ""] | int = _MOST_STEPS,
+    most: Int[Array, ""] | int = _MOST_STEPS,  # steps after which to stop all the same
     orthogonal: bool = False,
 ) -> Solution:
     """Solve Aᵢxᵢ = rhsᵢ for a block of columns.
 
     Args:
-        product: x ↦ Aᵢxᵢ, and for each column the energy xᵢᵀAᵢxᵢ below which Aᵢ counts as singular.
-        precondition: r ↦ an approximation of Aᵢ⁻¹rᵢ.
-        rhs: the right-hand sides.
-        wanted: the error in the energy norm, relative; columns of which it is infinite stay zero.
         inner: the inner products (b,) of two blocks of columns, with respect to which all Aᵢ and the preconditioner are
             symmetric and positive definite; energies are measured with it.
         clean: x ↦ its part in the subspace in which all this is so. Where rounding has led out of it, which an energy
             that is not positive tells, the iteration starts again from there.
-        most: steps after which to stop all the same.
         orthogonal: for one ill-conditioned matrix whose products are dear; b = 1, in JAX. Residuals stay orthogonal in
             spite of rounding. ``product(x, first)`` then returns the right-hand side where ``first``, so that what it
             has in common with Ax is compiled once, and of ``rhs`` the shape counts.

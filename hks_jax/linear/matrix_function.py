@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.linear import lapack
-from hks_jax.linear.linear_map import linear_map
-from hks_jax.linear.not_differentiable import not_differentiable
-from hks_jax.linear.standard_form import checked_standard_form, transposed_solve
+from hks_jax.linear.dense_eigh import checked_standard_form, transposed_solve
+from hks_jax.linear.linear_map import linear_map, not_differentiable
 from hks_jax.signatures.filters import divided_difference, second_divided_difference
 
 Matrix = Float[Array, "n n"]

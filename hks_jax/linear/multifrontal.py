@@ -7,7 +7,7 @@ in 2D, O(N log N) to solve, O(log N) steps one after another; the same code on e
 import math
 from collections.abc import Callable
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,6 +25,9 @@ from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
 """The greatest spectral radius of a factorisation's relative error at which its inertia is trusted."""
+
+Blocks = tuple[Array, ...]
+"""A batch of dense blocks for each level."""
 
 
 class Factorisation(eqx.Module):
@@ -47,13 +50,12 @@ class Factorisation(eqx.Module):
         """How many eigenvalues are negative: by Sylvester's law of inertia, those of the pencil that are below σ."""
         return jnp.sum(self.pivots < 0, axis=-1)
 
-    def solve(self, rhs: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
-        """Solve (K − σM) x = rhs for each row."""
-        return _solve(self, rhs.T).T
-
-    def solve_columns(self, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+    @jax.jit
+    def solve(self, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
         """Solve (K − σM) x = rhs for each column."""
-        return _solve(self, rhs)
+        tree = self.dissection.merged or self.dissection
+        x, _ = _substituted(tree.levels, self.downward, self.upward, rhs)
+        return taken(x, tree.order)
 
 
 class Trial(NamedTuple):
@@ -78,10 +80,8 @@ def factorise(
 ) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting from one front to the next; what it is good for, `try_out` tells.
 
-    Args:
-        dissection: the elimination tree.
-        matrix: its entries at the places of the pattern: `SymmetricPencil.shifted`.
-        least: the least pivot allowed, relative to the entries; smaller ones are replaced by it.
+    The matrix is given by its entries at the places of the pattern: `SymmetricPencil.shifted`. Pivots below the least
+    allowed, relative to the entries, are replaced by it.
     """
     # Where no pivot is replaced, the sizes of the fronts' entries are not needed.
     least_or_none = None if isinstance(least, float) and least == 0 else jnp.asarray(least, matrix.dtype)
@@ -101,13 +101,13 @@ def try_out(
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     tiny = CONTRACTION / math.sqrt(len(b))
 
-    def in_doubt(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+    def in_doubt(state: Any) -> Bool[Array, ""]:
         turn, rates, _, _ = state
         return (turn == 0) | ((turn == 1) & (rates[0] >= tiny) & (rates[0] < CONTRACTION))
 
-    def solve(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def solve(state: Any) -> tuple[Array, Array, Array, Array]:
         turn, rates, error, b = state
-        x = factor.solve_columns(b)
+        x = factor.solve(b)
         image = mass(x)
         residual = b - (stiffness(x) - shift * image)
         rates = rates.at[turn].set(jnp.linalg.norm(residual) / jnp.linalg.norm(b))
@@ -133,7 +133,7 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
 @jit_quickly()
 def _eliminate(
     dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | None
-) -> tuple[tuple[Array, ...], tuple[Array, ...], Float[Array, " pivots"]]:
+) -> tuple[Blocks, Blocks, Float[Array, " pivots"]]:
     """Return the matrices downward and upward, and the pivots."""
     pivots = []
 
@@ -150,9 +150,7 @@ def _eliminate(
     return downward, upward, jnp.concatenate(pivots)
 
 
-def _merged(
-    levels: tuple[Level, ...], merged: Merged, downward: tuple[Array, ...], upward: tuple[Array, ...]
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward: Blocks) -> tuple[Blocks, Blocks]:
     """Return the matrices of merged levels: what substitution along the levels in them makes of the identity."""
     inverses, couplings, first = [], [], 0
     for rows, places in zip(merged.rows, merged.places, strict=True):
@@ -176,15 +174,9 @@ def eliminate(
 ) -> list[tuple[Inexact[Array, "fronts s s"], Inexact[Array, "fronts r s"]]]:
     """Eliminate a symmetric matrix, real or complex, from the cells up to the first separator.
 
-    Args:
-        dissection: the elimination tree.
-        matrix: the entries at the places of the pattern.
-        invert: returns the inverses of symmetric blocks (fronts, s, s), given also the greatest modulus of each front's
-            entries, (fronts,).
-
-    Returns:
-        (A⁻¹, BA⁻¹) of each level's fronts, in the order of the levels: A is what the Schur complements of the fronts
-        below have made of a front's own block, and B its coupling to its boundary.
+    Given how to invert symmetric blocks (fronts, s, s), with the greatest modulus of each front's entries, it returns
+    (A⁻¹, BA⁻¹) of each level's fronts, in the order of the levels: A is what the Schur complements of the fronts below
+    have made of a front's own block, and B its coupling to its boundary.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
     entries = jnp.zeros(start[-1], matrix.dtype)
@@ -209,20 +201,12 @@ def eliminate(
     return eliminated[::-1]
 
 
-@jax.jit
-def _solve(factor: Factorisation, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
-    tree = factor.dissection.merged or factor.dissection
-    x, _ = _substituted(tree.levels, factor.downward, factor.upward, rhs)
-    return taken(x, tree.order)
-
-
 def _substituted(
-    levels: tuple[Level, ...], downward: tuple[Array, ...], upward: tuple[Array, ...], rhs: Float[Array, "n b"]
+    levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
     """Solve along some levels: zero at the boundary of the first of them.
 
-    Returns:
-        The solution at the own nodes of the levels, concatenated, and what it leaves to the boundary.
+    Returns the solution at the own nodes of the levels, concatenated, and what it leaves to the boundary.
     """
     width = rhs.shape[1]
     own: list[Array] = []

@@ -16,7 +16,6 @@ from hks_jax.linear.linear_map import with_transpose
 _MANY, _TERMS = 512, 40
 """For how many matrices, of how many columns at most, products on a CPU are written out: others take longer to compile
 than they gain."""
-
 _ROWS, _LARGE = (4, 5, 3, 7, 2), 1 << 18
 """How many rows of an array of so many numbers are multiplied at a time, which stay in the cache: the first of these by
 which their number can be divided, as what were left over would have to be copied."""
@@ -137,10 +136,7 @@ def quadratic_forms(
 ) -> Float[Array, "m n"]:
     """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each C; not differentiable with respect to φ.
 
-    Args:
-        matrices: C; of its entries between functions that do not matter some may be taken for zero.
-        vectors: φ.
-        matters: which functions matter, for each C.
+    Of C's entries between functions that do not matter for it some may be taken for zero.
     """
     (m, k), n = matters.shape, vectors.shape[1]
     size, width = min(max(_OF_MATRIX, -(-k // _BLOCKS)), k), min(_POINTS, n)

@@ -37,14 +37,7 @@ def diagonal_of_inverse(dissection: Dissection, matrix: Inexact[Array, " m"]) ->
     """Return the diagonal of the inverse of a symmetric matrix, real or complex (not Hermitian).
 
     There is no pivoting from one front to the next: for matrices whose real or imaginary part is definite, of which no
-    Schur complement is singular.
-
-    Args:
-        dissection: the elimination tree.
-        matrix: the entries at the places of the pattern.
-
-    Returns:
-        The diagonal. Differentiable in both modes: what is kept for the transpose are some copies of the factors.
+    Schur complement is singular. Differentiable in both modes; for the transpose some copies of the factors are kept.
     """
     return selected(dissection, eliminated_differentiably(dissection, matrix), diagonal=True)
 

@@ -66,7 +66,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     mesh: Mesh | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
-        """Check the settings."""
         require_number("tolerance", self.tolerance, 1)
         require_count("block", self.block)
         require_number("spare", self.spare)

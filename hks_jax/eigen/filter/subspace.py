@@ -19,8 +19,8 @@ from jaxtyping import Array, Float, Int
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns
 from hks_jax.linear.accelerators import row_by_row
+from hks_jax.linear.dense_eigh import pencil_eigh
 from hks_jax.linear.products import combine
-from hks_jax.linear.standard_form import pencil_eigh
 
 EVERYWHERE = PartitionSpec()
 _CHUNK = 1 << 14

@@ -53,7 +53,6 @@ class ShiftInvert(Eigensolver[Pencil]):
         return n_dof - 1
 
     def __check_init__(self) -> None:
-        """Check the settings."""
         require_number("tolerance", self.tolerance, 1)
         require_count("max_restarts", self.max_restarts)
         if self.basis is not None:

@@ -15,10 +15,8 @@ from hks_jax.linear.products import combine, gram, products_with_columns, times
 
 _PIECE = 128
 """Rows kept together: vectors are projected on whole pieces, but not on those that are still empty."""
-
 _SMALL = 1e-7
 """Components up to here are taken away in single precision: what it leaves of them is rounding."""
-
 _NODES = 2048
 """Degrees of freedom combined at once: what is read and what comes of it stay in the cache."""
 
@@ -31,6 +29,8 @@ class Piece(NamedTuple):
 
 
 Basis = tuple[Piece, ...] | Float[Array, "n_dof rows"]
+Block = Float[Array, "n_dof b"]
+Small = Float[Array, "b b"]
 
 
 def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
@@ -51,7 +51,7 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
     return tuple(pieces)
 
 
-def write(basis: Basis, block: Float[Array, "n_dof b"], row: Int[Array, ""]) -> Basis:
+def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
     """Return the basis with columns as its rows from the given one on, a multiple of b."""
     if not isinstance(basis, tuple):
         return jax.lax.dynamic_update_slice_in_dim(accelerators.row_by_row(basis), block, row, axis=1)
@@ -133,13 +133,7 @@ def _put(
     )
 
 
-def recur(
-    block: Float[Array, "n_dof b"],
-    image: Float[Array, "n_dof b"],
-    before: Float[Array, "n_dof b"],
-    coupling: Float[Array, "b b"],
-    x: Float[Array, "n_dof b"],
-) -> tuple[Float[Array, "n_dof b"], Float[Array, "b b"]]:
+def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) -> tuple[Block, Small]:
     """Return x = (K − σM)⁻¹M · block without that block and the one before, and what it has in the block itself."""
 
     def plain() -> tuple[Array, Array]:
@@ -154,9 +148,7 @@ def recur(
     return _one_of(by_kernels, plain, x)
 
 
-def without(
-    block: Float[Array, "n_dof b"], image: Float[Array, "n_dof b"], x: Float[Array, "n_dof b"]
-) -> Float[Array, "n_dof b"]:
+def without(block: Block, image: Block, x: Block) -> Block:
     """Return x without what it has of M-orthonormal columns, given also their image under M."""
 
     def by_kernels() -> Array:
@@ -165,9 +157,7 @@ def without(
     return _one_of(by_kernels, lambda: x - times(block, gram(image, x)), x)
 
 
-def orthonormal(
-    mass: OfColumns, x: Float[Array, "n_dof b"]
-) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"], Float[Array, "b b"]]:
+def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
     The inner products are factorised by their eigenvalues; in kernels, for which these take long, by a pivoted Cholesky
@@ -195,13 +185,13 @@ def orthonormal(
     return _one_of(by_kernels, plain, x)
 
 
-def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Float[Array, "n_dof b"]) -> Any:
+def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Block) -> Any:
     if x.shape[1] <= column_kernels.LARGEST and column_kernels.agree(x.dtype):
         return jax.lax.platform_dependent(cuda=by_kernels, default=plain)
     return plain()
 
 
-def _factored(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float[Array, "b b"]]:
+def _factored(products: Small) -> tuple[Small, Small]:
     """Return F with FFᵀ = G, the inner products, and F⁻ᵀ."""
     norms = jnp.sqrt(jnp.diagonal(products))
     norms = jnp.where(norms > 0, norms, 1)

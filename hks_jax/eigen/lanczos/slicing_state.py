@@ -12,6 +12,8 @@ from hks_jax.linear.pencil import SymmetricPencil
 _NODES = 1 << 16
 """Degrees of freedom of all eigenvectors that are moved at once."""
 
+Stored = Float[Array, "capacity n_dof"]
+
 
 class Problem(NamedTuple):
     """A pencil, and what is known of its spectrum beforehand. The eigenvalues sought are counted from zero upwards."""
@@ -31,6 +33,7 @@ class Plan(NamedTuple):
     block: int  # vectors per Lanczos block
     slice_size: int  # eigenvalues that a slice is expected to find, half of them below its shift
     max_slices: int  # factorisations before giving up
+    tolerance: float  # relative residual that counts as converged
     nulls: int  # how many of the wanted eigenvalues are zero, by what is known of the matrices
 
     @property
@@ -70,8 +73,7 @@ class SlicingState(NamedTuple):
     """What is known between two slices."""
 
     values: Float[Array, " capacity"]  # known eigenvalues in the order found; infinite where there is none
-    # their M-orthonormal eigenvectors; None where they are handed over apart
-    vectors: Float[Array, "capacity n_dof"] | None
+    vectors: Stored | None  # their M-orthonormal eigenvectors; None where they are handed over apart
     known: Int[Array, ""]  # how many there are
     shift: Float[Array, ""]  # where to cut next
     # eigenvalues from zero to the shift, by the inertia of the factorisation there; −1 if that is not trusted
@@ -134,7 +136,7 @@ def make_room(plan: Plan, state: SlicingState) -> SlicingState:
 
 
 @jit_quickly(static_argnames="plan", donate_argnames="vectors")
-def _with_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: SlicingState) -> SlicingState:
+def _with_room(plan: Plan, vectors: Stored, state: SlicingState) -> SlicingState:
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
     count = jnp.minimum(count, plan.capacity - plan.ritz)
@@ -146,9 +148,7 @@ def _with_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: Slici
     )
 
 
-def _reordered(
-    vectors: Float[Array, "capacity n_dof"], order: Int[Array, " capacity"], kept: Bool[Array, " capacity"]
-) -> Float[Array, "capacity n_dof"]:
+def _reordered(vectors: Stored, order: Int[Array, " capacity"], kept: Bool[Array, " capacity"]) -> Stored:
     """Return the rows in that order, zero where none is kept: in place where they may be overwritten."""
 
     def some(at: int | Array, width: int, vectors: Array) -> Array:
