@@ -139,9 +139,8 @@ def eigsh(
         k: how many, 1 … n. See `eigenpairs` for k with an interval.
         interval: (a, b): all a ≤ λ < b.
         solver: see `eigenpairs`; None is ``"auto"``.
-        throw: whether a failure is an error, also under `jit`; else the pairs carry a code, ``.result``, and it is
-            warned of where values are concrete.
-        progress: called with short texts, where values are concrete; ``print`` will do.
+        throw: see `eigenpairs`.
+        progress: likewise.
 
     Returns:
         The pairs with residuals, convergence flags and the certificate. All signatures take them.

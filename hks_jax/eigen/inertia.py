@@ -45,10 +45,7 @@ Count = tuple[Number, Flag]
 
 
 def count_eigenvalues(
-    domain: Any,
-    below: Scalar | float,
-    boundary: BoundarySpec = "neumann",
-    mass: MassKind = "consistent",
+    domain: Any, below: Scalar | float, boundary: BoundarySpec = "neumann", mass: MassKind = "consistent"
 ) -> Number:
     """Count the eigenvalues below a number, with their multiplicities.
 
@@ -75,10 +72,7 @@ def count_eigenvalues(
 
 
 def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a domain as a user gives it.
-
-    Of matrices and forms of the user's own, where concrete, M is tested for definiteness.
-    """
+    """Return the pencil of a domain as a user gives it; an M of the user's own, where concrete, is definite."""
     pencil = pencil_of(domain, boundary, mass, quadrature)
     for part in jax.lax.stop_gradient(pencil).parts:
         own = isinstance(part.space, MatrixSpace) or part.volume is None
@@ -165,6 +159,7 @@ class _Descent(NamedTuple):
     far_number: Number  # how many those are
     next: Scalar  # what to try next
     tries: Number  # counts so far
+    going: Flag  # whether to go on
 
 
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
@@ -175,27 +170,18 @@ def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Numb
     """
     count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
 
-    def going_on(state: _Descent) -> Flag:
-        return _descends(state, pencil.negative, pencil.spacing, most)
-
     def step(state: _Descent) -> _Descent:
-        return _descended(state, *count(-state.next), pencil.negative, most)
+        return _descended(state, *count(-state.next), pencil.negative, pencil.spacing, most)
 
     nothing, none = jnp.zeros((), dtype), jnp.zeros((), int)
-    first = 3 / 4 * most * pencil.spacing
-    state = while_loop(going_on, step, _Descent(nothing, none, nothing + jnp.inf, none, first, none))
+    first, going = 3 / 4 * most * pencil.spacing, (pencil.negative > 0) & (most > 0)
+    start = _Descent(nothing, none, nothing + jnp.inf, none, first, none, going)
+    state = while_loop(lambda state: state.going, step, start)
     return state.near, state.number
 
 
 @partial(jax.jit, static_argnames="most")
-def _descends(state: _Descent, negative: Number, spacing: Scalar, most: int) -> Flag:
-    few = (2 * state.number < most) & (state.number < negative)
-    narrow = state.far - state.near <= _ALIKE * jnp.maximum(state.near, spacing)
-    return few & ~narrow & (state.tries < _TRIES)
-
-
-@partial(jax.jit, static_argnames="most")
-def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, most: int) -> _Descent:
+def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, spacing: Scalar, most: int) -> _Descent:
     """Return what is known after a count, and where to count next."""
     passed = negative - count
     nearer, farther = sound & (passed <= most), sound & (passed > most)
@@ -206,7 +192,9 @@ def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, mo
     following = jnp.where(jnp.isfinite(far), between, 4 * near)
     # Where the count is not to be trusted, try beside.
     following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
-    return _Descent(near, number, far, far_number, following, state.tries + 1)
+    few, narrow = (2 * number < most) & (number < negative), far - near <= _ALIKE * jnp.maximum(near, spacing)
+    tries = state.tries + 1
+    return _Descent(near, number, far, far_number, following, tries, few & ~narrow & (tries < _TRIES))
 
 
 class _Search(NamedTuple):
@@ -218,6 +206,7 @@ class _Search(NamedTuple):
     first: Scalar  # the highest number tried with as many below it: far from them, solves are accurate
     next: Scalar  # what to try next
     tries: Number  # counts so far
+    going: Flag  # whether to go on
 
 
 def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, Scalar, Number]:
@@ -231,26 +220,21 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     infinite = jnp.full((), jnp.inf, size.dtype)
     # Just below zero: of a singular K ⪰ 0 there is no eigenvalue below it, and the factorisation is still accurate.
     least = jnp.asarray(float(jnp.finfo(size.dtype).eps) ** _JUST_BELOW, size.dtype) * size
-    state = _Search(-infinite, infinite, jnp.zeros((), int), infinite, -least, jnp.zeros((), int))
+    none = jnp.zeros((), int)
 
     def step(state: _Search) -> _Search:
-        return _narrowed(state, *count(state.next), size, wanted, pencil.size)
+        return _narrowed(state, *count(state.next), size, least, wanted, pencil.size)
 
     # Step by step, the computations are those of the slices that follow: compiled once for both.
-    state = while_loop(lambda state: _unfinished(state, wanted, least), step, state)
+    start = _Search(-infinite, infinite, none, infinite, -least, none, jnp.ones((), bool))
+    state = while_loop(lambda state: state.going, step, start)
     known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
     low, first = (jnp.where(known, end, jnp.nan) for end in (state.low, state.first))
     return low, first, state.number
 
 
-@partial(jax.jit, static_argnames="wanted")
-def _unfinished(state: _Search, wanted: int, least: Scalar) -> Flag:
-    few = (state.number <= 2 * wanted) | (state.high - state.low <= _NARROW * least)
-    return ~(jnp.isfinite(state.low) & jnp.isfinite(state.high) & few) & (state.tries < _TRIES)
-
-
 @partial(jax.jit, static_argnames=("wanted", "n"))
-def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, wanted: int, n: int) -> _Search:
+def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: Scalar, wanted: int, n: int) -> _Search:
     """Return what is known after a count, and where to count next."""
     dtype = size.dtype
     low = jnp.where(sound & (count == 0), jnp.maximum(state.low, state.next), state.low)
@@ -265,7 +249,9 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, wanted: 
     following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), -reach, up))
     # Where the count is not to be trusted, try beside.
     beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
-    return _Search(low, high, number, first, jnp.where(sound, following, beside), state.tries + 1)
+    few, tries = (number <= 2 * wanted) | (high - low <= _NARROW * least), state.tries + 1
+    going = ~(bracketed & few) & (tries < _TRIES)
+    return _Search(low, high, number, first, jnp.where(sound, following, beside), tries, going)
 
 
 def _counting(pencil: SymmetricPencil, probes: int) -> Callable[[Scalar], Count]:

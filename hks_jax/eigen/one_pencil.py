@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,10 +34,7 @@ def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPen
 
 
 def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
-    """Return the k lowest pairs of one pencil and, where one ``extra`` is asked for, the next eigenvalue.
-
-    With ``throw``, a derivative that does not converge is an error.
-    """
+    """Return the k lowest pairs, and with one ``extra`` the next eigenvalue; see `solved` for ``throw``."""
     n_dof = pencil.size
     if not (pencil.bounded or solver.indefinite):
         raise ValueError(
@@ -52,50 +49,43 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
-    if pencil.null_space is None and not solver.indefinite:
-        return _from_bound(pencil, solver, k, extra, throw, report)
-    if not isinstance(solver, BlockLanczos) or known_by_weyl(pencil):
+    from_bound = pencil.null_space is None and not solver.indefinite
+    if not from_bound and (not isinstance(solver, BlockLanczos) or known_by_weyl(pencil)):
         found = solved(solver, pencil, k, extra, False, throw, report)
         return _pairs(pencil, pencil, jnp.zeros((), found[0].dtype), found, solver)
-    half = max(solver.plan(k).slice_size // 2, 1)
-    origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
-    number, method = k, cast(Eigensolver, solver)
-    if not is_traced(below) and below > 2 * half:
-        # Of a lowest eigenvalue with more copies than are asked for, all are computed: the count is of all.
-        number = max(k, int(below))
-        method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
-    spacing = (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
-    moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spacing)
-    found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+    number, method = k, solver
+    if from_bound:
+        assert pencil.lower_bound is not None
+        origin = reach = spacing = jax.lax.stop_gradient(pencil.lower_bound)
+    else:
+        assert isinstance(solver, BlockLanczos)
+        half = max(solver.plan(k).slice_size // 2, 1)
+        origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
+        reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
+        if not is_traced(below) and below > 2 * half:
+            # Of a lowest eigenvalue with more copies than are asked for, all are computed: the count is of all.
+            number = max(k, int(below))
+            method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
+
+    def solve(origin: Scalar, reach: Scalar, spacing: Scalar) -> tuple[SymmetricPencil, tuple[Any, ...]]:
+        if from_bound:  # a solver for K ⪰ 0 finds the pairs of K − σM, σ a lower bound of the spectrum
+            moved: SymmetricPencil = pencil.counted_from(origin)
+        else:
+            moved = translated(pencil, origin, jnp.zeros((), int), reach, spacing)
+        return moved, solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+
+    moved, found = solve(origin, reach, spacing)
     values = jax.lax.stop_gradient(found[0])
     if not is_traced(values) and _is_far(moved, values):
-        spread = values[-1] - values[0]
         # Once more, from an origin nearer to the spectrum: distances from one so far below would lose their digits.
-        origin, first = origin + values[0] - spread, origin + values[-1]
-        moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spread / number)
-        found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+        spread = values[-1] - values[0]
+        origin = origin + values[0] - spread
+        moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
         values, vectors, _, _, bound = found
         frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
         found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method)
-
-
-def _from_bound(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
-    """Return the lowest pairs by a solver for K ⪰ 0: those of K − σM, σ a lower bound of the spectrum."""
-
-    def solve(origin: Scalar) -> tuple[Pencil, tuple[Any, ...]]:
-        moved = pencil.counted_from(origin)
-        return moved, solved(solver, moved, k, extra, False, throw, report)
-
-    assert pencil.lower_bound is not None
-    origin = jax.lax.stop_gradient(pencil.lower_bound)
-    moved, found = solve(origin)
-    values = jax.lax.stop_gradient(found[0])
-    if not is_traced(values) and _is_far(moved, values):  # as after a spike, to which tolerances are relative
-        origin = origin + 2 * values[0] - values[-1]
-        moved, found = solve(origin)
-    return _pairs(pencil, moved, origin, found, solver)
 
 
 def _is_far(pencil: SymmetricPencil, values: Values) -> bool:
@@ -130,11 +120,7 @@ def solve_interval(
 
 
 def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | None) -> Interval:
-    """Return an interval as a user gives it, with what inertia counts; pencil and ends may be traced.
-
-    Raises:
-        ValueError: see `hks_jax.eigenpairs`.
-    """
+    """Return an interval that a user gives, checked as `eigenpairs` says, with what inertia counts; also traced."""
     low, high = (jnp.asarray(end, pencil.stiffness.dtype) for end in interval)
     if is_traced((pencil, low, high)):
         if k is None:

@@ -26,10 +26,7 @@ def weyl(count: float, volume: Volume, dimension: int) -> Volume:
 
 
 def weyl_number(values: Real, volume: float, dimension: int, rim: float = 0.0) -> Real:
-    """Return about how many eigenvalues lie below a λ ≥ 0, by the two terms of `weyl_count`.
-
-    The rim is the length or the area of its natural part, less that of its Dirichlet part.
-    """
+    """Return about how many eigenvalues lie below λ ≥ 0; of the rim, natural parts count less Dirichlet ones."""
     if dimension == 2:
         return (volume * values + rim * values**0.5) / (4 * math.pi)
     return volume * values**1.5 / (6 * math.pi**2) + rim * values / (16 * math.pi)
@@ -80,10 +77,7 @@ def weyl_count(
 
 
 def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
-    """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part.
-
-    The space knows the conditions. Not traced.
-    """
+    """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part."""
     if isinstance(domain, SimplicialMesh):
         return _mesh_rim(domain, space)
     assert isinstance(space, GridSpace)

@@ -25,10 +25,7 @@ def at_hand() -> bool:
 
 
 def kernels_compile() -> bool:
-    """Return whether Pallas' kernels compile for the GPU here; False without one, as tracing them takes time.
-
-    Whether it is a CUDA device is decided where kernels are used.
-    """
+    """Return whether Pallas' kernels compile for the GPU here; False without one, as tracing them takes time."""
     if jax.default_backend() != "gpu":
         return False
     try:

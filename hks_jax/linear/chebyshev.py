@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ive
 
 from hks_jax.linear import accelerators, lapack
-from hks_jax.linear.products import aligned
+from hks_jax.linear.products import aligned, matmul
 
 _FAILURE = 1e-6
 _START = 30
@@ -29,10 +29,7 @@ def chebyshev_recurrence(
     total: Any = (),  # what is to be gathered on the way
     add: Callable[[Any, Any, Any], Any] = lambda n, y, total: total,  # (n, yₙ, total) ↦ the total with the term of yₙ
 ) -> tuple[Any, Any, Any]:
-    """Go through yₙ = Tₙ(A)x for n = 0, …, degree: y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁.
-
-    Returns y of the degree, the one before, and the total.
-    """
+    """Go through yₙ = Tₙ(A)x, n = 0, …, degree: y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁; return the last two and the total."""
 
     def step(n: Array, state: tuple) -> tuple:
         y, before, total = state
@@ -101,7 +98,7 @@ def chebyshev_heat_coefficients(
     weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
     weights[:, 0] /= 2
     values = jnp.exp(-times[:, None] * top * jnp.asarray((1 + np.cos(angles)) / 2, times.dtype))
-    return jnp.matmul(values, jnp.asarray(weights, times.dtype), precision="highest")
+    return matmul(values, jnp.asarray(weights, times.dtype))
 
 
 def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:

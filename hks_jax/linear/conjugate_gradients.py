@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from hks_jax.linear.loops import when, while_loop
-from hks_jax.linear.products import products_with_columns, times
+from hks_jax.linear.products import matmul, products_with_columns
 
 Array = Any
 """NumPy's or JAX's, the same for all arguments and the result."""
@@ -104,7 +104,7 @@ def conjugate_gradients(
             # first was known first.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
-            r = r - times(kept[0].T, products_with_columns(kept[1], r))
+            r = r - matmul(kept[0].T, products_with_columns(kept[1], r))
         if clean is not None:
             again = xp.any(state.going & ~regular) & ~state.fresh & (state.starts < _RESTARTS)
             x, r = when(again, restarted, (x, r))

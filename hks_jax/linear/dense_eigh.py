@@ -3,7 +3,7 @@
 A pencil becomes a matrix by Cholesky's factorisation.
 """
 
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import real_array, require_number
 from hks_jax.linear import lapack
+from hks_jax.linear.products import matmul
 from hks_jax.traced import is_traced
 
 Matrix = Float[Array, "n n"]
@@ -87,10 +88,9 @@ def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Mat
 @differentiable_eigh.defjvp
 def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
     values, vectors = differentiable_eigh(tolerance, primals[0])
-    change = jnp.matmul(tangents[0], vectors, precision="highest")
-    change = jnp.matmul(vectors.T, change, precision="highest")
+    change = matmul(vectors.T, matmul(tangents[0], vectors))
     rotation = (change + change.T) / 2 * _inverse_gaps(tolerance, values)
-    return (values, vectors), (jnp.diagonal(change), jnp.matmul(vectors, rotation, precision="highest"))
+    return (values, vectors), (jnp.diagonal(change), matmul(vectors, rotation))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -132,10 +132,10 @@ def standard_form(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
 def _standard_form_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[tuple, tuple]:
     reduced, factor = standard_form(*primals)
     inverse = _triangular_inverse(factor)
-    of_a, of_b = (_product(inverse, tangent, inverse.T) for tangent in tangents)
+    of_a, of_b = (matmul(inverse, tangent, inverse.T) for tangent in tangents)
     p = jnp.tril(of_b) - jnp.diag(jnp.diagonal(of_b)) / 2
-    change = _product(p, reduced)
-    return (reduced, factor), (of_a - change - change.T, _product(factor, p))
+    change = matmul(p, reduced)
+    return (reduced, factor), (of_a - change - change.T, matmul(factor, p))
 
 
 @jax.custom_jvp
@@ -148,7 +148,7 @@ def transposed_solve(factor: Matrix, columns: Float[Array, "n m"]) -> Float[Arra
 @transposed_solve.defjvp
 def _transposed_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     x, (d_factor, d_columns) = transposed_solve(*primals), tangents
-    return x, _product(_triangular_inverse(primals[0]).T, d_columns - _product(d_factor.T, x))
+    return x, matmul(_triangular_inverse(primals[0]).T, d_columns - matmul(d_factor.T, x))
 
 
 # (L⁻¹)˙ = −L⁻¹L̇L⁻¹.
@@ -160,29 +160,18 @@ def _triangular_inverse(factor: Matrix) -> Matrix:
 @_triangular_inverse.defjvp
 def _triangular_inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     inverse = _triangular_inverse(*primals)
-    return inverse, -_product(inverse, *tangents, inverse)
-
-
-def _product(*matrices: Float[Array, "_ _"]) -> Float[Array, "_ _"]:
-    return reduce(partial(jnp.matmul, precision="highest"), matrices)
+    return inverse, -matmul(inverse, *tangents, inverse)
 
 
 def pencil_eigh(a: Matrix, b: Matrix, k: int | None = None) -> tuple[Float[Array, " k"], Float[Array, "n k"]]:
-    """Return the k lowest eigenvalues of a pencil, or all, and B-orthonormal eigenvectors in columns.
-
-    Not differentiable.
-    """
+    """Return the k lowest eigenvalues, or all, and B-orthonormal eigenvectors in columns; not differentiable."""
     reduced, factor = standard_form(a, b)
     values, vectors = lapack.eigh(reduced)
     return values[:k], transposed_solve(factor, vectors[:, :k])
 
 
 def checked_standard_form(A: Any, B: Any) -> tuple[Matrix, Matrix | None]:
-    """Check A and B as users pass them, and return the standard form of their symmetric parts; without B, A and None.
-
-    Raises:
-        ValueError: see `hks_jax.eigh`.
-    """
+    """Return the standard form of the symmetric parts, checked as `hks_jax.eigh` says; without B, A and None."""
     a = _symmetric("A", A)
     if B is None:
         return a, None

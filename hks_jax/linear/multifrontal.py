@@ -20,7 +20,7 @@ from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.elimination_tree import Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import batched, batched_with_columns, gram, times, transposed
+from hks_jax.linear.products import batched_with_columns, gram, matmul, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
@@ -126,7 +126,7 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
     norms = jnp.sqrt(jnp.diagonal(products))
     # Of a matrix this small the inverse is as good, and a long triangular solve is slow.
     inverse = lapack.inverse_cholesky(products / norms[None] / norms[:, None]) / norms[None]
-    residuals, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
+    residuals, images = (jnp.linalg.norm(matmul(y, inverse.T), axis=0) for y in (residual, image))
     return jnp.max(residuals / images)
 
 
@@ -195,8 +195,8 @@ def eliminate(
             added = first + second
             blocks, beyond = blocks + added[:, :, :s], added[:, s:, s:]
         inverse = invert(blocks[:, :s], sizes)
-        coupling = batched(blocks[:, s:], inverse)
-        schur = beyond - batched(coupling, transposed(blocks[:, s:]))
+        coupling = matmul(blocks[:, s:], inverse)
+        schur = beyond - matmul(coupling, transposed(blocks[:, s:]))
         eliminated.append((inverse, coupling))
     return eliminated[::-1]
 
@@ -204,10 +204,7 @@ def eliminate(
 def _substituted(
     levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along some levels: zero at the boundary of the first of them.
-
-    Returns the solution at the own nodes of the levels, concatenated, and what it leaves to the boundary.
-    """
+    """Solve along levels, zero at the boundary of the first: return x at their own nodes, and what is left to that."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None

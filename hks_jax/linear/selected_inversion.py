@@ -20,7 +20,7 @@ from jaxtyping import Array, Inexact
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import eliminate, gather_symmetric, taken
-from hks_jax.linear.products import batched, transposed
+from hks_jax.linear.products import matmul, transposed
 
 Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts _r _s"]]]
 """(A⁻¹, BA⁻¹) of each level's fronts."""
@@ -55,12 +55,12 @@ def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> 
         boundary = jnp.zeros((1, 0, 0), inverse.dtype)
         if known is not None:
             boundary = gather_symmetric(known, jnp.asarray(level.boundary)[None])[0]
-        beside = -batched(boundary, coupling)
+        beside = -matmul(boundary, coupling)
         last = number == len(dissection.levels) - 1
         if diagonal and last:  # of the cells, nothing else is wanted
             own = jnp.diagonal(inverse, axis1=1, axis2=2) - jnp.sum(coupling * beside, axis=1)
         else:
-            block = inverse - batched(transposed(coupling), beside)
+            block = inverse - matmul(transposed(coupling), beside)
             if not last:
                 known = jnp.block([[block, transposed(beside)], [beside, boundary]])
             own = jnp.diagonal(block, axis1=1, axis2=2) if diagonal else jnp.concatenate([block, beside], axis=1)
@@ -90,4 +90,4 @@ def _inverses(matrices: Inexact[Array, "m n n"]) -> Inexact[Array, "m n n"]:
 def _inverses_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # d(A⁻¹) = −A⁻¹ dA A⁻¹: nothing but the inverse is kept for the transpose.
     inverse = _inverses(*primals)
-    return inverse, -batched(batched(inverse, *tangents), inverse)
+    return inverse, -matmul(inverse, *tangents, inverse)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.linear import accelerators, lapack
-from hks_jax.linear.products import batched, even_size, transposed
+from hks_jax.linear.products import even_size, matmul, transposed
 
 Matrices = Float[Array, "m n n"]
 Pivots = Float[Array, " m"]
@@ -53,15 +53,12 @@ def _kernel_agrees(dtype: Any) -> bool:
 
 
 def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert the Cholesky factors L, whose pivots are positive; by eigenvalues unless all are, and none is too small.
-
-    That takes a third of the time.
-    """
+    """Invert the Cholesky factors, in a third of the time; by eigenvalues unless all are definite, no pivot small."""
     inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
         jnp.all(pivots > least[:, None]),  # they are NaN where a matrix is not definite
-        lambda: (batched(transposed(inverses), inverses), pivots),
+        lambda: (matmul(transposed(inverses), inverses), pivots),
         lambda: by_eigenvalues(matrices, least),
     )
 
@@ -76,17 +73,17 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     if n <= _BLOCK:
         values, vectors = jax.vmap(lapack.eigh)(matrices)
         values = _away_from_zero(values, least[:, None])
-        return batched(vectors / values[:, None, :], transposed(vectors)), values
+        return matmul(vectors / values[:, None, :], transposed(vectors)), values
     if n <= _LARGE:
         size = even_size(n, max(_BLOCK, n // _BLOCKS))
         return _by_blocks(by_eigenvalues, size, matrices, least)
     half = n // 2
     first, values = by_eigenvalues(matrices[:, :half, :half], least)
-    coupling = batched(matrices[:, half:, :half], first)
-    schur = matrices[:, half:, half:] - batched(coupling, matrices[:, :half, half:])
+    coupling = matmul(matrices[:, half:, :half], first)
+    schur = matrices[:, half:, half:] - matmul(coupling, matrices[:, :half, half:])
     last, others = by_eigenvalues((schur + transposed(schur)) / 2, least)
-    beside = -batched(last, coupling)
-    first = first - batched(transposed(coupling), beside)
+    beside = -matmul(last, coupling)
+    first = first - matmul(transposed(coupling), beside)
     whole = jnp.block([[first, transposed(beside)], [beside, last]])
     return whole, jnp.concatenate([values, others], axis=1)
 
@@ -109,7 +106,11 @@ def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
 
 def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
     """Sweep the matrices block by block, and these row by row."""
-    return _by_blocks(sweep_rows, min(matrices.shape[1], _ROWS), matrices, least)
+
+    def by_rows(blocks: Matrices, least: Pivots) -> Inverses:
+        return jax.vmap(_sweep)(blocks, least[:, None])
+
+    return _by_blocks(by_rows, min(matrices.shape[1], _ROWS), matrices, least)
 
 
 def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: Matrices, least: Pivots) -> Inverses:
@@ -140,16 +141,11 @@ def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
     inside = (index >= at) & (index < at + rows.shape[1])
     rows = jnp.where(inside, -(index[None] == own[:, None]).astype(a.dtype), rows)
-    change = batched(transposed(rows), batched(inverses, rows))
+    change = matmul(transposed(rows), matmul(inverses, rows))
     return jnp.where(inside, 0, jnp.where(inside[:, None], 0, a)) - change
 
 
-def sweep_rows(matrices: Matrices, least: Pivots) -> Inverses:
-    """Sweep one row at a time, always the one with the largest diagonal entry left; return with them the pivots."""
-    return jax.vmap(_sweep)(matrices, least[:, None])
-
-
-def _away_from_zero(pivots: Float[Array, "*m"], least: Float[Array, "*#m"]) -> Float[Array, "*m"]:
+def _away_from_zero(pivots: Float[Array, "..."], least: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the pivots, of which none is smaller than the least allowed."""
     return jnp.where(jnp.abs(pivots) < least, jnp.where(pivots < 0, -least, least), pivots)
 
@@ -159,7 +155,7 @@ def _away_from_zero(pivots: Float[Array, "*m"], least: Float[Array, "*#m"]) -> F
 def invert_in_registers(
     matrices: Matrices, least: Pivots, at: Int[Array, ""] | None = None, rows: int | None = None
 ) -> tuple[Float[Array, "m s s"], Float[Array, "m s"]]:
-    """Return the inverses of blocks on the diagonal, and their pivots, as `sweep_rows` does.
+    """Return the inverses of blocks on the diagonal, and their pivots; see `_sweep`.
 
     The blocks begin at the first row or at ``at``, an int32, and have all rows or as many as given, at most `_LARGEST`.
     """
@@ -203,7 +199,7 @@ def invert_in_registers(
 
 
 def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Return the inverse of one matrix, and the pivots."""
+    """Return the inverse of one matrix, and the pivots: of all rows left, the one with the largest is swept next."""
     n = a.shape[0]
     index = jax.lax.broadcasted_iota(jnp.int32, (n,), 0)
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from hks_jax.checks import require_number
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, even_size, inner_products, products_with_columns, row_blocks
+from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
 
 Array = Any
 """NumPy's or JAX's, the same for all arguments and the result."""
@@ -157,10 +157,7 @@ def group_numbers(
 
 
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
-    """Return a shift for each group of rows whose distances from Λ lie between the given ones.
-
-    The geometric mean of the two leaves the least condition, √ of their ratio.
-    """
+    """Return for each group of rows the shift of the least condition: its distance from Λ is a geometric mean."""
     xp = values.__array_namespace__()
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
@@ -169,10 +166,7 @@ def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
 
 
 def middles_of_gaps(values: Values, targets: Shifts, otherwise: Scalar) -> Shifts:
-    """Return the middle of the gap between two known eigenvalues that is nearest to each target: it is no eigenvalue.
-
-    Where all p ≥ 2 are equal it is ``otherwise``.
-    """
+    """Return the middle of the gap of known eigenvalues nearest to each target; ``otherwise`` where all are equal."""
     xp = values.__array_namespace__()
     gaps = xp.diff(values)
     typical = (values[-1] - values[0]) / (values.size - 1)
@@ -193,7 +187,7 @@ def unsolved(failed: int | str, total: int) -> str:
 def without_known(pencil: SymmetricPencil, vectors: Vectors) -> OfColumns:
     """Return x ↦ x − ΦΦᵀMx, of columns."""
     mass = pencil.mass.of_columns()
-    return lambda x: x - combine(products_with_columns(vectors, mass(x)).T, vectors).T
+    return lambda x: x - matmul(products_with_columns(vectors, mass(x)).T, vectors).T
 
 
 # All that is as large as the eigenvectors is computed in place: to fill a new array of that size, whose memory the
@@ -205,7 +199,7 @@ def projected(
     lumped = pencil.mass.diagonal()
 
     def project(b: Rows, _: Array) -> tuple[Rows, OfRows]:
-        left = b - pencil.mass.apply(combine(inner_products(vectors, b), vectors))
+        left = b - pencil.mass.apply(matmul(inner_products(vectors, b), vectors))
         return left, norms(left, lumped)
 
     before = norms(rhs, lumped)
@@ -217,7 +211,7 @@ def cleaned(pencil: SymmetricPencil, vectors: Vectors, x: Rows) -> Rows:
     """Return x − ΦΦᵀMx, of rows."""
 
     def clean(x: Rows) -> tuple[Rows]:
-        return (x - combine(inner_products(vectors, pencil.mass.apply(x)), vectors),)
+        return (x - matmul(inner_products(vectors, pencil.mass.apply(x)), vectors),)
 
     return _in_parts(clean, x)[0]
 

@@ -23,7 +23,7 @@ from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import products_with_columns, times
+from hks_jax.linear.products import matmul, products_with_columns
 
 BLOCK = 16
 """Rows solved at once."""
@@ -87,7 +87,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
             factor, near, images = group
 
             def without_near(x: Columns) -> Columns:
-                return x - times(near, products_with_columns(images, x))
+                return x - matmul(near, products_with_columns(images, x))
 
             return self._solve_block(pencil, values, without_near, clean, factor, b, wanted, shifts)
 

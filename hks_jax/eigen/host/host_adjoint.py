@@ -50,7 +50,7 @@ class HostAdjoint(Adjoint[Pencil]):
             if not all(np.isfinite(array).all() for array in (values, vectors, b)):
                 warn_of_accuracy(
                     f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
-                    "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis",
+                    "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis"
                 )
                 return np.full(rhs.shape, np.nan, rhs.dtype)
             K, M = matrices(data_k, data_m, nulls)

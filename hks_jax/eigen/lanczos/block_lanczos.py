@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hks_jax.checks import require_count, require_number
+from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.complement.adjoint import Values, Vectors
 from hks_jax.eigen.dense import Dense
@@ -49,7 +49,6 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     slice_size: int | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
-        require_number("tolerance", self.tolerance, 1)
         require_count("block", self.block)
         if self.slice_size is not None:
             require_count("slice_size", self.slice_size)

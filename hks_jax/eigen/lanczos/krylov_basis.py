@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.linear import accelerators, column_kernels, lapack
 from hks_jax.linear.operators import OfColumns
-from hks_jax.linear.products import combine, gram, products_with_columns, times
+from hks_jax.linear.products import gram, matmul, products_with_columns
 
 _PIECE = 128
 """Rows kept together: vectors are projected on whole pieces, but not on those that are still empty."""
@@ -72,7 +72,7 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
     """Return what columns x, given as Mx, have in the first vectors of the basis: VVᵀMx."""
     if not isinstance(basis, tuple):
-        return times(accelerators.row_by_row(basis), gram(basis, images))
+        return matmul(accelerators.row_by_row(basis), gram(basis, images))
     used = [filled > at for at in _starts(basis)]
 
     def none(rows: Array, x: Array) -> Float[Array, "rows c"]:
@@ -88,7 +88,7 @@ def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]
         parts = jnp.zeros(images.shape[::-1], dtype)
         for filled_piece, product, rows in zip(used, products, pieces, strict=True):
             mix = product.T.astype(dtype)
-            parts = jax.lax.cond(filled_piece, lambda m, r, p: p + combine(m, r), lambda m, r, p: p, mix, rows, parts)
+            parts = jax.lax.cond(filled_piece, lambda m, r, p: p + matmul(m, r), lambda m, r, p: p, mix, rows, parts)
         return parts.astype(images.dtype)
 
     whole = [piece.rows for piece in basis]
@@ -102,7 +102,7 @@ def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]
 def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     """Return many linear combinations of all rows of the basis."""
     if not isinstance(basis, tuple):
-        return combine(mix, basis.T)
+        return matmul(mix, basis.T)
     n = basis[0].rows.shape[1]
     width = min(_NODES, n)
     mixes = jnp.split(mix, _starts(basis)[1:], axis=1)
@@ -110,7 +110,7 @@ def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     def some(number: Array, sums_so_far: Float[Array, "q n_dof"]) -> Float[Array, "q n_dof"]:
         at = jnp.minimum(number * width, n - width)  # the last may overlap the one before
         parts = [jax.lax.dynamic_slice_in_dim(piece.rows, at, width, axis=1) for piece in basis]
-        sums = sum(map(combine, mixes, parts), jnp.zeros((), mix.dtype))
+        sums = sum(map(matmul, mixes, parts), jnp.zeros((), mix.dtype))
         return jax.lax.dynamic_update_slice_in_dim(sums_so_far, sums, at, axis=1)
 
     return jax.lax.fori_loop(0, -(-n // width), some, jnp.zeros((len(mix), n), mix.dtype))
@@ -139,7 +139,7 @@ def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) 
     def plain() -> tuple[Array, Array]:
         diagonal = gram(image, x)
         diagonal = (diagonal + diagonal.T) / 2
-        return x - times(block, diagonal) - times(before, coupling), diagonal
+        return x - matmul(block, diagonal) - matmul(before, coupling), diagonal
 
     def by_kernels() -> tuple[Array, Array]:
         parts = column_kernels.parts_of_products(image, x)
@@ -154,7 +154,7 @@ def without(block: Block, image: Block, x: Block) -> Block:
     def by_kernels() -> Array:
         return column_kernels.remainder(x, block, column_kernels.parts_of_products(image, x))[0]
 
-    return _one_of(by_kernels, lambda: x - times(block, gram(image, x)), x)
+    return _one_of(by_kernels, lambda: x - matmul(block, gram(image, x)), x)
 
 
 def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
@@ -170,9 +170,9 @@ def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
         for _ in range(2):
             image = mass(y)
             factor, change = _factored(gram(y, image))
-            y = times(y, change)
-            total = times(total, factor)
-        return y, times(image, change), total
+            y = matmul(y, change)
+            total = matmul(total, factor)
+        return y, matmul(image, change), total
 
     def by_kernels() -> tuple[Array, Array, Array]:
         parts = column_kernels.parts_of_products(x, mass(x))

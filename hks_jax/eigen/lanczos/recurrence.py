@@ -14,7 +14,7 @@ from hks_jax.eigen.lanczos.krylov_basis import Basis, Block, Small, orthonormal
 from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.multifrontal import Factorisation
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, products_with_columns
+from hks_jax.linear.products import matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _STRETCH = 16
@@ -83,7 +83,7 @@ def _begin(pencil: SymmetricPencil, start: Block, known: Known, room: int) -> _R
     """Return the state before the first step: the first block is orthogonal to the known vectors."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2 if len(known) else 0):
-        block = block - combine(products_with_columns(known, mass(block)).T, known).T
+        block = block - matmul(products_with_columns(known, mass(block)).T, known).T
         block, _, _ = orthonormal(mass, block)
     block, image, _ = orthonormal(mass, block)
     basis = krylov_basis.begin(known, len(known) + room * b, b)

@@ -22,7 +22,7 @@ from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.loops import when
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, gram, products_with_columns, times
+from hks_jax.linear.products import gram, matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _ERROR = 0.1
@@ -157,9 +157,9 @@ def _inverse_iteration(
     x = shifted.factor.solve(mass(x))
     for _ in range(2):
         parts = jnp.where(jnp.arange(len(vectors))[:, None] < known, products_with_columns(vectors, mass(x)), 0)
-        x, _, _ = orthonormal(mass, x - combine(parts.T, vectors).T)
+        x, _, _ = orthonormal(mass, x - matmul(parts.T, vectors).T)
     values, mix = lapack.eigh(gram(x, stiffness(x)))
-    x = times(x, mix)
+    x = matmul(x, mix)
     image = mass(x)
     return values, x, jnp.linalg.norm(stiffness(x) - values * image, axis=0) / jnp.linalg.norm(image, axis=0)
 

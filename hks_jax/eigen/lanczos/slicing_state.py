@@ -61,11 +61,9 @@ class Plan(NamedTuple):
         return self.wanted + self.block + self.ritz
 
 
+# Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
 def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
-    """Return the number of Lanczos blocks, even, that finds a number of eigenvalues.
-
-    Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
-    """
+    """Return the number of Lanczos blocks, even, that finds a number of eigenvalues."""
     return 2 * -(-(21 * size + 120 * plan.block) // (20 * plan.block))
 
 
@@ -142,9 +140,7 @@ def _with_room(plan: Plan, vectors: Stored, state: SlicingState) -> SlicingState
     count = jnp.minimum(count, plan.capacity - plan.ritz)
     kept = jnp.arange(plan.capacity) < count
     return state._replace(
-        values=jnp.where(kept, state.values[order], jnp.inf),
-        vectors=_reordered(vectors, order, kept),
-        known=count,
+        values=jnp.where(kept, state.values[order], jnp.inf), vectors=_reordered(vectors, order, kept), known=count
     )
 
 
