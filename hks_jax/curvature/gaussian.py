@@ -1,13 +1,13 @@
-"""Scalar curvature of a metric, and Gaussian curvature in two dimensions."""
+"""Curvature of a metric: Riemann's tensor, the scalar curvature, and the Gaussian curvature of surfaces."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hks_jax.curvature.jet import Jet, metric_jet, wraps_per_axis
-from hks_jax.curvature.volume_coefficients import riemann, scalar
+from hks_jax.curvature.jet import Jet, christoffel, inner, metric_jet, wraps_per_axis
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.nan_outside import nan_is_meant, nan_outside
@@ -30,13 +30,7 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
     Raises:
         ValueError: fewer than 8 nodes on an axis of a nodal field; bad `periodic`.
     """
-    return _scalar_curvature(field, wraps_per_axis(periodic, field.grid.dimension))
-
-
-@partial(jax.jit, static_argnums=1)
-def _scalar_curvature(field: TensorField, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
-    metric, known = metric_jet(field, wraps)
-    return nan_outside(scalar(metric), known)
+    return _at_nodes(scalar, field, wraps_per_axis(periodic, field.grid.dimension))
 
 
 @nan_is_meant
@@ -58,31 +52,77 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
         ValueError: a field that is not two-dimensional; fewer than 8 nodes on an axis of a nodal field; bad
             `periodic`.
     """
-    require_surface(field)
-    return _gaussian_curvature(field, wraps_per_axis(periodic, 2))
-
-
-@partial(jax.jit, static_argnums=1)
-def _gaussian_curvature(field: TensorField, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
-    metric, known = metric_jet(field, wraps)
-    return nan_outside(brioschi(metric), known)
-
-
-def brioschi(metric: Jet) -> Float[Array, "..."]:
-    """Return the Gaussian curvature from the jet of a metric ((E, F), (F, G)).
-
-    This is Brioschi's formula (Gray, Modern Differential Geometry of Curves and Surfaces, §17.1) with its two
-    determinants expanded, in Christoffel symbols of the first kind; the right-hand side is R₁₂₁₂:
-
-        K (EG − F²) = ∂₁∂₂F − ½ ∂₂∂₂E − ½ ∂₁∂₁G + ⟨Γ₁₂, Γ₁₂⟩ − ⟨Γ₁₁, Γ₂₂⟩.
-    """
-    return riemann(metric)[..., 0, 0] / spd.determinant(metric.value)
-
-
-def require_surface(field: TensorField) -> None:
-    """Raise ValueError unless the field is two-dimensional."""
     if field.grid.dimension != 2:
         raise ValueError(
             f"field: got a grid of shape {field.grid.shape}; Gaussian curvature belongs to metrics in two "
             "dimensions. Take a slice: the metric's components in a coordinate plane, on its two-dimensional grid"
         )
+    return _at_nodes(gaussian, field, wraps_per_axis(periodic, 2))
+
+
+@partial(jax.jit, static_argnums=(0, 2))
+def _at_nodes(curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
+    metric, known = metric_jet(field, wraps)
+    return nan_outside(curvature(metric), known)
+
+
+# The coordinate planes; in three dimensions each at the place of the axis that is not in it.
+_PLANES = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
+
+
+def riemann(metric: Jet) -> Float[Array, "... p p"]:
+    """Return the curvature tensor R_abcd of a metric in 2 or 3 dimensions, ab and cd running over the p planes,
+
+        R_abcd = ½(∂_b∂_c g_ad + ∂_a∂_d g_bc − ∂_a∂_c g_bd − ∂_b∂_d g_ac) + ⟨Γ_bc, Γ_ad⟩ − ⟨Γ_bd, Γ_ac⟩
+
+    in Christoffel symbols of the first kind (Landau and Lifshitz, The Classical Theory of Fields, §92). The planes are
+    12 on a surface, which is Brioschi's formula with its determinants expanded (Gray, Modern Differential Geometry of
+    Curves and Surfaces, §17.1), and 23, 31, 12 in three dimensions.
+    """
+    planes = _PLANES[metric.value.shape[-1]]
+    hessian, symbols, inverse = metric.hessian, christoffel(metric), spd.inverse(metric.value)
+
+    def product(i: int, j: int, k: int, m: int) -> Array:
+        return inner(inverse, symbols[..., i, j], symbols[..., k, m])
+
+    def component(a: int, b: int, c: int, d: int) -> Array:
+        linear = (
+            hessian[..., a, d, b, c] + hessian[..., b, c, a, d] - hessian[..., b, d, a, c] - hessian[..., a, c, b, d]
+        )
+        return linear / 2 + product(b, c, a, d) - product(b, d, a, c)
+
+    numbers = range(len(planes))
+    lower = {(i, j): component(*planes[i], *planes[j]) for i in numbers for j in range(i + 1)}
+    rows = [jnp.stack([lower[max(i, j), min(i, j)] for j in numbers], axis=-1) for i in numbers]
+    return jnp.stack(rows, axis=-2)
+
+
+def einstein(metric: Jet) -> Float[Array, "... 3 3"]:
+    """Return the Einstein tensor (Ric − ½Rg)ⁱʲ of a three-dimensional metric.
+
+    It is the double dual of the curvature tensor, −R_abcd/|g| at the place ij of the planes ab and cd, and so in three
+    dimensions all of the curvature.
+    """
+    return -riemann(metric) / spd.determinant(metric.value)[..., None, None]
+
+
+def scalar(metric: Jet) -> Float[Array, "..."]:
+    """Return the scalar curvature R of a metric in two or three dimensions."""
+    if metric.value.shape[-1] == 2:
+        return 2 * gaussian(metric)
+    return -2 * jnp.sum(einstein(metric) * metric.value, axis=(-2, -1))
+
+
+def gaussian(metric: Jet) -> Float[Array, "..."]:
+    """Return the Gaussian curvature R₁₂₁₂/|g| of a metric ((E, F), (F, G))."""
+    return riemann(metric)[..., 0, 0] / spd.determinant(metric.value)
+
+
+def scalar_and_ricci_squared(metric: Jet) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return R and |Ric|² = RicᵢⱼRicⁱʲ of a three-dimensional metric.
+
+    With the Einstein tensor G, R = −2 tr G and |Ric|² = |G|² + R²/4.
+    """
+    mixed = jnp.sum(einstein(metric)[..., :, :, None] * metric.value[..., None, :, :], axis=-2)
+    R = -2 * jnp.trace(mixed, axis1=-2, axis2=-1)
+    return R, jnp.sum(mixed * jnp.swapaxes(mixed, -1, -2), axis=(-2, -1)) + R**2 / 4

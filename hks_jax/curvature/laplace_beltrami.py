@@ -6,8 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from hks_jax.checks import real_array
 from hks_jax.curvature.jet import (
@@ -58,22 +57,18 @@ def laplace_beltrami(
 
 @partial(jax.jit, static_argnums=2)
 def _laplace_beltrami(field: TensorField, f: Array | jtu.Partial, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
-    metric, metric_known = metric_jet(field, wraps)
-    scalar, scalar_known = _scalar_jet(f, field, wraps)
-    return nan_outside(laplacian(metric, scalar), metric_known & scalar_known)
-
-
-def _scalar_jet(
-    f: Array | jtu.Partial, field: TensorField, wraps: tuple[bool, ...]
-) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
     inside = domain_nodes(field.grid, wraps)
+    metric, known = metric_jet(field, wraps)
     if callable(f):
 
         def number(x: Array) -> Array:
             return real_array("f", f(x)).astype(x.dtype)
 
-        return at_nodes(lambda x: function_jet(number, x), field.grid, inside), inside
-    return nodal_jet(jnp.where(inside, f, 0), field.grid, inside, wraps)
+        scalar = at_nodes(lambda x: function_jet(number, x), field.grid, inside)
+    else:
+        scalar, of_f = nodal_jet(jnp.where(inside, f, 0), field.grid, inside, wraps)
+        known = known & of_f
+    return nan_outside(laplacian(metric, scalar), known)
 
 
 def laplacian(metric: Jet, scalar: Jet) -> Float[Array, "..."]:
