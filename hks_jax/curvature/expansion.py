@@ -81,7 +81,7 @@ def hks_expansion(
             f"expansion is known here in {dimension} dimensions"
         )
     return _hks_expansion(
-        field, checked_times("times", times, field.tensors.dtype), int(order), wraps_per_axis(periodic, dimension)
+        field, checked_times(times, field.tensors.dtype), int(order), wraps_per_axis(periodic, dimension)
     )
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import checked_times
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.nan_outside import nan_is_meant, nan_outside
@@ -19,8 +18,8 @@ from hks_jax.signatures.spectral_functions import (
     spectral_diagonal,
     spectral_squared_distances,
 )
-from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
-from hks_jax.signatures.truncation import truncation, warn_if_truncated
+from hks_jax.signatures.times import dimension_of, positive_range, times_of, volume_of
+from hks_jax.signatures.truncation import resolved_times, truncation
 from hks_jax.traced import is_traced
 
 
@@ -35,9 +34,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     Returns:
         (n_times, n_sources, *shape) in 1/(metric length)^(d/2); NaN outside the mask.
     """
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, 2 * times)
-    return _distance(pairs, Heat(2 * times), sources)
+    return _distance(pairs, Heat(resolved_times(pairs, 2 * times_of(pairs, times))), sources)
 
 
 @nan_is_meant
@@ -137,8 +134,7 @@ def varadhan_distance(
         AccuracyWarning: how many distances are NaN, and what limits them; and as `hks`, times too small for k or
             for the grid.
     """
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, times)
+    times = resolved_times(pairs, times)
     nodes, space = source_indices(pairs, sources), pairs.space
     if not space.free.ravel()[nodes].all():
         raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is zero; choose others")

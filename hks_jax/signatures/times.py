@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import checked_times
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.traced import is_traced
@@ -22,6 +23,11 @@ def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
             "with jax.vmap"
         )
     return pairs
+
+
+def times_of(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
+    """Return times as an array in the precision of the pairs; raise TypeError or ValueError for anything else."""
+    return checked_times(times, require_pairs(pairs).eigenvalues.dtype)
 
 
 def dimension_of(pairs: Eigenpairs, purpose: str) -> int:

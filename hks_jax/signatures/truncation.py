@@ -14,7 +14,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import checked_times
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import mask_for
@@ -22,7 +21,7 @@ from hks_jax.linear.loops import for_each
 from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal
-from hks_jax.signatures.times import dimension_of, require_pairs
+from hks_jax.signatures.times import dimension_of, times_of
 from hks_jax.traced import is_traced
 
 TAIL_LIMIT = 0.01
@@ -108,10 +107,7 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     Raises:
         ValueError: times that are not positive and finite; pairs in an interval; matrices whose dimension is not known.
     """
-    dtype = require_pairs(pairs).eigenvalues.dtype
-    if not pairs.lowest:
-        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
-    pairs, at = jax.lax.stop_gradient((pairs, checked_times("times", times, dtype)))
+    pairs, at = _estimated(pairs, times)
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
     dimension, resolution = dimension_of(pairs, "an estimate of the truncation"), pairs.pencil.resolution
     by_weyl, errors, order = pairs.null_space_known, None, 1
@@ -199,17 +195,26 @@ def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
     return xp.where(xp.any(xp.isnan(x), axis=1), xp.nan, median)
 
 
-def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
-    """Warn (AccuracyWarning) of times that k or the spacing does not resolve, where values are concrete.
+def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, " n"]]:
+    """Return pairs and times, constant to derivatives; raise ValueError for pairs of which nothing is estimated."""
+    at = times_of(pairs, times)
+    if not pairs.lowest:
+        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
+    return jax.lax.stop_gradient((pairs, at))
 
-    Nothing is said of pairs in an interval, whose sums are meant to be those of a band, nor where the dimension of the
-    manifold is not known.
+
+def resolved_times(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
+    """Return times as `times_of` does; warn (AccuracyWarning) of those that k or the spacing does not resolve.
+
+    Nothing is said where values are traced, of pairs in an interval, whose sums are meant to be those of a band, nor
+    where the dimension of the manifold is not known.
     """
-    pairs, times = jax.lax.stop_gradient((pairs, times))
-    if is_traced((pairs.eigenvalues, pairs.pencil, times)) or not pairs.lowest or pairs.space.dimension is None:
-        return
-    for message in truncation(pairs, times).messages():
-        warn_of_accuracy(message)
+    times = times_of(pairs, times)
+    known, at = jax.lax.stop_gradient((pairs, times))
+    if not is_traced((known.eigenvalues, known.pencil, at)) and pairs.lowest and pairs.space.dimension is not None:
+        for message in truncation(known, at).messages():
+            warn_of_accuracy(message)
+    return times
 
 
 _EXPONENTS = np.geomspace(0.5, 8, 33)
@@ -290,10 +295,7 @@ def truncation_map(
     Raises:
         ValueError: times that are not positive and finite; pairs in an interval.
     """
-    dtype = require_pairs(pairs).eigenvalues.dtype
-    if not pairs.lowest:
-        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
-    return _map(*jax.lax.stop_gradient((pairs, checked_times("times", times, dtype))))
+    return _map(*_estimated(pairs, times))
 
 
 @jax.jit

@@ -66,7 +66,7 @@ def hks_spectrum_free(
         TypeError: colouring on a mesh.
     """
     pencil, origin = from_lower_bound(_read_as_unknowns(pencil_of(domain, boundary, mass)))
-    times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
+    times = checked_times(times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     settings = choose_method(pencil, times, method, tolerance)
     scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
@@ -106,7 +106,7 @@ def colouring(
     """
     pencil = _read_as_unknowns(pencil_of(domain, boundary, mass))
     require_grid(pencil)
-    times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
+    times = checked_times(times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     require_number("memory", memory)
     require_number("slack", slack, above=1, inclusive=True)
