@@ -52,11 +52,7 @@ def require_spd(
 ) -> None:
     """Raise ValueError unless the tensors are finite, symmetric and positive definite inside.
 
-    Args:
-        name: of the argument.
-        tensors: the tensors.
-        inside: where they count.
-        place: what they belong to: ``"node"`` (of a grid, which may have a mask), ``"vertex"``, …
+    The place is what they belong to: ``"node"`` (of a grid, which may have a mask), ``"vertex"``, …
     """
     require_finite_symmetric(name, tensors, inside, place)
     bad = inside & ~spd.is_spd(tensors)

@@ -105,7 +105,7 @@ class TensorField(eqx.Module):
         if metric == "tensor":
             return cls(grid, tensors, interpolation)
         # In three dimensions the adjugate of −D is that of D.
-        tensors = spd.positive_or_nan(_identity_outside(grid, tensors))
+        tensors = spd.positive_or_nan(spd.identity_outside(tensors, grid.inside))
         return cls(grid, spd.inverse(tensors) if metric == "inverse" else spd.adjugate(tensors), interpolation)
 
     @classmethod
@@ -196,7 +196,7 @@ class TensorField(eqx.Module):
     @property
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
         """The tensors, with the identity outside the mask: what computations read; NaN where not positive definite."""
-        return spd.positive_or_nan(_identity_outside(self.grid, self.tensors))
+        return spd.positive_or_nan(spd.identity_outside(self.tensors, self.grid.inside))
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
@@ -206,12 +206,6 @@ def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_com
     nodes = jnp.asarray(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]))
     flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes.reshape(-1, grid.dimension)).astype(nodes.dtype)
     return flat.reshape(*grid.shape, *flat.shape[1:])
-
-
-def _identity_outside(grid: Grid, tensors: Float[Array, "*shape d d"]) -> Float[Array, "*shape d d"]:
-    if grid.mask is None:
-        return tensors
-    return spd.identity_outside(tensors, grid.mask)
 
 
 def _require_grid(grid: Any) -> None:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import GridSpace, grid_space
-from hks_jax.fem.stencil import StencilOperator
+from hks_jax.fem.stencil import StencilOperator, coefficients_of
 from hks_jax.linear.operators import DiagonalOperator, Operator
 from hks_jax.linear.pencil import NullSpace
 from hks_jax.traced import is_traced
@@ -22,12 +22,8 @@ def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
     """Return a pencil on all nodes of a grid, whose lowest eigenpairs are those of the pencil given, if that pays.
 
     Each node that is not free is an equation of its own, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
-    the spectrum; eigenvectors of others vanish there. Where values are traced the computation is compiled for its mask
-    in any case, and the pencil is returned as it is.
-
-    Args:
-        pencil: on any domain.
-        k: how many of its lowest pairs are to be computed; where they are more than a quarter, it is returned as it is.
+    the spectrum; eigenvectors of others vanish there. The pencil is returned as it is where more than that quarter is
+    wanted, k pairs, and where values are traced, as the computation is compiled for its mask in any case.
     """
     parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
     return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)
@@ -45,15 +41,10 @@ def _of_one(pencil: Pencil) -> Pencil:
     natural = ("neumann", "neumann")
     sides = [("periodic", "periodic") if wraps else natural for wraps in space.periodic]
     whole = grid_space(Grid(space.node_shape), (*sides, natural))
-    assert isinstance(pencil.stiffness, StencilOperator)
-    if isinstance(pencil.mass, DiagonalOperator):
-        of_mass = space.extend(pencil.mass.entries, 0.0)[None]
-        stiffness, of_mass = _with_others(pencil.stiffness.coefficients, of_mass, space.free)
-        mass: Operator = DiagonalOperator(of_mass.ravel())
-    else:
-        assert isinstance(pencil.mass, StencilOperator)
-        stiffness, of_mass = _with_others(pencil.stiffness.coefficients, pencil.mass.coefficients, space.free)
-        mass = StencilOperator(of_mass, whole)
+    of_stiffness, of_mass = (coefficients_of(each, space) for each in (pencil.stiffness, pencil.mass))
+    of_stiffness, of_mass = _with_others(of_stiffness, of_mass, space.free)
+    diagonal = isinstance(pencil.mass, DiagonalOperator)
+    mass: Operator = DiagonalOperator(of_mass.ravel()) if diagonal else StencilOperator(of_mass, whole)
     nulls = pencil.null_space
     if nulls is not None:
         vectors = space.extend(nulls.vectors, outside=0.0)
@@ -61,7 +52,7 @@ def _of_one(pencil: Pencil) -> Pencil:
     sums = pencil.row_sums
     if sums is not None:  # with infinite ones, nothing is read from neighbours
         sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
-    known_of_it = StencilOperator(stiffness, whole), mass, pencil.metric, pencil.volume, whole
+    known_of_it = StencilOperator(of_stiffness, whole), mass, pencil.metric, pencil.volume, whole
     return Pencil(*known_of_it, null_space=nulls, lower_bound=pencil.lower_bound, row_sums=sums)
 
 

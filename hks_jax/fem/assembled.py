@@ -28,18 +28,7 @@ def assembled(
     operator: WeakForm,
     fields: dict[str, Field],
 ) -> Pencil:
-    """Return the pencil of two matrices, with what is known of it.
-
-    Args:
-        stiffness: K.
-        consistent: M, unless it is to be lumped.
-        lumped: the row sums of M at all nodes.
-        metric: for estimates; None where there are none.
-        volume: of the domain.
-        space: of its functions.
-        operator: what was assembled.
-        fields: what it reads.
-    """
+    """Return the pencil of K and M, which may be lumped to its row sums at all nodes, with what is known of it."""
     mass = DiagonalOperator(entries=space.restrict(lumped)) if operator.lumped else consistent
     if operator.own:
         return Pencil(stiffness, mass, None, None, space)

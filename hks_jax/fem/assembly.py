@@ -191,11 +191,11 @@ def _checked_operator(
 def _checked_fields(
     operator: WeakForm, given: dict[str, Any], space: GridSpace | MeshSpace, points: Callable[[], Array], dtype: Any
 ) -> dict[str, Field]:
-    def checked(name: str) -> Field:
-        positive = name == "density" and not operator.own
-        return checked_field(name, given[name], space, points, dtype, scalar=not operator.own, positive=positive)
-
-    return {name: checked(name) for name in given}
+    known = not operator.own
+    return {
+        name: checked_field(name, value, space, points, dtype, scalar=known, positive=known and name == "density")
+        for name, value in given.items()
+    }
 
 
 def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:

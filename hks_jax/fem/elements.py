@@ -41,22 +41,12 @@ def element_matrices(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Integrate one element: by default stiffness ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and mass ∫ √|T| hᵢhⱼ.
 
-    Args:
-        metric: T at the quadrature points.
-        element: the shape functions there.
-        form: what is integrated.
-        x: the positions of the quadrature points, for forms that read them.
-        fields: the fields that the forms read, (q, …) each.
-        frames: ∂x/∂ξ of the element's coordinates ξ, where the forms see places x in space; else they see ξ.
-
-    Returns:
-        stiffness (n, n) and mass (n, n).
+    The metric T, positions x and fields are those at the quadrature points. With frames ∂x/∂ξ of the element's
+    coordinates ξ the forms see places x in space; else they see ξ.
     """
     h, dh = jnp.asarray(element.values, metric.dtype), jnp.asarray(element.gradients, metric.dtype)
-    volume, inverse = (
-        jnp.asarray(element.weights, metric.dtype) * jnp.sqrt(spd.determinant(metric)),
-        spd.inverse(metric),
-    )
+    volume = jnp.asarray(element.weights, metric.dtype) * jnp.sqrt(spd.determinant(metric))
+    inverse = spd.inverse(metric)
     if frames is not None:
         product = partial(jnp.einsum, precision="highest")
         dual = product("qxa,qab->qxb", frames, spd.inverse(product("qxa,qxb->qab", frames, frames)))

@@ -90,7 +90,7 @@ def _grid_integrals(
     Of functions with several components the matrices of all elements in place of stencils.
     """
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
-    tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
+    tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 
     # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them
     # into everything that reads a component, and compute them again for each.

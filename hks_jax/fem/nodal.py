@@ -11,9 +11,8 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace, mask_for
-from hks_jax.fem.stencil import Stencil, StencilOperator
+from hks_jax.fem.stencil import Stencil, coefficients_of
 from hks_jax.linear.chebyshev import chebyshev_iteration
-from hks_jax.linear.operators import DiagonalOperator
 
 
 class NodalPencil(eqx.Module):
@@ -75,12 +74,7 @@ class NodalPencil(eqx.Module):
     def mass_solve(
         self, low: Float[Array, ""] | float, degree: int
     ) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return r ↦ Pr, P ≈ M⁻¹ a fixed polynomial; exact where the mass is lumped.
-
-        Args:
-            low: the lower end of the spectrum of D⁻¹M.
-            degree: how many steps of Chebyshev iteration P consists of.
-        """
+        """Return r ↦ Pr, P ≈ M⁻¹ so many steps of Chebyshev iteration; exact where the mass is lumped."""
         inverse, mass = 1 / self.lumped[..., None], self.mass.of_columns()
         if self.mass.is_diagonal:
             return lambda r: inverse * r
@@ -96,17 +90,14 @@ def lump(stiffness: Stencil, mass: Stencil, free: Bool[Array, "*shape"], domain:
 
 def nodal_pencil(pencil: Pencil) -> NodalPencil:
     """Return a grid's pencil on nodal arrays."""
-    space, stiffness, mass = pencil.space, pencil.stiffness, pencil.mass
+    space = pencil.space
     assert isinstance(space, GridSpace)
-    assert isinstance(stiffness, StencilOperator)
-    if isinstance(mass, DiagonalOperator):
-        of_mass = Stencil(space.extend(mass.entries, outside=0.0)[None], space.periodic)
-    else:
-        assert isinstance(mass, StencilOperator)
-        of_mass = mass.nodal
+    stiffness, mass = (
+        Stencil(coefficients_of(each, space), space.periodic) for each in (pencil.stiffness, pencil.mass)
+    )
     # Under `jit` they are known, and without the barrier the compiler would compute with them, node by node.
     masks = (jnp.asarray(mask_for(pencil, mask)) for mask in (space.free, space.domain))
-    return lump(stiffness.nodal, of_mass, *jax.lax.optimization_barrier(tuple(masks)))
+    return lump(stiffness, mass, *jax.lax.optimization_barrier(tuple(masks)))
 
 
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:

@@ -63,13 +63,7 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
 def moved(
     stiffness: Float[Array, "n n"], metric: Float[Array, "q d d"], spacing: Float[np.ndarray | Array, " d"]
 ) -> Float[Array, "n n"]:
-    """Return a cell's stiffness, integrated at Gauss's points, as one at the points that its tensor asks for.
-
-    Args:
-        stiffness: as `element_matrices` returns it.
-        metric: T at Gauss's points.
-        spacing: the sides of the cell.
-    """
+    """Return a cell's stiffness, integrated at Gauss's points, as one at the points that its tensor asks for."""
     ratio = jnp.sqrt(stiffness_point(jnp.mean(metric, axis=0), spacing)) / GAUSS
     basis, powers = (jnp.asarray(each, stiffness.dtype) for each in _products(len(spacing)))
     factors = ratio**powers
