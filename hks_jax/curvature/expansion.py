@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.checks import checked_times
 from hks_jax.curvature import taylor
 from hks_jax.curvature.gaussian import gaussian, scalar, scalar_and_ricci_squared
@@ -26,7 +27,6 @@ from hks_jax.curvature.jet import (
 from hks_jax.curvature.laplace_beltrami import laplacian
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 
 Coefficients: TypeAlias = list[Array]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.curvature.jet import Jet, christoffel, inner, metric_jet, wraps_per_axis
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 
 
 @nan_is_meant

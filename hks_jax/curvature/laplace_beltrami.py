@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.checks import real_array
 from hks_jax.curvature.jet import (
     Jet,
@@ -21,7 +22,6 @@ from hks_jax.curvature.jet import (
 )
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 
 
 @nan_is_meant

@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import StaticArray, describe_array
 from hks_jax.checks import real_array
-from hks_jax.describe import describe_array
 from hks_jax.domain import spd
 from hks_jax.domain.mesh_tensors import metric_of_tensors
 from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_cells, checked_mask
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, checked_tensors
 from hks_jax.domain.triangulation import Triangulation
-from hks_jax.static_array import StaticArray
 from hks_jax.traced import is_traced
 
 Mesh = TypeVar("Mesh", bound="SimplicialMesh")
@@ -89,7 +88,6 @@ class SimplicialMesh(eqx.Module):
         return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 
     def __repr__(self) -> str:
-        """Return one line: the sizes, and where the metric comes from."""
         metric = "that of space" if self._metric is None else describe_array(self._metric)
         cells = f"{len(self.triangulation.cells)} {WORDS[self.triangulation.dimension].simplices}"
         return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"

@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import describe_array
 from hks_jax.checks import real_array
-from hks_jax.describe import describe_array
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import (
@@ -181,7 +181,6 @@ class TensorField(eqx.Module):
         return cls(grid, positive_map(name, tensors, chosen, number, grid.inside), interpolation)
 
     def __repr__(self) -> str:
-        """Return one line: the grid, and where the metric comes from."""
         values = "a function" if self.function is not None else describe_array(self._tensors)
         return f"TensorField({values} on {self.grid!r}, interpolation={self.interpolation!r})"
 

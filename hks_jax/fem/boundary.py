@@ -56,7 +56,6 @@ def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, .
 
 
 def _pair(entry: str | Sides) -> Sides:
-    """Return the (low, high) conditions of one axis."""
     pair = (entry, entry) if isinstance(entry, str) else entry
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise ValueError(f"boundary: got {entry!r} for one axis; expected a name or a pair (low, high)")

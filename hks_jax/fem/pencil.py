@@ -37,7 +37,6 @@ class Pencil(SymmetricPencil):
     row_sums: Float[Array, " n_dof"] | None = eqx.field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
-        """Return one line: how many unknowns on what, and under which boundary."""
         return f"Pencil({self.space!r})"
 
     @property

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import ByKey
 from hks_jax.fem.halo import Slabs, neighbours, product_with_rim, side_by_side, with_rim
 from hks_jax.fem.space import GridSpace, taken
 from hks_jax.linear import accelerators
@@ -25,11 +26,12 @@ _CELL = {2: 25, 3: 64}
 
 
 @jax.tree_util.register_static
-class GridPattern(Pattern):
+class GridPattern(ByKey, Pattern):
     """The couplings of a grid's free nodes with their 3^d neighbours, as places in stencil coefficients."""
 
     def __init__(self, space: GridSpace) -> None:
         self.space, self.size, self.n_entries = space, space.n_dof, 3**space.dimension * space.free.size
+        self._key = space
 
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for each place its index into the flat coefficients, its row, and its column."""
@@ -42,12 +44,6 @@ class GridPattern(Pattern):
     def bisect(self) -> Parts:
         """Return how to cut the grid."""
         return _bisect(self.space)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, GridPattern) and self.space == other.space)
-
-    def __hash__(self) -> int:
-        return hash(self.space)
 
 
 @lru_cache(maxsize=16)

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.checks import checked_times, require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.signatures.hks import hks
 from hks_jax.signatures.kernels import heat_trace, wks
-from hks_jax.static_array import StaticArray
 
 Function = Callable[[Eigenpairs], Array]
 Loss = Callable[[Array, Array], Array]

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import nan_is_meant
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.driver import eigenpairs
@@ -12,7 +13,6 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, Sides, normalise_boundary
-from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.hks import hks
 from hks_jax.signatures.spectral_functions import spectral_diagonal

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.products import quadratic_forms
-from hks_jax.static_array import StaticArray
 
 
 class Contraction(eqx.Module):

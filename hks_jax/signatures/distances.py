@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral_functions import (
     source_indices,

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
+from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import dimension_of, times_of, volume_of
@@ -183,7 +183,6 @@ def hks_auto(
 
 
 def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, values: Array) -> Array:
-    """Normalise a raw signature."""
     if normalisation == "heat-trace":
         raise ValueError(
             'normalisation: "heat-trace" needs the whole spectrum; use "raw", "volume" or "flat", or method="spectral"'

@@ -14,11 +14,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.arrays import nan_is_meant
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import mask_for
 from hks_jax.linear.loops import for_each
-from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal
 from hks_jax.signatures.times import dimension_of, times_of

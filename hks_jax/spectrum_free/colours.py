@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.fem.space import GridSpace, axis_colours
 from hks_jax.linear.chebyshev import coefficient_tails, least_degree
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
-from hks_jax.static_array import StaticArray
 
 _STEEPEST = 0.9
 """How much of the steepest decay of M⁻¹ is made use of: near all of it the bound has a large factor before it."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.checks import checked_times, require_number
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -18,7 +19,6 @@ from hks_jax.fem.space import GridSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.chebyshev import heat_coefficients
 from hks_jax.linear.dissection import dissect
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.spectrum_free.colours import Colouring
 from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_fewer_vectors, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal
