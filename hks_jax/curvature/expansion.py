@@ -55,9 +55,8 @@ def hks_expansion(
 
     Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order, h the spacing
     of the nodes in length: beside the sides of a grid and the rim of a mask, where they are one-sided, u₂ is of fourth
-    order and u₃ of second. Their rounding errors grow with the sixth derivative in u₃: relative to the result, some
-    ε(t/h²)³/5 with the floating-point ε, and some hundred times more within eight nodes of a side or rim. In float32
-    keep t below some 30 h², or the order below 3.
+    order and u₃ of second. The relative rounding error of u₃ is some ε(t/h²)³/5, a hundred times more within eight
+    nodes of a side or rim: in float32 keep t below some 30 h², or the order below 3.
 
     Args:
         field: the metric, d = 2 or 3.

@@ -48,9 +48,8 @@ def sparse_pencil(
 ) -> Pencil:
     """Return a pair of matrices as a pencil with one pattern, that of either matrix and of its transpose.
 
-    The entries of the operators are what K and M have as numbers; of an entry and the one across the diagonal it is the
-    mean that counts, in derivatives too. Eigenpairs of the pencil have every signature. Those that need a geometry say
-    which of the arguments below they lack.
+    Of an entry and the one across the diagonal the mean counts, in derivatives too. Eigenpairs of the pencil have every
+    signature. Those that need a geometry say which of the arguments below they lack.
 
     Args:
         K: symmetric (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data may be

@@ -107,13 +107,13 @@ def varadhan_distance(
 
     Varadhan 1967; Zobel, Reininghaus and Hotz, section 2. At a positive t the kernel is (4πt)^(−n/2) exp(−d²/4t)
     (u₀ + O(t)) in n dimensions. Divided by its diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), it has no power of t
-    before it and is at most 1: the error of d² is −4t log u₀ + O(t²), none on a flat domain away from its sides. The
-    formula as it stands errs by 2nt log 4πt besides.
+    before it: the error of d² is −4t log u₀ + O(t²), none on a flat domain away from its sides. The formula as it
+    stands errs by 2nt log 4πt besides.
 
-    Small times need fine grids and many pairs. At the distance d linear elements err by d²h²/48t² of d² (h: the
-    distance of neighbours), so that t must be about d·h or more; and exp(−d²/4t) must stand out from what lies beyond k
-    and from rounding. Where the kernel's estimated error exceeds a tenth of it, or the grid's error of d² a tenth, the
-    result is NaN, not a guess. Larger times reach further, at the cost of an error that grows with t.
+    Small times need fine grids and many pairs: linear elements with neighbours at the distance h err by d²h²/48t² of
+    d², and exp(−d²/4t) must stand out from the part beyond k and from rounding. Where the kernel's estimated error
+    exceeds a tenth of it, or the grid's error of d² a tenth, the result is NaN. Larger times reach further, at the cost
+    of an error that grows with t.
 
     Args:
         pairs: from `eigenpairs`; more of them reach further. Distances are those within the domain: around holes of its

@@ -53,14 +53,13 @@ def scale_invariant_hks(
     """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT| of d/dτ log HKS(exp τ, x), low frequencies.
 
     Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant; the derivative drops the constant, the
-    modulus of the Fourier transform the shift. The default times follow the spectrum (log-spaced from 4 ln10/λ_last to
-    4 ln10/λ₁), which makes the invariance exact; give ``times`` (log-spaced) to compare shapes at absolute scales.
+    modulus of the Fourier transform the shift. The default times follow the spectrum, which makes the invariance exact.
 
     Args:
         pairs: from `eigenpairs`.
         n_frequencies: how many Fourier moduli, from frequency 0.
         n_times: how many samples of τ.
-        times: (n,) log-spaced times instead of the default.
+        times: (n,) log-spaced times, to compare shapes at absolute scales; None: from 4 ln10/λ_last to 4 ln10/λ₁.
 
     Returns:
         (n_frequencies, *shape), without unit; NaN outside the mask and at Dirichlet nodes.

@@ -93,16 +93,14 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     Weyl's law N(λ) = k (λ/Λ)^(d/2), whose constant is taken from the spectrum itself (Λ is the first eigenvalue beyond
     the k), gives the part of the heat trace beyond Λ: a mean over the domain. `truncation_map` has single nodes.
 
-    The error by the spacing h has two parts. One is that of a constant metric, d h²/48t where its axes are the grid's,
-    more where they are not. The other does not fall as t grows: where tensors turn or stretch from node to node,
-    elements are too stiff, and the interpolated tensors have another volume, to whose inverse the signature tends. Both
-    are of leading order in h. On fields whose tensors turn, in 2D and 3D, with either interpolation, the median error
-    was a third of the estimate to three times it, where k was enough for t; at eigenvalue ratios of 30 on coarse grids
-    (errors above 10 %) down to a quarter. On meshes only the first part is estimated. Of matrices from elsewhere the
-    spacing is not known, and its error NaN.
+    The error by the spacing h has two parts, both of leading order in h. One is that of a constant metric, d h²/48t
+    where its axes are the grid's, more where they are not. The other does not fall as t grows: where tensors turn or
+    stretch from node to node, elements are too stiff, and the interpolated tensors have another volume. Where k was
+    enough for t, the median error on such fields was a third of the estimate to three times it; a quarter at eigenvalue
+    ratios of 30 on coarse grids. On meshes only the first part is estimated.
 
-    A potential changes both. Where nothing is known of the null space, the exponent is the one that the mean of the
-    pairs' eigenvalues tells, if it is more than d/2, and the error by the spacing is NaN.
+    With a potential, or where nothing is known of the null space, the exponent is the one that the mean of the pairs'
+    eigenvalues tells, if it is more than d/2. The error by the spacing is then NaN, as that of matrices from elsewhere.
 
     Raises:
         ValueError: times that are not positive and finite; pairs in an interval; matrices whose dimension is not known.
@@ -279,10 +277,8 @@ def truncation_map(
     N(Λ, x) and the exponent a(x) come from the pairs, the latter from the mean of λ at the node, which is Λ a/(a + 1):
     about d/2 inside and at natural sides, d/2 + 1 at a Dirichlet side.
 
-    An estimate, not a bound. Against all pairs of small grids (2D and 3D, flat, smooth and rough tensors, every
-    boundary, from 28 pairs to a third of all) the largest share of a node was 0.25 to 2 times the largest estimate
-    where the mean was above 0.1 %, and up to 3 times at a mean of 1e-6. Where the mean was 1 % the largest share was
-    1.1 to 6 times that without Dirichlet sides, and 3 to 20 times beside them.
+    An estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the largest estimate
+    where the mean was above 0.1 %, and up to 3 times at a mean of 1e-6.
 
     Args:
         pairs: from `eigenpairs`.

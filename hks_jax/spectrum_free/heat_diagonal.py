@@ -84,14 +84,9 @@ def colouring(
     memory: float = 2e9,
     slack: float = 1.0,
 ) -> Colouring:
-    """Choose spacing and degree for `hks_spectrum_free` from the error bound; needs concrete values.
+    """Choose spacing and degree for `hks_spectrum_free`, with its arguments, from the error bound; no traced values.
 
     Args:
-        domain: as there.
-        times: as there.
-        boundary: as there.
-        mass: as there.
-        tolerance: as there.
         memory: bytes that the working vectors may take; fewer vectors at once where it is short.
         slack: ≥ 1: be prepared for a spectrum and a reach so many times as large, as fields have that are still to
             come (in a fit, say).
