@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.checks import checked_times
 from hks_jax.curvature import taylor
-from hks_jax.curvature.gaussian import gaussian, scalar, scalar_and_ricci_squared
+from hks_jax.curvature.geometry import gaussian, laplacian, scalar, scalar_and_ricci_squared
 from hks_jax.curvature.jet import (
     Jet,
     at_nodes,
@@ -24,7 +24,6 @@ from hks_jax.curvature.jet import (
     nodal_jet,
     wraps_per_axis,
 )
-from hks_jax.curvature.laplace_beltrami import laplacian
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
 
