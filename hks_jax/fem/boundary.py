@@ -116,12 +116,8 @@ def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
     mixed = list(product(*choices))
     if not any("mean" in sides for sides in boundary):
         return mixed
-    return [_replaced(problem, "mean", condition) for condition in ("neumann", "dirichlet") for problem in mixed]
-
-
-def _replaced(boundary: tuple[Sides, ...], old: Side, new: Side) -> tuple[Sides, ...]:
-    """Return the conditions, with another name for one of them."""
-    return tuple((new if low == old else low, new if high == old else high) for low, high in boundary)
+    halves = [{"mean": condition} for condition in ("neumann", "dirichlet")]
+    return [tuple((half.get(a, a), half.get(b, b)) for a, b in problem) for half in halves for problem in mixed]
 
 
 def reflect(field: TensorField, width: int) -> TensorField:

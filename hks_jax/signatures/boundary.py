@@ -12,7 +12,7 @@ from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
-from hks_jax.fem.boundary import BoundarySpec, Sides, normalise_boundary
+from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.hks import hks
 from hks_jax.signatures.spectral_functions import spectral_diagonal
@@ -73,16 +73,14 @@ def boundary_influence(
 
 def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:
     """Return the boundary that has the mean on all of the rim."""
-    allowed = ("neumann", "mean", "periodic")
     if isinstance(domain, SimplicialMesh):
-        if boundary not in allowed[:2]:
+        if boundary not in ("neumann", "mean"):
             raise ValueError(f'boundary: got {boundary!r}; a mesh takes "neumann" here')
         return "mean"
     sides = normalise_boundary(boundary, domain.grid.dimension)
-    if any(condition not in allowed for pair in sides for condition in pair):
+    if not {condition for pair in sides for condition in pair} <= {"neumann", "mean", "periodic"}:
         raise ValueError(
             f'boundary: got {boundary!r}; expected "neumann" or "periodic" for each axis: natural and Dirichlet '
             "conditions on all sides that are not periodic are compared"
         )
-    mean: Sides = ("mean", "mean")
-    return tuple(pair if pair == ("periodic", "periodic") else mean for pair in sides)
+    return tuple("periodic" if pair == ("periodic", "periodic") else "mean" for pair in sides)

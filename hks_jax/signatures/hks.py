@@ -55,17 +55,15 @@ class AutomaticHKS(eqx.Module):
         times, spectral = np.asarray(self.times), np.asarray(self.spectral)
         lines = []
         for name, which in (("eigenpairs", spectral), (self.method, ~spectral)):
-            if which.any():
-                lines.append(f"{int(which.sum())} of {times.size} times by {name}: {_listed(times[which])}")
+            some = [f"{t:.4g}" for t in times[which]]
+            if some:
+                listed = ", ".join(some[:8]) + (" …" if len(some) > 8 else "")
+                lines.append(f"{len(some)} of {times.size} times by {name}: {listed}")
         if math.isfinite(float(self.overlap_time)):
             lines.append(
                 f"both at t = {float(self.overlap_time):.4g}: they differ by {float(self.overlap_difference):.1e}"
             )
         return "\n".join(lines)
-
-
-def _listed(times: np.ndarray) -> str:
-    return ", ".join(f"{t:.4g}" for t in times[:8]) + (" …" if times.size > 8 else "")
 
 
 def hks(
