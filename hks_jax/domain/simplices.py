@@ -127,7 +127,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
         if crowded.size:
             edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
             warn_of_accuracy(
-                f"faces: {crowded.size} edges belong to three triangles or more (the first is that of vertices {edge}): "
+                f"faces: {crowded.size} edges belong to three triangles or more (the first is of vertices {edge}): "
                 "the surface branches there, and heat goes into all branches. If it should not, remove inner sheets"
             )
         _warn_of_hanging(vertices, triangulation)
