@@ -15,7 +15,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.one_pencil import solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
-from hks_jax.fem.all_nodes import on_all_nodes
+from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 

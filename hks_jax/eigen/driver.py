@@ -16,11 +16,11 @@ from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest
 from hks_jax.eigen.solver import Eigensolver, Report, silent
-from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.elements import Quadrature
+from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.quadrature import Quadrature
 from hks_jax.traced import is_traced
 
 

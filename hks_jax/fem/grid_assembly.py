@@ -15,11 +15,10 @@ from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.elements import Element, at_quadrature, element_matrices, tensor_product_element
+from hks_jax.fem.elements import MASS, Element, at_quadrature, element_matrices, moved, tensor_product_element
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
 from hks_jax.fem.pencil import Pencil, assembled, gathered, row_sums_of
-from hks_jax.fem.quadrature import MASS, moved
 from hks_jax.fem.resolution import SampledMetric
 from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator

@@ -16,8 +16,8 @@ from scipy.sparse.linalg import LinearOperator
 from hks_jax.checks import real_array, require_number
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.quadrature import Quadrature
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.operators import ROUNDING, DiagonalOperator, Operator, SparseOperator, require_symmetric
 from hks_jax.linear.pattern import SparsePattern

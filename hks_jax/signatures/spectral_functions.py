@@ -14,7 +14,7 @@ from hks_jax.arrays import StaticArray, nan_outside
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.all_nodes import on_all_nodes
+from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.not_differentiable import first_order_only
