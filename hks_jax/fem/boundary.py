@@ -138,14 +138,9 @@ def reflect(field: TensorField, width: int) -> TensorField:
         raise ValueError(f"width: got {width}; expected 1 … {min(grid.shape) - 1} nodes for shape {grid.shape}")
     pad = [(width, width)] * d
     tensors = jnp.pad(field.tensors, [*pad, (0, 0), (0, 0)], mode="reflect")
-    for axis in range(d):
-        index = np.arange(-width, grid.shape[axis] + width)
-        beyond = (index < 0) | (index > grid.shape[axis] - 1)
-        sign = np.where(beyond, -1.0, 1.0).reshape([-1 if a == axis else 1 for a in range(d)] + [1, 1])
-        flips = np.zeros((d, d), dtype=bool)
-        flips[axis, :] = flips[:, axis] = True
-        flips[axis, axis] = False
-        tensors = tensors * jnp.where(flips, sign, 1.0).astype(tensors.dtype)
+    inside = [np.pad(np.ones(n), width, constant_values=-1) for n in grid.shape]
+    sign = np.stack(np.meshgrid(*inside, indexing="ij"), axis=-1)
+    tensors = tensors * jnp.asarray(sign[..., :, None] * sign[..., None, :], tensors.dtype)
     mask = None if grid.mask is None else np.pad(grid.mask, pad, mode="reflect")
     origin = [o - width * h for o, h in zip(grid.origin, grid.spacing, strict=True)]
     shape = [n + 2 * width for n in grid.shape]
