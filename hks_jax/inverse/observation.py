@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.checks import checked_times, require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.signatures.hks import hks_of_pairs
+from hks_jax.signatures.hks import hks
 from hks_jax.signatures.kernels import heat_trace, wks
-from hks_jax.static_array import StaticArray
 
 Function = Callable[[Eigenpairs], Array]
 Loss = Callable[[Array, Array], Array]
@@ -41,7 +41,7 @@ class Signature:
 SIGNATURES = {
     each.name: each
     for each in (
-        Signature("hks", lambda pairs, times, *_: hks_of_pairs(pairs, times), "t", at_nodes=True),
+        Signature("hks", lambda pairs, times, *_: hks(pairs, times), "t", at_nodes=True),
         Signature("wks", lambda pairs, energies, sigma, _: wks(pairs, energies, sigma), "e", at_nodes=True),
         Signature("heat-trace", lambda pairs, times, *_: heat_trace(pairs, times), "t"),
         Signature("eigenvalues", lambda pairs, _, __, count: pairs.eigenvalues[:count]),  # there may be spare ones
@@ -103,7 +103,7 @@ def observe(
         require_number("sigma", sigma)
         times, sigma = jnp.asarray(times, dtype), jnp.asarray(sigma, dtype)
     else:
-        times, sigma = checked_times("times", times, dtype) if kind.symbol else None, None
+        times, sigma = checked_times(times, dtype) if kind.symbol else None, None
     nodes = space.node_shape if kind.at_nodes else ()
     expected = None if times is None else (times.size, *nodes)
     if (expected is not None and values.shape != expected) or (kind.name == "eigenvalues" and values.ndim != 1):

@@ -11,9 +11,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.inverse.parametrisation import Parametrisation
-from hks_jax.static_array import StaticArray
 
 Values = Float[Array, "..."]
 
