@@ -14,10 +14,9 @@ from hks_jax import assemble
 from hks_jax.cli.job import Settings, Solved, field_of
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.io.arrays import place_of
+from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.io.result import plain, recorded_boundary
-from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npz
 
 _RECORD = "field_record"
@@ -69,9 +68,8 @@ def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solv
     """Return the eigenpairs, where the settings that are settled are theirs, and the suffix of images."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
-    spacing, origin = (tuple(arrays[name].tolist()) for name in ("spacing", "origin"))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}
-    volume = TensorVolume(arrays["tensors"], spacing, origin, arrays.get("mask"), arrays.get("affine"), **about)
+    volume = volume_of(str(path), arrays, arrays["tensors"], **about)
     boundary = recorded_boundary(record["settings"])
     assert boundary is not None
     settings = replace(settings, **{**record["settings"], "boundary": boundary})
