@@ -4,7 +4,6 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -67,12 +66,16 @@ def read_tensors(
             f"files: got {given}; expected six NIfTI images, one for each component {' '.join(NAMES)}, which their "
             "names tell, as in sub-01_param-txx_dwimap.nii.gz or dtxx.nii.gz"
         )
-    images = [_image(files[name]) for name in NAMES]
+    images = [nifti.load(files[name]) for name in NAMES if nifti.is_nifti(files[name])]
+    if len(images) < 6:
+        raise ValueError(f"{', '.join(files.values())}: six images of components; expected NIfTI, .nii or .nii.gz")
     first = images[0]
     affine = nifti.affine_in_mm(files["xx"], first)[0]
     for name, image in zip(NAMES, images, strict=True):
-        if image.shape != first.shape:
-            raise ValueError(f"{files[name]}: got shape {image.shape}; expected that of {files['xx']}, {first.shape}")
+        if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
+            raise ValueError(
+                f"{files[name]}: got shape {image.shape}; expected (nx, ny, nz), one component, as all six"
+            )
         if not np.allclose(nifti.affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected the same voxels")
     values = np.stack([nifti.voxels(files[name], image) for name, image in zip(NAMES, images, strict=True)], axis=-1)
@@ -80,12 +83,3 @@ def read_tensors(
     joined.header["xyzt_units"] = first.header["xyzt_units"]
     joined.header.set_intent(nifti.SYMMETRIC_MATRIX, (3,))
     return nifti.tensors_of(files["xx"], joined, None, frame)
-
-
-def _image(path: str) -> Any:
-    if not nifti.is_nifti(path):
-        raise ValueError(f"{path}: one of six images; expected NIfTI, .nii or .nii.gz")
-    image = nifti.load(path)
-    if len(image.shape) < 3 or math.prod(image.shape[3:]) != 1:
-        raise ValueError(f"{path}: got shape {image.shape}; expected (nx, ny, nz), one component")
-    return image

@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Literal, NamedTuple
@@ -13,9 +14,9 @@ from jaxtyping import Bool, Float
 from hks_jax.checks import require_number
 from hks_jax.io import nifti
 from hks_jax.io.masks import read_mask
-from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import Matrices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
-from hks_jax.io.volume import TensorVolume, as_mask, digest
+from hks_jax.io.volume import TensorVolume, as_mask, digest, placed
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
@@ -44,10 +45,8 @@ def find_example_brain() -> ExampleBrain | None:
         files = importlib.metadata.files("mdt") or []
     except importlib.metadata.PackageNotFoundError:
         return None
-    paths = {file.name: Path(str(file.locate())) for file in files if file.name in names}
-    if any(name not in paths or not paths[name].is_file() for name in names):
-        return None
-    return ExampleBrain(*(paths[name] for name in names))
+    paths = {file.name: Path(str(file.locate())) for file in files if Path(str(file.locate())).is_file()}
+    return ExampleBrain(*(paths[name] for name in names)) if paths.keys() >= set(names) else None
 
 
 def fit_dwi(
@@ -118,7 +117,7 @@ def fit_dwi(
     inside, found = _inside(os.fspath(path), mask, signal, b[used] <= threshold, affine, segmentation)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
-    tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), bvec_frame, affine)
+    fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
     covariance = None
     if noise is not None:
         covariance = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
@@ -137,21 +136,8 @@ def fit_dwi(
         notes.append(f"covariances of the tensors from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
-    return TensorVolume(
-        tensors,
-        tuple(np.linalg.norm(affine[:3, :3], axis=0).tolist()),
-        (0.0, 0.0, 0.0),
-        inside,
-        affine,
-        order="fit",
-        frame=bvec_frame,
-        notes=tuple(notes),
-        source=os.fspath(path),
-        digest=digest(path),
-        length_unit="mm",
-        unit=MM2_PER_S,
-        covariance=covariance,
-    )
+    volume = placed(os.fspath(path), fitted, bvec_frame, affine, inside, unit=MM2_PER_S, covariance=covariance)
+    return replace(volume, notes=tuple(notes), digest=digest(path))
 
 
 # With the logarithms y of the signals, weights w (the signals that an unweighted fit predicts), and the rows X of the

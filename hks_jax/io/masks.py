@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
-from hks_jax.io.volume import as_mask
+from hks_jax.io.volume import as_mask, corners
 from hks_jax.reading import existing, reading
 
 
@@ -29,7 +29,12 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
     name = os.fspath(path)
     values, place = _image(path, affine, IMAGES)
     if affine is not None and place is not None:
-        _check_same_place(name, place, affine, values.shape)
+        shift = np.linalg.norm(corners(values.shape) @ (place - affine).T, axis=1).max()
+        if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
+            raise ValueError(
+                f"{name}: the mask's affine places it up to {shift:.3g} away from the tensors'; expected the same "
+                "place. Resample the mask to the tensors' voxels"
+            )
     return as_mask(name, values)
 
 
@@ -50,17 +55,6 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
     if not eroded.any():
         raise ValueError(f"iterations: eroding by {iterations} voxels leaves nothing of {int(mask.sum())} voxels")
     return eroded
-
-
-def _check_same_place(name: str, mask_affine: np.ndarray, affine: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Raise ValueError if any corner of the mask lies over half a voxel from the same corner of the image."""
-    corners = np.stack(np.meshgrid(*[(0, n - 1) for n in shape[:3]], [1], indexing="ij"), -1).reshape(-1, 4)
-    shift = np.linalg.norm(corners @ (mask_affine - affine).T, axis=1).max()
-    if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
-        raise ValueError(
-            f"{name}: the mask's affine places it up to {shift:.3g} away from the tensors'; expected the same place. "
-            "Resample the mask to the tensors' voxels"
-        )
 
 
 NEAR = 0.1
@@ -148,9 +142,8 @@ def _at_voxels(
     size = list(shape)
     if len(size) == 2:
         size.insert(2 if slice_axis is None else slice_axis, 1)
-    corners = np.stack(np.meshgrid(*[(0, n - 1) for n in size], [1], indexing="ij"), -1).reshape(-1, 4)
-    first = np.rint(to_labels[:3, 3]).astype(int)
-    apart = np.abs((corners @ to_labels.T)[:, :3] - corners[:, :3] - first).max()
+    first, ends = np.rint(to_labels[:3, 3]).astype(int), corners(tuple(size))
+    apart = np.abs((ends @ to_labels.T)[:, :3] - ends[:, :3] - first).max()
     box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
     inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
     if apart > NEAR or not inside:

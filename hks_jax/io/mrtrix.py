@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.io.tensor_order import FRAMES, invalid_by_order, to_voxel_axes, unpack
-from hks_jax.io.volume import Format, TensorVolume
+from hks_jax.io.tensor_order import FRAMES, matrices
+from hks_jax.io.volume import Format, TensorVolume, placed
 from hks_jax.reading import existing, reading
 
 _MAGIC = b"mrtrix image"
@@ -61,21 +61,9 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
         raise ValueError(
             f"{name}: got an image of shape {values.shape}; expected the six components of dwi2tensor, (nx, ny, nz, 6)"
         )
-    order = order or "mrtrix"
-    frame = frame or FRAMES[order]
     components = np.ascontiguousarray(values, np.float32 if values.dtype.itemsize <= 4 else np.float64)
-    return TensorVolume(
-        to_voxel_axes(unpack(components, order), frame, affine),
-        tuple(np.linalg.norm(affine[:3, :3], axis=0).tolist()),
-        (0.0, 0.0, 0.0),
-        affine=affine,
-        order=order,
-        frame=frame,
-        notes=(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes',),
-        source=name,
-        invalid_by_order=invalid_by_order(components, order),
-        length_unit="mm",
-    )
+    found = matrices(name, components, order, "mrtrix")
+    return placed(name, found, frame or FRAMES[found.order], affine)
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], int]:

@@ -5,6 +5,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,9 +16,9 @@ from hks_jax.checks import require_real
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
-from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import FRAMES, matrices, pack
 from hks_jax.io.units import by_axis, scaled_beside
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
+from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
@@ -150,29 +151,18 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     affine, length_unit = affine_in_mm(name, image)
     encoding, record, notes = _encoding(name), _own_record(image, affine) if declared else {}, list[str]()
-    if order is None and declared:
-        order = "nifti"
-    elif order is None and encoding.get("Type") == "tensor":
-        order = "fsl"  # as BIDS has it: xx xy xz yy yz zz
-    elif order is None:
-        raise ValueError(
-            f"{name}: six components, but the file does not declare their order (its NIfTI intent is not "
-            f"symmetric-matrix), and programs differ. Pass order (--order), one of {choices()}"
-        )
-    elif declared and order != "nifti":
+    by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # xx xy xz yy yz zz
+    found = matrices(name, voxels(name, image).reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
+    if declared and found.order != "nifti":
         notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
     declared_frame = _REFERENCES.get(encoding.get("Reference", ""), record.get("frame"))
-    open_frame = frame is None and declared_frame is None and order == "nifti"
+    open_frame = frame is None and declared_frame is None and found.order == "nifti"
     if frame is not None and declared_frame not in (None, frame):
         notes.append(f"the {declared_frame} axes that the file declares are set aside for the {frame} axes, as asked")
-    frame = frame or declared_frame or FRAMES[order]
-    components = voxels(name, image).reshape(*shape[:3], 6)
-    tensors = unpack(components, order)
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if not (np.isfinite(affine).all() and spacing.min() > 0):
-        raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
+    frame = frame or declared_frame or FRAMES[found.order]
+    volume = placed(name, found, frame, affine, unit=record.get("unit", ""))
     notes += placement_notes(image)
-    axes = affine[:3, :3] / spacing
+    axes = affine[:3, :3] / volume.spacing
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
         notes.append("the affine's axes are not orthogonal: the shear is ignored")
     stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
@@ -183,20 +173,7 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
         notes.append(f"voxel sizes {by_axis(stored)} are those of the affine; the header's own are {by_axis(header)}")
     if open_frame and np.linalg.det(affine[:3, :3]) > 0:
         notes.append(OPEN_FRAME)
-    notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
-    return TensorVolume(
-        to_voxel_axes(tensors, frame, affine),
-        tuple(spacing.tolist()),
-        (0.0, 0.0, 0.0),
-        affine=affine,
-        order=order,
-        frame=frame,
-        notes=tuple(notes),
-        source=name,
-        invalid_by_order=invalid_by_order(components, order),
-        length_unit="mm",
-        unit=record.get("unit", ""),
-    )
+    return replace(volume, notes=(*notes, *volume.notes))
 
 
 def placement_notes(image: Any) -> list[str]:
@@ -209,8 +186,7 @@ def placement_notes(image: Any) -> list[str]:
         ]
     if not (sform and qform):
         return []
-    ends = np.stack(np.meshgrid(*((0, n - 1) for n in image.shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
-    apart = float(np.linalg.norm(ends @ (by_sform - by_qform).T, axis=1).max())
+    apart = float(np.linalg.norm(corners(image.shape) @ (by_sform - by_qform).T, axis=1).max())
     if apart <= 0.1 * np.linalg.norm(by_sform[:3, :3], axis=0).min():
         return []
     mirrored = np.linalg.det(by_sform[:3, :3]) * np.linalg.det(by_qform[:3, :3]) < 0

@@ -10,39 +10,21 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.nrrd_checks import check_data, check_header
+from hks_jax.io.nrrd_checks import PATIENT, check_data, check_header, space_of
 from hks_jax.io.repair import require_symmetric
-from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
-TO_RAS = {
-    "right-anterior-superior": (1.0, 1.0, 1.0),
-    "ras": (1.0, 1.0, 1.0),
-    "left-anterior-superior": (-1.0, 1.0, 1.0),
-    "las": (-1.0, 1.0, 1.0),
-    "left-posterior-superior": (-1.0, -1.0, 1.0),
-    "lps": (-1.0, -1.0, 1.0),
-}
-"""The signs that take a patient-based space to the scanner axes right, anterior, superior, as NIfTI has them."""
-
-
-class Kind(NamedTuple):
-    """What an axis of tensor components holds: d×d tensors, behind a confidence or not, symmetric or whole."""
-
-    d: int
-    masked: bool
-    symmetric: bool
-
-
 KINDS = {
-    f"{d}D-{'masked-' if masked else ''}{'symmetric-' if symmetric else ''}matrix": Kind(d, masked, symmetric)
+    f"{d}D-{masked}{symmetric}matrix": (d * (d + 1) // 2 if symmetric else d * d) + bool(masked)
     for d in (2, 3)
-    for masked in (False, True)
-    for symmetric in (False, True)
+    for masked in ("", "masked-")
+    for symmetric in ("", "symmetric-")
 }
+"""The kinds of axes of tensor components, and how many numbers each has, its confidence among them."""
 
 
 class Placement(NamedTuple):
@@ -104,53 +86,37 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
     components = np.moveaxis(data, axis, -1)
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
     notes, mask = [], None
-    if label is None:
-        if order is None:
-            raise ValueError(
-                f"{name}: {components.shape[-1]} components along axis {axis}, but the file does not declare their "
-                f"order (its kind is no kind of tensor), and programs differ. Pass order (--order), one of {choices()}"
-            )
-        tensors, used = unpack(components, order), order
-    else:
-        kind, used = KINDS[label], order or "nrrd"
-        if kind.masked:
-            mask, components = components[..., 0] > confidence, components[..., 1:]
-            notes.append(f"inside where the file's confidence exceeds {confidence:g}: {int(mask.sum())} voxels")
-        if not kind.symmetric:
-            if order is not None:
-                raise ValueError(f"order: {name} holds whole matrices ({label}); leave this out")
-            tensors, used = components.reshape(*components.shape[:-1], kind.d, kind.d), "matrix"
-        elif order is None:
-            tensors = unpack(components, "fsl")  # xx xy xz yy yz zz: the components alone, not FSL's frame
-        else:
-            notes.append(f'read in order "{order}" as asked, though the file declares {label}')
-            tensors = unpack(components, order)
-    d = tensors.shape[-1]
+    if label is not None and "masked" in label:
+        mask, components = components[..., 0] > confidence, components[..., 1:]
+        notes.append(f"inside where the file's confidence exceeds {confidence:g}: {int(mask.sum())} voxels")
+    found = matrices(name, components, order, "" if label is None else "nrrd")
+    if label is not None and order is not None:
+        notes.append(f'read in order "{order}" as asked, though the file declares {label}')
+    d = found.tensors.shape[-1]
     if len(domain) != d:
         raise ValueError(f"{name}: {d}×{d} tensors on {len(domain)} axes of voxels; expected {d} axes")
     place = _placement(name, header, domain)
     spacing = np.linalg.norm(place.directions, axis=0)
     affine = place.affine
-    tensors, frame = _to_voxel_axes(name, tensors, frame, place, header.get("measurement frame"), notes)
+    tensors, frame = _to_voxel_axes(name, found.tensors, frame, place, header.get("measurement frame"), notes)
     if affine is not None and place.signs is None:
         notes.append(f"space {header.get('space', 'unnamed')!r}: the affine's axes are those of the file")
     elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
         notes.append("the grid's axes are those of the voxels; their directions in the plane are not kept")
     if place.unit not in ("", "mm"):
         notes.append(f"lengths in {place.unit}, as the file declares, are in mm here")
-    what = "whole matrices" if used == "matrix" else f'components in order "{used}"'
-    notes.append(f"{what} ({label or 'as asked'}), given along the {frame} axes, taken to the voxel axes")
+    notes.append(found.note(frame, f" ({label or 'as asked'})"))
     return TensorVolume(
         np.ascontiguousarray(tensors),
         tuple(spacing.tolist()),
         tuple((place.origin if affine is None else np.zeros(d)).tolist()),
         mask,
         affine,
-        order=used,
+        order=found.order,
         frame=frame,
         notes=tuple(notes),
         source=name,
-        invalid_by_order=invalid_by_order(components, order) if order is not None else None,
+        invalid_by_order=found.invalid,
         length_unit="mm" if place.unit or place.signs is not None else "",  # patients are measured in mm
         unit=own_record(header.get("provenance", "")).get("unit", ""),
     )
@@ -222,10 +188,8 @@ def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -
     matrix_axes = [(axis, kind) for axis, kind in enumerate(kinds) if kind in KINDS]
     if len(matrix_axes) == 1:
         axis, kind = matrix_axes[0]
-        n = KINDS[kind].d
-        expected = (n * (n + 1) // 2 if KINDS[kind].symmetric else n * n) + KINDS[kind].masked
-        if shape[axis] != expected:
-            raise ValueError(f"{name}: axis {axis} is a {kind} of {shape[axis]} components; expected {expected}")
+        if shape[axis] != KINDS[kind]:
+            raise ValueError(f"{name}: axis {axis} is a {kind} of {shape[axis]} components; expected {KINDS[kind]}")
         return axis, kind
     count = {4: 6, 3: 3}.get(len(shape))
     rows = _rows(header, len(shape))
@@ -261,8 +225,8 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
             "finite numbers, none of them zero"
         )
     origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
-    signs = TO_RAS.get(str(header.get("space", "")).lower().removesuffix("-time").removesuffix("t"))
-    to_ras = None if signs is None or d != 3 else np.array(signs)
+    signs = PATIENT.get(space_of(header)) if d == 3 else None
+    to_ras = None if signs is None else np.array(signs)
     return Placement(scales[:, None] * directions, origin, to_ras, True, unit)
 
 
@@ -294,13 +258,11 @@ def _to_voxel_axes(
     notes: list[str],
 ) -> tuple[Float[np.ndarray, "*shape d d"], str]:
     """Return the tensors along the voxel axes, and the frame that they were in."""
-    d = tensors.shape[-1]
-    affine = np.eye(d + 1)
-    affine[:d, :d] = place.directions
+    d, directions = tensors.shape[-1], place.directions
     if measurement is None or not np.isfinite(np.asarray(measurement, np.float64)).all():
         if frame == "measurement":
             raise ValueError(f'frame: {name} has no measurement frame; expected "voxel" or "world"')
-        rotation = nearest_rotation(place.directions)
+        rotation = nearest_rotation(directions)
         # With all axes along or all against those of space, both readings give the same tensors.
         same = np.allclose(rotation, np.eye(d), atol=1e-6) or np.allclose(rotation, -np.eye(d), atol=1e-6)
         if frame is None and not same:
@@ -316,12 +278,12 @@ def _to_voxel_axes(
         if np.abs(columns.T @ columns - np.eye(d)).max() > 1e-3:
             notes.append("the measurement frame is not orthonormal: it scales the tensors, as NRRD defines")
         columns = columns.astype(tensors.dtype)
-        return to_voxel_axes(columns @ tensors @ columns.T, "world", affine), "measurement"
+        return to_voxel_axes(columns @ tensors @ columns.T, "world", directions), "measurement"
     else:
         notes.append(f"the file's measurement frame is set aside for the {frame} axes, as asked")
     if frame == "fsl" and place.signs is not None:  # FSL's rule is about the axes right, anterior, superior
-        affine[:d, :d] = place.signs[:, None] * place.directions
-    return to_voxel_axes(tensors, frame, affine), frame
+        directions = place.signs[:, None] * directions
+    return to_voxel_axes(tensors, frame, directions), frame
 
 
 _NAMES = (".nrrd", ".nhdr")

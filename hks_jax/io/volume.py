@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from hks_jax import __version__
 from hks_jax.checks import require_real
 from hks_jax.describe import describe_array
 from hks_jax.domain.grid import Grid
-from hks_jax.io.tensor_order import InvalidByOrder
+from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
 
 AXES = "xyz"
 
@@ -198,6 +198,43 @@ class TensorVolume:
     def thin_axis(self) -> int:
         """For a slice, the axis along which it is one voxel thick as a volume: z unless it was cut otherwise."""
         return 2 if self.slice_axis is None else self.slice_axis
+
+
+def placed(
+    name: str,
+    found: Matrices,
+    frame: str,
+    affine: Float[np.ndarray, "4 4"],
+    mask: Bool[np.ndarray, "*shape"] | None = None,
+    of: str = "",
+    **known: Any,
+) -> TensorVolume:
+    """Return the tensors of a file whose voxels an affine places, taken from the axes of `frame` to the voxels'.
+
+    Raises:
+        ValueError: an unknown frame; an affine that is singular or not finite.
+    """
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if not (np.isfinite(affine).all() and spacing.min() > 0):
+        raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
+    return TensorVolume(
+        np.ascontiguousarray(to_voxel_axes(found.tensors, frame, affine)),
+        tuple(spacing.tolist()),
+        (0.0, 0.0, 0.0),
+        mask,
+        affine,
+        order=found.order,
+        frame=frame,
+        notes=(found.note(frame, of),),
+        source=name,
+        invalid_by_order=found.invalid,
+        **{"length_unit": "mm", **known},
+    )
+
+
+def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
+    """Return the indices of the voxels at the corners of a volume, with a 1 behind each, which affines map."""
+    return np.stack(np.meshgrid(*((0, n - 1) for n in shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
 
 
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:

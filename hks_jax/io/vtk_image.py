@@ -15,8 +15,8 @@ from urllib.parse import quote
 import numpy as np
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, to_voxel_axes, unpack
-from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
+from hks_jax.io.tensor_order import matrices, nearest_rotation
+from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors, placed
 from hks_jax.npz import load_npz
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
@@ -73,18 +73,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     with reading(file, kind):
         (_check_range if xml else _check_length)(content, chosen, components)
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
-    if components.shape[-1] == 9:
-        if order is not None:
-            raise ValueError(f"order: {name} holds whole matrices; leave this out")
-        tensors, order = components.reshape(-1, 3, 3), "matrix"
-    elif order is None and not declared:
-        raise ValueError(
-            f"{name}: six components in {chosen!r}, which the file does not declare as tensors, and programs "
-            f"differ in their order. Pass order (--order), one of {choices()}"
-        )
-    else:
-        order = order or "vtk"
-        tensors = unpack(components, order)
+    found = matrices(name, components, order, "vtk" if declared else "")
     lower, upper = image["extent"].reshape(3, 2).T
     thick = upper > lower
     of_cells = thick & (place == "cell")  # a cell's value is at its centre
@@ -92,27 +81,13 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # 0 is what has no thickness
     affine = np.eye(4)
     affine[:3, :3] = image["direction"] * steps
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if not (np.isfinite(affine).all() and spacing.min() > 0):
-        raise ValueError(f"{name}: got spacing {image['spacing']}; expected finite numbers, none of them zero")
     affine[:3, 3] = image["origin"] + affine[:3, :3] @ (lower + np.where(of_cells, 0.5, 0.0))
-    frame = frame or "world"
-    what = "whole matrices" if order == "matrix" else f'components in order "{order}"'
-    note = f"{what} from {chosen!r} at the {place}s, given along the {frame} axes, taken to the voxel axes"
-    straight = np.array_equal(affine[:3, :3], np.diag(spacing))
     mask = image.get(f"{place}:mask")
-    volume = TensorVolume(
-        np.ascontiguousarray(to_voxel_axes(_on_grid(tensors, shape), frame, affine)),
-        tuple(spacing.tolist()),
-        tuple(affine[:3, 3].tolist()) if straight else (0.0,) * 3,
-        None if mask is None else as_mask(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape))),
-        None if straight else affine,
-        order=order,
-        frame=frame,
-        notes=(note,),
-        source=name,
-        invalid_by_order=None if order == "matrix" else invalid_by_order(components, order),
-    )
+    inside = None if mask is None else as_mask(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape)))
+    found, of = found._replace(tensors=_on_grid(found.tensors, shape)), f" from {chosen!r} at the {place}s"
+    volume = placed(name, found, frame or "world", affine, inside, of, length_unit="")
+    if np.array_equal(affine[:3, :3], np.diag(volume.spacing)):
+        volume = replace(volume, affine=None, origin=tuple(affine[:3, 3].tolist()))
     return _as_plane(volume)
 
 
