@@ -15,7 +15,6 @@ import json
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
-from hks_jax.io.result import Result, recorded_boundary
+from hks_jax.io.result import Result, plain, recorded_boundary
 from hks_jax.io.volume import digest
 
 OPTIONS = f"""
@@ -108,7 +107,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if not fit.converged:
         progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; what was best is written")
     names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", *_PASSED_ON)
-    settings = {name: getattr(args, name) for name in names if name != "k"}
     report = {
         "target": {
             "source": str(args.target),
@@ -122,7 +120,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
         "parametrisation": args.parametrisation,
-        "settings": {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()},
+        "settings": plain({name: getattr(args, name) for name in names if name != "k"}),
     }
     return _write(args, fit, target, report, progress)
 

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from hks_jax import SurfaceMesh, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
@@ -44,7 +44,7 @@ from hks_jax.io import TensorVolume, read_mask, read_mesh, read_mesh_arrays, sam
 from hks_jax.io.mesh import WRITTEN, is_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.result import Result
-from hks_jax.io.tensor_order import unpack
+from hks_jax.io.tensor_order import matrices
 from hks_jax.optional import optional
 
 OPTIONS = f"""
@@ -167,7 +167,15 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | 
         tensors = np.zeros((len(vertices), 3, 3), args.dtype)
         tensors[at] = sample_tensors(volume, np.asarray(mesh.vertices)[at])
     elif args.array:
-        tensors = _tensors(args).astype(args.dtype)
+        arrays = read_mesh_arrays(args.file, clean=args.clean)
+        if args.array not in arrays:
+            there = ", ".join(arrays) or "none"
+            raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {there}")
+        values = arrays[args.array].reshape(len(vertices), -1)
+        if values.shape[1] != (9 if args.order is None else 6):
+            n = values.shape[1]
+            raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
+        tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
     else:
         return kind(vertices, cells, mask=inside)
     settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
@@ -181,19 +189,6 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
     if numbers.size == 0 or numbers.max() >= n_vertices:
         raise ValueError(f"--inside: {path} names {numbers.size} vertices, and the mesh has {n_vertices}")
     return np.isin(np.arange(n_vertices), numbers)
-
-
-def _tensors(args: argparse.Namespace) -> Float[np.ndarray, "V 3 3"]:
-    arrays = read_mesh_arrays(args.file, clean=args.clean)
-    if args.array not in arrays:
-        raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {', '.join(arrays) or 'none'}")
-    values = arrays[args.array].reshape(len(arrays[args.array]), -1)
-    if values.shape[1] == 6 and args.order is not None:
-        return unpack(values, args.order)
-    if values.shape[1] != 9 or args.order is not None:
-        n = values.shape[1]
-        raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
-    return values.reshape(-1, 3, 3)
 
 
 def _draw_mesh(result: Result, path: Path) -> None:

@@ -167,14 +167,12 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
 
 
 def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, Any]:
-    """Return what a report says of the tensors."""
+    """Return what a report says of the tensors; the mask is the domain."""
+    about = {name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit")}
     return {
         "source": volume.source,
         "sha256": volume.digest,
-        "shape": volume.shape,
-        "spacing": volume.spacing,
-        "length_unit": volume.length_unit,
-        "unit": volume.unit,
+        **about,
         "median_mean_diffusivity": median_mean_diffusivity(volume),
         "order": volume.order,
         "frame": volume.frame,

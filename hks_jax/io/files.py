@@ -38,25 +38,20 @@ def read_tensors(
 ) -> TensorVolume:
     """Read a field of diffusion tensors.
 
-    A file that leaves the order of components or their axes open is refused with the choices named.
+    The file's name tells the format. A file that leaves the order of components or their axes open is refused with the
+    choices named. Lengths are in mm where the file declares their unit; a note says what was converted.
 
-    NIfTI (``.nii``, ``.nii.gz``): a symmetric-matrix image, (nx, ny, nz, 1, 6) with intent code 1005, whose components
-    are xx xy yy xz yz zz; or any (nx, ny, nz, 6) or (nx, ny, nz, 1, 6) image whose `order` is given, because
-    programs differ. The distance between voxels is that of the affine. Lengths are in mm: those of files that declare
-    another unit, as NIfTI and NRRD can, are converted, and a note says so. A BIDS sidecar beside the image is heeded
-    where it has ``OrientationEncoding``: `frame` by its Reference, and the order of its Type "tensor".
+    NIfTI: (nx, ny, nz, 1, 6) or (nx, ny, nz, 6), whose order the symmetric-matrix intent (code 1005) declares, or a
+    BIDS sidecar, which may declare the frame, too; or six images of one component each, of which one may be given.
 
-    Six NIfTI images, one for each component, as BIDS's ``param-txx`` … ``param-tzz``, DSI Studio and ANTs have them:
-    all six, or one, whose siblings are found by its name.
+    MRtrix: (nx, ny, nz, 6) as its dwi2tensor writes them.
 
-    MRtrix (``.mif``, ``.mif.gz``): the six components of its dwi2tensor, along the scanner's axes.
+    NRRD: an axis of any of the format's kinds of matrix, 2D or 3D, at any place; or one of six (in the plane three)
+    components whose `order` is given. The measurement frame is heeded. The affine's axes are right, anterior, superior
+    where the file's space is patient-based.
 
-    NRRD (``.nrrd``, ``.nhdr``): an axis of any of the format's kinds of matrix, 2D or 3D, symmetric or whole, masked or
-    not, at any place; or an axis of six (in the plane three) components whose `order` is given. The measurement frame
-    is heeded. The affine's axes are right, anterior, superior where the file's space is patient-based.
-
-    VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at the points or cells, along the
-    axes of space; and a mask of this name. Tensors without components across an image one voxel thick are 2×2.
+    VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at the points or cells, and an
+    array ``mask``. Tensors without components across an image one voxel thick are 2×2.
 
     npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), array axis a being coordinate a and tensor index a,
     or six (in the plane three) components whose order is given; and, optional, ``spacing`` (d,) = 1, ``origin`` (d,)
@@ -125,27 +120,25 @@ def save(
     extra: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write scalars on the grid of a volume or slice, or at the vertices of a mesh: the format follows the suffix.
+    """Write scalars on the grid of a volume or slice, or at the vertices of a mesh, in the format of the suffix.
 
     ``.nii``, ``.nii.gz``: an image with the volume's affine, times along its fourth axis. A slice becomes an image one
-    voxel thick at its place in space. NaN outside the mask is kept. The header has no room for times: those in `extra`
-    are written beside the image, as BIDS does it, NAME.json with ``Times`` in the order of the fourth axis.
+    voxel thick at its place in space. NaN outside the mask is kept. Times in `extra` are written beside the image, as
+    BIDS does it, NAME.json with ``Times``.
 
     ``.nrrd``: the same, times along the last axis; `extra` as text in the header.
 
     ``.vti``: one array of points per time, which is in its name, ``mask``, and `extra` as field data.
 
     ``.npz``: the arrays `name` (the values), ``spacing``, ``origin``, ``mask`` and ``affine`` (where there are any),
-    ``slice_axis`` (for a slice), and those in `extra`.
+    ``slice_axis`` (for a slice), and those in `extra`; of a mesh `name`, ``vertices``, ``faces`` (of tetrahedra
+    ``cells``), and those in `extra`.
 
-    A mesh's ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and of triangles ``.ply``: the mesh, and one array per time, which is
-    in its name. Its ``.npz``: `name`, ``vertices``, ``faces`` (of tetrahedra ``cells``), and those in `extra`.
+    ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and of triangles ``.ply``: the mesh, and one array per time.
 
-    Every file says where it came from, in JSON: the version, the tensors' file with its SHA-256, order and frame, what
-    was decided in reading it, and `provenance`. It is the comment extension of NIfTI; ``provenance`` in the others; for
-    meshes, which have no place for it, a file beside it, the path with ``.json`` after it.
-
-    The file is written beside its place and moved there in one step: it is never half there.
+    Every file says in JSON where it came from: the version, the tensors' file with its SHA-256, order and frame, what
+    was decided in reading it, and `provenance`; of a mesh, but for npz, a file beside it, the path with ``.json`` after
+    it. Files appear whole or not at all.
 
     Args:
         path: the file; missing folders are made.

@@ -38,13 +38,12 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
     """Read a mesh: tetrahedra, where the file has any, or else triangles.
 
     ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply``, ``.stl`` through meshio; ``.obj`` and ``.off``; polygonal data in
-    ``.vtk`` and ``.vtp``, which meshio does not read, through VTK; GIFTI (``.gii``) and FreeSurfer's surfaces
-    (``lh.white``, … by their first bytes) through nibabel, their coordinates as they are in the file.
+    ``.vtk`` and ``.vtp`` through VTK; GIFTI (``.gii``) and FreeSurfer's surfaces (``lh.white``, … by their first bytes)
+    through nibabel.
 
     Quadrilaterals (of polygonal data, OBJ and OFF all polygons) are cut into triangles; vertices keep their order. STL
-    has no vertices, only corners: those at the same place become one vertex. Beside tetrahedra, the triangles, lines
-    and points of their boundary are passed over. A warning says where vertices lie at the same place, as at the seams
-    of a texture: the surface is torn there.
+    has only corners: those at the same place become one vertex. Cells of lower dimension beside tetrahedra are passed
+    over. A warning says where vertices lie at the same place, as at the seams of a texture: the surface is torn there.
 
     Args:
         path: the file.
@@ -54,15 +53,14 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
             vertices are in the other order. The vertices are numbered anew, in the order of the file. A warning says
             what was done.
         in_space: take the coordinates of the scanner, in which images lie: FreeSurfer's are turned and moved by the
-            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Others are taken to
-            have them.
+            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Others, and all
+            without it, stay as they are.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: with ``in_space`` a surface of FreeSurfer's that does not say where its volume lies; an unknown
-            kind of file, an unreadable one, cells that are neither triangles, quadrilaterals nor
-            tetrahedra, a mesh in pieces that touch at vertices at the same place, or one that `SurfaceMesh` or
-            `TetMesh` refuses.
+        ValueError: an unknown kind of file, an unreadable one, other cells, a mesh in pieces that touch at vertices at
+            the same place, or one that `SurfaceMesh` or `TetMesh` refuses; with `in_space` a surface of FreeSurfer's
+            that does not say where its volume lies.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
     loaded, said = _load(path, clean, in_space)

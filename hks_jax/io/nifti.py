@@ -90,20 +90,15 @@ def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -
     return voxels(path, image), own if unit or beside is None else scaled_beside(own, beside)
 
 
-def sidecar_of(path: str | os.PathLike[str]) -> Path | None:
-    """Return the BIDS sidecar beside an image, if it is there."""
-    sidecar = _sidecar(path)
-    return sidecar if sidecar.is_file() else None
-
-
-def _sidecar(path: str | os.PathLike[str]) -> Path:
+def sidecar_of(path: str | os.PathLike[str]) -> Path:
+    """Return the path of the BIDS sidecar beside an image, which need not be there."""
     return Path(os.fspath(path).removesuffix(".gz")).with_suffix(".json")
 
 
 def _encoding(path: str) -> dict[str, Any]:
     """Return the field OrientationEncoding of the sidecar beside an image; empty if there is none."""
     sidecar = sidecar_of(path)
-    if sidecar is None:
+    if not sidecar.is_file():
         return {}
     with reading(sidecar, "a BIDS sidecar in JSON"):
         content = json.loads(sidecar.read_text(encoding="utf-8"))
@@ -205,7 +200,7 @@ def write(
         raise ValueError(f"extra: got {', '.join(others)}; NIfTI has no place for more arrays. Write an .npz too")
     if "times" in extra:
         sources = [Path(volume.source).name] if volume.source else []
-        write_json(_sidecar(path), {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources})
+        write_json(sidecar_of(path), {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources})
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)

@@ -176,7 +176,7 @@ def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold: no NaN or infinity, no tuples or NumPy scalars."""
+    """Return what JSON can hold: no NaN or infinity, no tuples, paths or NumPy scalars."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -185,4 +185,4 @@ def plain(value: Any) -> Any:
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    return str(value) if isinstance(value, Path) else value

@@ -230,7 +230,8 @@ def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
     images = [args.file, *args.others]
     if not args.others and args.bval is None and is_nifti(args.file) and is_one_of_six(args.file):
         images = siblings(args.file)
-    sidecars = [sidecar_of(path) for path in images[:1] if args.bval is None and is_nifti(path)]
+    sidecar = sidecar_of(images[0]) if args.bval is None and is_nifti(images[0]) else None
+    sidecars = [] if sidecar is None or not sidecar.is_file() else [sidecar]
     given = {"file": images, "sidecar": sidecars, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
     inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
     second = second_scan(args)
