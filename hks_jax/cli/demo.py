@@ -35,7 +35,7 @@ B_MAX = 1000.0
 RIM = 2
 """Voxels taken off the mask: at the rim, tissue mixes with what surrounds it and fits fail."""
 SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
-"""How far the heat has spread, √(Dt), at the times drawn: in voxels, from what they resolve to the brain's size."""
+"""How far the heat has spread, √(Dt), at the times drawn: in voxels, from their resolution to the brain's size."""
 N_PAIRS = 600
 """Of the two problems whose mean it is: enough for the first of these times."""
 PHANTOM_SHAPE = (72, 80)

@@ -96,7 +96,7 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
         _check_voxel(args.through, volume)
     if not saved:
         solved = compute_pairs(volume, settings, progress)
-    if args.save_pairs:  # at once: what comes after may fail, or be interrupted
+    if args.save_pairs:  # at once: later steps may fail, or be interrupted
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
@@ -136,7 +136,7 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that are for grids alone, and for tensors of which the metric is open."""
+    """Raise ValueError for options that are for grids alone, and for tensors whose metric is open."""
     refuse(args, ("noise",), _NO_NOISE)
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; tensors come from a volume, or from the mesh's own vertices")
@@ -150,7 +150,7 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
         why = "a mesh has the metric of space unless --array names tensors at its vertices, or --tensors a volume"
         refuse(args, _OF_TENSORS, f"{why} of them; pass both, or neither")
     elif args.metric is None:
-        raise ValueError("--metric: choose what the tensors at the vertices stand for: inverse, tensor or adjugate")
+        raise ValueError("--metric: choose the metric of the tensors at the vertices: inverse, tensor or adjugate")
 
 
 def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:

@@ -1,4 +1,4 @@
-"""The main job: from a tensor volume or a mesh to its heat kernel signature, and what is known about it."""
+"""The main job: from a tensor volume or a mesh to its heat kernel signature, and the facts that reports have."""
 
 import argparse
 from dataclasses import asdict, dataclass, fields, replace
@@ -48,7 +48,7 @@ class Settings:
 
     @classmethod
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
-        """Return what the arguments ask for, or what is usual, but for the settings that are given."""
+        """Return the arguments' settings, or the defaults, with those that are given in their place."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
         given = {"metric": chosen["metric"] or "tensor", "times": DEFAULT_TIMES, **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
@@ -69,7 +69,7 @@ class Solved(NamedTuple):
 
     @property
     def described(self) -> dict[str, Any]:
-        """What a report says of the tensors."""
+        """A report's entries about the tensors."""
         return describe_input(self.volume, self.field.grid.mask)
 
 
@@ -136,7 +136,7 @@ def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Pro
 
 
 def _signature(pairs: hj.Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the signature and, where methods were chosen from, what the report says of the choice."""
+    """Return the signature and, where a method was chosen, the report's entry about the choice."""
     if settings.method != "auto":
         return np.asarray(hj.hks(pairs, times, settings.normalisation, settings.method)), {}
     result = hj.hks_auto(pairs, times, settings.normalisation)
@@ -167,7 +167,7 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
 
 
 def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, Any]:
-    """Return what a report says of the tensors; the mask is the domain."""
+    """Return a report's entries about the tensors; the mask is the domain."""
     about = {name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit")}
     return {
         "source": volume.source,
@@ -183,7 +183,7 @@ def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, A
 
 
 def describe_pairs(pairs: hj.Eigenpairs) -> dict[str, Any]:
-    """Return what a report says of eigenpairs."""
+    """Return a report's entries about eigenpairs."""
     values = np.asarray(pairs.eigenvalues)
     return {
         "k": pairs.k,

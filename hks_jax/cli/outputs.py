@@ -1,4 +1,4 @@
-"""What a job leaves in its folder: all of it or nothing; and what it prints."""
+"""The files of a job, which appear all or not at all, and the printed summary."""
 
 import argparse
 import importlib.metadata
@@ -17,6 +17,7 @@ import numpy as np
 from hks_jax.atomic import atomic_folder
 from hks_jax.cli.progress import Progress
 from hks_jax.io.result import Result, plain, signature_file
+from hks_jax.io.tables import write_json
 
 REPORT = "report.json"
 PAIRS = "pairs.npz"
@@ -33,7 +34,7 @@ class Done(NamedTuple):
 
 
 def show(args: argparse.Namespace, done: Done) -> None:
-    """Print what was done, as the arguments ask."""
+    """Print the result of a command, as the arguments ask."""
     names = list(map(str, done.files))
     if args.json:
         print(json.dumps(plain({**done.summary, "files": names}), ensure_ascii=False))
@@ -45,7 +46,7 @@ def show(args: argparse.Namespace, done: Done) -> None:
 def writing(
     folder: Path, report: Mapping[str, Any], progress: Progress, stale: Callable[[], Iterable[Path]] = tuple
 ) -> Iterator[tuple[Path, Done]]:
-    """Yield a temporary folder, and what is filled at the end with the report and the paths of the results.
+    """Yield a temporary folder, and a `Done` that has the report and the paths of the results at the end.
 
     At the end report.json is written beside the other files, and all of them move to `folder`, or none of them does;
     then the files of earlier results that `stale` returns are gone.
@@ -56,8 +57,7 @@ def writing(
         seconds = {stage: round(spent, 3) for stage, spent in progress.timings.items()}
         known = {"warnings": progress.warnings, "versions": versions(), "seconds": seconds}
         done.summary.update(plain({"command": sys.argv, **report, **known}))
-        text = json.dumps(done.summary, indent=2, ensure_ascii=False)
-        (temporary / REPORT).write_text(text + "\n", encoding="utf-8")
+        write_json(temporary / REPORT, done.summary)
         done.files.extend(sorted(folder / file.name for file in temporary.iterdir()))
 
 
@@ -76,7 +76,7 @@ def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> lis
     Eigenpairs stay where they are those of the new signature, whose eigenvalues are given.
     """
     found, own = [], []
-    if signature_file(folder).is_file():  # else what has these names is not ours
+    if signature_file(folder).is_file():  # else files of these names are not ours
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
         own = [*folder.glob("hks.*"), folder / REPORT]
         found = [*own, *(folder / name for name in ("explore.html", *regions) if (folder / name).is_file())]
@@ -91,7 +91,7 @@ def _are_pairs(path: Path, eigenvalues: np.ndarray) -> bool:
     """Tell whether a file holds eigenpairs with just these eigenvalues, or is none of ours."""
     if not zipfile.is_zipfile(path):
         return True
-    with np.load(path) as arrays:  # of which only the one is read
+    with np.load(path) as arrays:  # reads this one array only
         return "eigenvalues" not in arrays or np.array_equal(arrays["eigenvalues"], eigenvalues)
 
 

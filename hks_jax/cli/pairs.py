@@ -39,12 +39,12 @@ def check_options(args: argparse.Namespace) -> None:
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one of eigenpairs")
     settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
-    why = f"{args.file} holds eigenpairs, of which all but the signature is settled; leave it out"
+    why = f"{args.file} holds eigenpairs: all but the signature is settled; leave it out"
     refuse(args, (*settled, "save_pairs"), why)
 
 
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
-    """Write eigenpairs with the volume, whose mask is the domain, and with what was settled in computing them.
+    """Write eigenpairs with the volume, whose mask is the domain, and with the settings of their computation.
 
     The suffix of images and the warnings are read back, too. The fingerprint identifies the files and settings of a
     study's subject.
@@ -60,7 +60,7 @@ def are_of(path: Path, fingerprint: str) -> bool:
     """Tell whether a file holds the eigenpairs of a study's subject, computed from the same files and settings."""
     if not is_saved_pairs(path):
         return False
-    with np.load(path) as arrays:  # of which only the one is read
+    with np.load(path) as arrays:  # reads this one array only
         return bool(json.loads(str(arrays[_RECORD]))["fingerprint"] == fingerprint)
 
 

@@ -16,7 +16,7 @@ from hks_jax.io.repair import REPAIRS
 
 
 def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return a reader of texts whose error says what was expected where `read` returns None."""
+    """Return a reader of texts that raises an error, naming the expected form, where `read` returns None."""
 
     def parse(text: str) -> Any:
         if (value := read(text)) is None:

@@ -1,4 +1,4 @@
-"""Results: what is computed and saved, to be read back and drawn, explored, tabulated or fitted."""
+"""Results: signatures and other scalar fields, which are saved, read back, drawn, explored, tabulated or fitted."""
 
 import json
 import math
@@ -31,7 +31,7 @@ class Result:
         values: (n_times, *shape).
         times: (n_times,), or (0,) for a result without.
         eigenvalues: (k,), or (0,) where they are not known.
-        report: what is known about it; ``settings`` are those of the computation.
+        report: facts about the computation; ``settings`` are those of the computation.
         arrays: more arrays by name, which are saved with it: ``deviation``, ``bias`` and ``noise_maps`` (n_draws,
             n_times, *shape) of error bars; ``scaled_times`` λ₁t; ``input_tensors``, where they are known.
         name: ``"hks"`` or ``"curvature"``.
@@ -109,7 +109,7 @@ class Result:
         Args:
             stem: the files' path without a suffix.
             image: the suffix; see `hks_jax.io.save`.
-            origin: what the files say of its origin beside the settings and the times.
+            origin: more entries of the files' provenance, beside the settings and the times.
         """
         single = isinstance(self.place, TensorVolume) and self.place.tensors.dtype == np.float32
         values = self.values.astype(np.float32) if single else self.values

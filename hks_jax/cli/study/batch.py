@@ -20,8 +20,8 @@ a picture, and with --atlas a table of regions; for all of them group_summary.ts
 Tensors whose mean diffusivity no living tissue has in mm2/s are refused unless --unit, or the column unit, says in
 which unit they are: subjects in different units cannot be compared.
 
-A subject that fails does not stop the others. The same command, given again, computes only what is not there yet, or
-was of other files.
+A subject that fails does not stop the others. The same command, given again, computes only the signatures and
+tables that are not there yet, or were made of other files.
 
 examples:
   hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
@@ -147,7 +147,7 @@ def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progr
     study = Study(args.output, Settings.of(args, times=times), args.time_unit, reading_options(args), args.save_pairs)
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = study.record, dict(before)
-    if times.automatic:  # they remain what they were
+    if times.automatic:  # they remain those of before
         now["times"], then["times"] = chosen, before.get("chosen")
     for part in ("settings", "reading"):
         now |= now.pop(part)
@@ -173,7 +173,7 @@ def _suitable(
     if args.metric == "adjugate":
         raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
     ranges: dict[str, Range] = {}
-    silent = StudyProgress(1, True, io.StringIO())  # what is to be warned of is, when the subject's turn comes
+    silent = StudyProgress(1, True, io.StringIO())  # warnings come when the subject's turn does
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
         with suppress(Exception):  # said when its turn comes

@@ -1,4 +1,4 @@
-"""The folder of a study, a BIDS derivative: names, sidecars, what is done already, and the tables of the group."""
+"""The folder of a study, a BIDS derivative: names, sidecars, finished subjects, and the tables of the group."""
 
 import argparse
 import hashlib
@@ -129,7 +129,7 @@ class Study:
     def forget(self, subject: Subject) -> None:
         """Remove what an earlier run with other settings, or an interrupted one, has left of a subject."""
         sidecar, picture = self.path(subject, f"{MAP}.json"), self.path(subject, f"{MAP}.png", "figures")
-        sidecar.unlink(missing_ok=True)  # first: what it stands for is complete as long as it is there
+        sidecar.unlink(missing_ok=True)  # first: it says that the other files are complete
         ours = [file for kind in _SUFFIXES for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
         for path in [*ours, picture, sidecar.with_name("explore.html")]:
             path.unlink(missing_ok=True)
@@ -156,7 +156,7 @@ class Study:
             )
 
     def write_description(self, subjects: list[Subject], chosen: str) -> None:
-        """Write what the study is: the files of a BIDS derivative, and the times."""
+        """Write the description of the study: the files of a BIDS derivative, and the times."""
         description = {
             "Name": "Heat kernel signatures of diffusion tensor fields",
             "BIDSVersion": "1.10.0",
@@ -205,7 +205,7 @@ def reading_options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def times_text(unit: str) -> str:
-    """Say what the times of a study are."""
+    """Describe the times of a study."""
     if unit == "lambda1":
         return "times of each subject are the given numbers over its own first positive eigenvalue λ₁"
     return "the same times for all subjects, in (metric length)²: s for the metric D⁻¹ of mm²/s on mm"
