@@ -75,9 +75,7 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
     )
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars and the place that they have; see `hks_jax.io.save`."""
     slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
     write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})

@@ -23,7 +23,7 @@ def component_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def siblings(path: str | os.PathLike[str]) -> list[str]:
-    """Return the six files of which one is given: their names differ in the component alone."""
+    """Return the six files of one tensor image, given one of them: their names differ in the component alone."""
     folder, name = os.path.split(os.fspath(path))
     matches = list(_NAME.finditer(name))
     if not matches:
@@ -34,8 +34,8 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
     missing = [os.path.basename(each) for each in names if not os.path.isfile(each)]
     if missing:
         raise FileNotFoundError(
-            f"{os.fspath(path)}: by its name it holds the component {component_of(path)} of tensors, of which six are "
-            f"needed; not beside it: {', '.join(missing)}"
+            f"{os.fspath(path)}: by its name it holds the component {component_of(path)} of tensors. Six are needed; "
+            f"not beside it: {', '.join(missing)}"
         )
     return names
 
@@ -45,9 +45,7 @@ def is_one_of_six(path: str | os.PathLike[str]) -> bool:
     return component_of(path) is not None and math.prod(nifti.load(path).shape[3:]) == 1
 
 
-def read_tensors(
-    paths: Sequence[str | os.PathLike[str]], order: str | None = None, frame: str | None = None
-) -> TensorVolume:
+def read_tensors(paths: Sequence[str | os.PathLike[str]], order: str | None, frame: str | None) -> TensorVolume:
     """Read tensors from six NIfTI images, whose names say which component each has, in any sequence.
 
     The axes of the components are those asked for, or those that the BIDS sidecar beside an image says
@@ -74,7 +72,7 @@ def read_tensors(
     for name, image in zip(NAMES, images, strict=True):
         if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
             raise ValueError(
-                f"{files[name]}: got shape {image.shape}; expected (nx, ny, nz), one component, as all six"
+                f"{files[name]}: got shape {image.shape}; expected one component, (nx, ny, nz), as all six"
             )
         if not np.allclose(nifti.affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected the same voxels")

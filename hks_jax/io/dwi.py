@@ -75,8 +75,8 @@ def fit_dwi(
         unit: of diffusivity, whose reciprocal is the b-values' unit: ``"m2/s"`` for b-values in s/m², ``"um2/ms"`` for
             ms/µm². None: mm²/s.
         noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
-            ``"residuals"``, in each voxel what the fit leaves, of as many degrees of freedom as there are images more
-            than 7. None: no covariance.
+            ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
+            for n images. None: no covariance.
 
     Returns:
         Tensors along the voxel axes, in mm²/s, and with `noise` their covariance, to first order in it. DIPY replaces
@@ -136,7 +136,7 @@ def fit_dwi(
         notes.append(f"covariances of the tensors from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
-    volume = placed(os.fspath(path), fitted, bvec_frame, affine, inside, unit=MM2_PER_S, covariance=covariance)
+    volume = placed(os.fspath(path), fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance)
     return replace(volume, notes=tuple(notes), digest=digest(path))
 
 
@@ -187,7 +187,7 @@ def _covariance(
 def _of_length_one(
     name: str, directions: Float[np.ndarray, "n 3"], weighted: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], list[str]]:
-    """Return the directions of weighted images with length 1, those of others zero; and a note of what was rounded."""
+    """Return the directions of weighted images with length 1, those of others zero; and a note of their lengths."""
     lengths = np.linalg.norm(directions, axis=1)
     bad = weighted & ~(np.abs(lengths - 1) <= _LENGTH)
     if bad.any():

@@ -64,7 +64,7 @@ def read_tensors(
         mask: a file (see `read_mask`) or a bool array of the volume's shape; None: the file's own, or no mask.
         frame: the axes along which the file's components are: ``"voxel"``; ``"fsl"`` (voxel axes, the first reversed
             where the affine's determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"``
-            (NRRD's measurement frame). None: what the file declares, or what the order's programs write: voxel axes
+            (NRRD's measurement frame). None: the declared ones, or those of the order's programs: voxel axes
             for ``"nifti"``, ``"fsl"``, and ``"world"`` for ``"mrtrix"``, ``"vtk"``; for NumPy's files voxel axes.
         array: the name of the tensors' array in an npz or VTK file, where there are several.
         spacing: for NumPy's files without one.
@@ -143,7 +143,7 @@ def save(
     Args:
         path: the file; missing folders are made.
         values: (*shape,) or (n_times, *shape); for a mesh (V,) or (n_times, V).
-        volume: what the values belong to.
+        volume: where the values are.
         name: what to call the values in the file.
         extra: more arrays, such as the times; for NIfTI the times alone.
         provenance: what else the file should say of its origin, such as the settings of the computation.

@@ -20,6 +20,7 @@ from hks_jax.domain.tet_mesh import TetMesh
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.io import cortex
 from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
+from hks_jax.io.tables import write_json
 from hks_jax.io.vtk_image import holds_dataset
 from hks_jax.optional import optional
 from hks_jax.reading import existing
@@ -108,27 +109,23 @@ def is_mesh(path: Path) -> bool:
     return name.endswith(READ) or cortex.is_freesurfer(path)
 
 
-def write(
-    path: str | os.PathLike[str], arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str
-) -> Path:
+def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str) -> None:
     """Write a mesh with values at its vertices, and a file ``path.json`` beside it that says where they came from."""
-    name = os.fspath(path)
-    suffix, solid = Path(name).suffix.lower(), mesh.triangulation.dimension == 3
+    suffix, solid = path.suffix.lower(), mesh.triangulation.dimension == 3
     allowed = [s for s in WRITTEN if not (solid and s == ".ply")]
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
-        raise ValueError(f"path: got {name!r}; {what} are written as {', '.join(allowed)} or .npz")
+        raise ValueError(f"path: got {str(path)!r}; {what} are written as {', '.join(allowed)} or .npz")
     library = optional("meshio")
     cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # what PLY has room for
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})
-    with atomic_path(name + ".json") as beside, atomic_path(name) as temporary:
+    with atomic_path(path) as temporary:
         getattr(library, WRITTEN[suffix]).write(str(temporary), whole)
-        beside.write_text(json.dumps(json.loads(record), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    return Path(path)
+        write_json(path.with_name(f"{path.name}.json"), json.loads(record))
 
 
 def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
-    """Return what is in a file, cleaned if asked to, and what was done about it."""
+    """Return the mesh in a file, cleaned if asked to, and a text that lists the changes."""
     file = existing(path)
     name = file.name.lower()
     if name.endswith((".gii", ".gii.gz")):
@@ -186,7 +183,7 @@ def _require_joined(loaded: Loaded) -> str:
 
 
 def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
-    """Return the mesh as `read_mesh` documents it, and what was done, in words; the empty text if that is nothing."""
+    """Return the mesh cleaned as `read_mesh` documents it, and a text that lists the changes, empty without any."""
     words = WORDS[loaded.cells.shape[1] - 1]
     first, n_cells, done = _same_places(loaded.vertices), len(loaded.cells), []
 

@@ -243,7 +243,7 @@ def load_off(file: Path) -> Loaded:
         n_vertices, n_faces = (int(word) for word in head.split()[:2])
         if min(n_vertices, n_faces) < 0 or len(rest) != n_vertices + n_faces:
             raise ValueError(
-                f"it declares {n_vertices} vertices and {n_faces} faces, and has {len(rest)} lines for them"
+                f"it declares {n_vertices} vertices and {n_faces} faces, and has {len(rest)} lines of them"
             )
         rows = [line.split() for line in rest]
         if len({len(row) for row in rows[:n_vertices]}) != 1:
@@ -273,7 +273,7 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
         if (cut < 0).any():
             bad = which[np.argmax((cut < 0).any(axis=(1, 2)))]
             raise ValueError(
-                f"{file}: face {bad} of {size} corners is not convex; have it cut into triangles by what wrote it"
+                f"{file}: face {bad} of {size} corners is not convex; expected triangles: cut it into some"
             )
         order.append(np.repeat(which, size - 2))
         triangles.append(cut.reshape(-1, 3))

@@ -115,7 +115,7 @@ def _encoding(path: str) -> dict[str, Any]:
 
 
 def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
-    """Return what the file says of its tensors, where we wrote it; empty otherwise.
+    """Return the record that `save_tensors` wrote into the file; empty if another program wrote the file.
 
     Where the affine's directions are no longer those that were recorded, another program has moved the voxels, and
     the record is no longer true.
@@ -172,13 +172,11 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
 
 
 def placement_notes(image: Any) -> list[str]:
-    """Say what is doubtful about where an image lies: its sform and qform differ, or there is neither."""
+    """Say if the place of an image is in doubt: its sform and qform differ, or there is neither."""
     by_sform, sform = image.header.get_sform(coded=True)
     by_qform, qform = image.header.get_qform(coded=True)
     if not (sform or qform):
-        return [
-            "the file does not say where its voxels lie (neither sform nor qform is set): which side is left is a guess"
-        ]
+        return ["neither sform nor qform places the voxels in space: which side is left is a guess"]
     if not (sform and qform):
         return []
     apart = float(np.linalg.norm(corners(image.shape) @ (by_sform - by_qform).T, axis=1).max())
@@ -191,9 +189,7 @@ def placement_notes(image: Any) -> list[str]:
     ]
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars with times along the fourth axis, a slice one voxel thick; see `hks_jax.io.save`."""
     others = sorted(extra.keys() - {"times"})
     if others:
@@ -211,9 +207,7 @@ def write(
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     """Write a symmetric-matrix image; see `hks_jax.io.save_tensors`."""
     if volume.dimension != 3:
-        raise ValueError(
-            "volume: NIfTI has no 2×2 tensors; write the volume that the slice is of, or an .npz, .nrrd or .vti"
-        )
+        raise ValueError("volume: NIfTI has no 2×2 tensors; write the whole volume, or an .npz, .nrrd or .vti")
     require_symmetric(volume)
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)

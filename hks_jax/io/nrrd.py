@@ -105,7 +105,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
         notes.append("the grid's axes are those of the voxels; their directions in the plane are not kept")
     if place.unit not in ("", "mm"):
         notes.append(f"lengths in {place.unit}, as the file declares, are in mm here")
-    notes.append(found.note(frame, f" ({label or 'as asked'})"))
+    notes.append(found._replace(of=f" ({label or 'as asked'})").note(frame))
     return TensorVolume(
         np.ascontiguousarray(tensors),
         tuple(spacing.tolist()),
@@ -122,15 +122,13 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
     )
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars with times along the last axis; see `hks_jax.io.save`."""
     if volume.affine is not None:
         array = images_of(array, volume)
     elif array.ndim > volume.dimension:
         array = np.moveaxis(array, 0, -1)
-    _write(path, array, volume, record, more=extra)
+    _write(path, array, volume, record, "", extra)
 
 
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
@@ -140,25 +138,17 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
     components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
     record = describe_tensors(volume, "nrrd", "measurement", provenance)
     kind = f"{volume.dimension}D-masked-symmetric-matrix"
-    _write(path, np.moveaxis(components, -1, 0), volume, record, kind=kind)
+    _write(path, np.moveaxis(components, -1, 0), volume, record, kind, {})
 
 
-def _write(
-    path: Path,
-    array: np.ndarray,
-    volume: TensorVolume,
-    record: str,
-    *,
-    kind: str | None = None,
-    more: Mapping[str, Any] | None = None,
-) -> None:
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
     """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
 
     It has one more axis for tensor components, of some `kind`, first, or for times last. A slice that has an affine
     must come one voxel thick. More arrays go as text into the header.
     """
     nrrd = optional("nrrd")
-    placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
+    placed = volume.affine is not None and not kind.startswith("2D")
     if placed:
         d, linear, origin = 3, volume.volume_affine[:3, :3], volume.volume_affine[:3, 3]
     else:
@@ -167,7 +157,7 @@ def _write(
     # pynrrd writes a direction of NaN as "none", which is what axes have that are not in space.
     directions, kinds, none = linear.T, ["space"] * d, np.full((1, d), np.nan)
     header: dict[str, Any] = {"space": "right-anterior-superior"} if placed else {"space dimension": d}
-    if kind is not None:
+    if kind:
         directions, kinds = np.concatenate([none, directions]), [kind, *kinds]
         header["measurement frame"] = nearest_rotation(linear).T  # its vectors, which are the matrix's columns
     elif array.ndim > d:
@@ -175,7 +165,7 @@ def _write(
     if placed or volume.length_unit:
         header["space units"] = ["mm"] * d
     header |= {"space directions": directions, "space origin": origin, "kinds": kinds, "encoding": "gzip"}
-    header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in (more or {}).items()}
+    header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in more.items()}
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     with atomic_path(path) as temporary:

@@ -185,7 +185,7 @@ OPEN_FRAME = (
 
 
 def questions(volume: TensorVolume) -> tuple[str, ...]:
-    """Ask what the tensors of a volume give reason to: "Wrong frame?", "Wrong unit of length?", "Wrong unit?".
+    """Ask about tensors that look wrong: "Wrong frame?", "Wrong unit of length?", "Wrong unit?".
 
     Mirrored or turned tensors are as positive definite as right ones, but the fibres of neighbours no longer continue
     each other: the mean angle between a principal direction and those of the two neighbours along it is compared with
@@ -204,7 +204,7 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the volume with notes of what its fibres tell, and the questions.
+    """Return the volume with notes about its fibres, and the questions.
 
     The note of an open frame is then a question, or settled.
     """

@@ -1,4 +1,4 @@
-"""Tensors that are not positive definite: how many, where, and what is done about them, if asked."""
+"""Tensors that are not positive definite: finding, counting and, if asked, repairing them."""
 
 import math
 from collections.abc import Callable
@@ -39,7 +39,7 @@ REPAIRS: dict[str, str] = {
 """The choices, for messages."""
 
 LISTED = 20
-"""So many voxels are listed in a report."""
+"""The number of voxels that a report lists."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
 """Relative difference of tensors that are the same; relative size of tensors that are nothing; least share of them."""
@@ -81,11 +81,11 @@ def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
-    """Return the volume with the tensors inside its mask positive definite, and a report of what was done.
+    """Return the volume with the tensors inside its mask positive definite, and a report of the changes.
 
     Args:
-        volume: the tensors. Without a mask, voxels whose tensor is exactly zero, as programs write what is outside,
-            are left out first.
+        volume: the tensors. Without a mask, voxels whose tensor is exactly zero are left out first: programs write the
+            background so.
         method: what to do with tensors that are not positive definite (or have an eigenvalue below `floor`):
             ``"clip"`` raises their eigenvalues to the floor, which gives the nearest such tensor in the Frobenius norm;
             ``"mask"`` takes them out of the mask; ``"nearest"`` puts the tensor of the nearest valid voxel (by
@@ -185,7 +185,7 @@ def without_background(volume: TensorVolume) -> TensorVolume:
 
 
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
-    """Return which voxels look as if a program had filled in what lies outside, and a sentence; None if few do.
+    """Return the voxels that a program seems to have filled in as background, and a sentence; None if few do.
 
     No measurement gives the same isotropic tensor twice, nor one that is a millionth of the others: programs such as
     ANTs write either where there is no signal. Of a volume with a mask, and of one that is alike everywhere, None.
@@ -193,7 +193,7 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
     if volume.mask is not None:
         return None
     tensors, d = volume.tensors, volume.dimension
-    with np.errstate(invalid="ignore", over="ignore"):  # of what is not finite
+    with np.errstate(invalid="ignore", over="ignore"):  # of tensors that are not finite
         mean = np.trace(tensors, axis1=-2, axis2=-1, dtype=np.float64) / d
         isotropic = mean > 0
         for i, j in product(range(d), repeat=2):  # one by one: volumes are large
@@ -250,7 +250,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     tensors = volume.tensors.copy()
     tensors[inside] = mapped
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
-    note = f"{formula} of all tensors S, {before} of {int(inside.sum())} of which are not positive definite"
+    note = f"{formula} of all tensors S, {before} of {int(inside.sum())} not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
     return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))
 

@@ -48,7 +48,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> Path:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return what is in a JSON file; nothing if there is no such file, or it is no object."""
+    """Return the object in a JSON file; an empty one if there is no such file, or it holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

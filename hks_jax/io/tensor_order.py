@@ -145,11 +145,12 @@ class Matrices(NamedTuple):
     tensors: Float[np.ndarray, "*shape d d"]
     order: str  # of their components; "matrix" if they were whole matrices
     invalid: InvalidByOrder | None
+    of: str = ""  # what notes say of the components
 
-    def note(self, frame: str, of: str = "") -> str:
-        """Say how they were read; `of` says more of the components."""
+    def note(self, frame: str) -> str:
+        """Say how they were read."""
         what = "whole matrices" if self.order == "matrix" else f'components in order "{self.order}"'
-        return f"{what}{of}, given along the {frame} axes, taken to the voxel axes"
+        return f"{what}{self.of}, given along the {frame} axes, taken to the voxel axes"
 
 
 def matrices(name: str, components: Float[np.ndarray, "*shape n"], order: str | None, declared: str = "") -> Matrices:

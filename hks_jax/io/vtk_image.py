@@ -78,22 +78,20 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     thick = upper > lower
     of_cells = thick & (place == "cell")  # a cell's value is at its centre
     shape = tuple((upper - lower + np.where(of_cells, 0, 1)).tolist())
-    steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # 0 is what has no thickness
+    steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # an axis without thickness has 0
     affine = np.eye(4)
     affine[:3, :3] = image["direction"] * steps
     affine[:3, 3] = image["origin"] + affine[:3, :3] @ (lower + np.where(of_cells, 0.5, 0.0))
     mask = image.get(f"{place}:mask")
     inside = None if mask is None else as_mask(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape)))
-    found, of = found._replace(tensors=_on_grid(found.tensors, shape)), f" from {chosen!r} at the {place}s"
-    volume = placed(name, found, frame or "world", affine, inside, of, length_unit="")
+    found = found._replace(tensors=_on_grid(found.tensors, shape), of=f" from {chosen!r} at the {place}s")
+    volume = placed(name, found, frame or "world", affine, mask=inside, length_unit="")
     if np.array_equal(affine[:3, :3], np.diag(volume.spacing)):
         volume = replace(volume, affine=None, origin=tuple(affine[:3, 3].tolist()))
     return _as_plane(volume)
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars as arrays of points, one per time; see `hks_jax.io.save`."""
     _write(path, by_time(name, array, array.ndim - volume.dimension, extra), volume, record, extra)
 
@@ -107,7 +105,7 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
         tensors[..., np.ix_(keep, keep)[0], np.ix_(keep, keep)[1]] = volume.tensors
     rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
     record = describe_tensors(volume, "matrix", "world", provenance)
-    _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record)
+    _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record, {})
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -119,13 +117,7 @@ def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> d
     return dict(zip(labels, array, strict=True))
 
 
-def _write(
-    path: Path,
-    arrays: Mapping[str, np.ndarray],
-    volume: TensorVolume,
-    record: str,
-    more: Mapping[str, Any] | None = None,
-) -> None:
+def _write(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, record: str, more: dict[str, Any]) -> None:
     """Write point arrays over the voxels of a volume, the mask, and `more` and the provenance as field data.
 
     Arrays are (*shape,) or (*shape, 3, 3), the latter as tensors along the axes of space.
@@ -154,7 +146,7 @@ def _write(
             image.GetPointData().SetTensors(array)
         else:
             image.GetPointData().AddArray(array)
-    for name, values in (more or {}).items():
+    for name, values in more.items():
         array = numpy_to_vtk(np.ascontiguousarray(np.asarray(values).ravel()), deep=True)
         array.SetName(name)
         image.GetFieldData().AddArray(array)
@@ -171,7 +163,7 @@ def _write(
 
 
 def _check_pieces(content: bytes) -> None:
-    """Raise ValueError unless the pieces of an image fill its whole extent: VTK makes up what is not there."""
+    """Raise ValueError unless the pieces of an image fill its whole extent: VTK makes up values for missing pieces."""
     head = content.partition(b"<AppendedData")[0]
 
     def cells(extent: bytes) -> int:
