@@ -31,8 +31,7 @@ class ComputationError(RuntimeError):
 class Settings:
     """What to compute: the options of the same names.
 
-    Only on meshes, which have one of their own, is there no metric. Without a boundary the domain has the one that
-    suits it (`default_boundary`), and a mesh the natural one.
+    Only meshes may have no metric. Without a boundary a volume has its `default_boundary`, and a mesh the natural one.
     """
 
     metric: MetricChoice | None

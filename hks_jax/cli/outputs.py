@@ -48,8 +48,7 @@ def writing(
 ) -> Iterator[tuple[Path, Done]]:
     """Yield a temporary folder, and a `Done` that has the report and the paths of the results at the end.
 
-    At the end report.json is written beside the other files, and all of them move to `folder`, or none of them does;
-    then the files of earlier results that `stale` returns are gone.
+    Then report.json is written, too, and all files move to `folder`, or none; files that `stale` returns are gone.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
@@ -71,28 +70,19 @@ def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callab
 
 
 def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> list[Path]:
-    """Return the files of an earlier signature in a folder and all that was made of it, which a new one takes away.
-
-    Eigenpairs stay where they are those of the new signature, whose eigenvalues are given.
-    """
-    found, own = [], []
+    """Return an earlier signature's files in a folder, and all made of it but eigenpairs with these eigenvalues."""
+    found, own, pairs = [], [], folder / PAIRS
     if signature_file(folder).is_file():  # else files of these names are not ours
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
         own = [*folder.glob("hks.*"), folder / REPORT]
         found = [*own, *(folder / name for name in ("explore.html", *regions) if (folder / name).is_file())]
-    if not _are_pairs(folder / PAIRS, eigenvalues):
-        found.append(folder / PAIRS)
+    if zipfile.is_zipfile(pairs):
+        with np.load(pairs) as arrays:  # reads this one array only
+            if "eigenvalues" in arrays and not np.array_equal(arrays["eigenvalues"], eigenvalues):
+                found.append(pairs)
     if derived := [file.name for file in found if file not in own]:
         progress.note(f"removed {', '.join(derived)} of an earlier signature in {folder}")
     return found
-
-
-def _are_pairs(path: Path, eigenvalues: np.ndarray) -> bool:
-    """Tell whether a file holds eigenpairs with just these eigenvalues, or is none of ours."""
-    if not zipfile.is_zipfile(path):
-        return True
-    with np.load(path) as arrays:  # reads this one array only
-        return "eigenvalues" not in arrays or np.array_equal(arrays["eigenvalues"], eigenvalues)
 
 
 def versions() -> dict[str, str]:

@@ -46,8 +46,7 @@ def check_options(args: argparse.Namespace) -> None:
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with the settings of their computation.
 
-    The suffix of images and the warnings are read back, too. The fingerprint identifies the files and settings of a
-    study's subject.
+    The suffix of images and the warnings are read back, too. The fingerprint is that of a study's subject.
     """
     volume, settings = solved.domain, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}

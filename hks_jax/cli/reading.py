@@ -44,8 +44,7 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
     """Read or fit the tensors, cut the slice, settle the mask, and repair if asked to.
 
-    What is to be doubted is a warning, unless `ask` says it. With ``args.strict_unit``, tensors of an implausible unit
-    are refused unless ``--unit`` says that they have it.
+    Questions are warnings, unless `ask` takes them. With ``args.strict_unit``, an implausible unit needs ``--unit``.
     """
     with progress.stage("reading", str(args.file)):
         volume, mask = _load(args)

@@ -1,6 +1,5 @@
 """Tensors in NumPy's own files, .npz and .npy."""
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,13 @@ from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
 from hks_jax.npz import load_npy, load_npz, write_npz
 
 
-def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
+def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
     """Return the array of an npy, or ``mask`` of an npz; neither says where it lies."""
-    if os.fspath(path).lower().endswith(".npy"):
-        return load_npy(path), None
-    arrays = load_npz(path)
+    if name.lower().endswith(".npy"):
+        return load_npy(name), None
+    arrays = load_npz(name)
     if "mask" not in arrays:
-        raise ValueError(f"{os.fspath(path)}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
+        raise ValueError(f"{name}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
     return arrays["mask"], None
 
 

@@ -42,18 +42,14 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
 
 def is_one_of_six(path: str | os.PathLike[str]) -> bool:
     """Tell whether a NIfTI file holds one component alone: by its name, and as it has one value for each voxel."""
-    return component_of(path) is not None and math.prod(nifti.load(path).shape[3:]) == 1
+    return component_of(path) is not None and math.prod(nifti.load(os.fspath(path)).shape[3:]) == 1
 
 
 def read_tensors(paths: Sequence[str | os.PathLike[str]], order: str | None, frame: str | None) -> TensorVolume:
-    """Read tensors from six NIfTI images, whose names say which component each has, in any sequence.
+    """Read tensors from six NIfTI images in any sequence, whose names say which component each has.
 
     The axes of the components are those asked for, or those that the BIDS sidecar beside an image says
-    (``Reference`` of ``OrientationEncoding``), or the voxels'. An order is refused.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not six images, or names that do not say which; shapes or affines that differ.
+    (``Reference`` of ``OrientationEncoding``), or the voxels'.
     """
     if order is not None:
         raise ValueError(f"order: got {order!r}; the names of six images say which component each has. Leave it out")

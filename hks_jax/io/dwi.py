@@ -91,8 +91,9 @@ def fit_dwi(
             residuals; residuals that are zero; no signal.
     """
     dti, gradients, segmentation = map(optional, ("dipy.reconst.dti", "dipy.core.gradients", "dipy.segment.mask"))
-    image = nifti.load(path)
-    affine, _ = nifti.affine_in_mm(os.fspath(path), image)
+    name = os.fspath(path)
+    image = nifti.load(name)
+    affine, _ = nifti.affine_in_mm(name, image)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
     if directions.shape[-1] != 3 or directions.shape == (3, 3) != (b.size, 3):
         directions = directions.T
@@ -113,8 +114,8 @@ def fit_dwi(
             "at least 6 and 1"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
-    signal = nifti.voxels(path, image)[..., used]
-    inside, found = _inside(os.fspath(path), mask, signal, b[used] <= threshold, affine, segmentation)
+    signal = nifti.voxels(name, image)[..., used]
+    inside, found = _inside(name, mask, signal, b[used] <= threshold, affine, segmentation)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
     fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
@@ -136,8 +137,8 @@ def fit_dwi(
         notes.append(f"covariances of the tensors from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
-    volume = placed(os.fspath(path), fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance)
-    return replace(volume, notes=tuple(notes), digest=digest(path))
+    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance)
+    return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
 # With the logarithms y of the signals, weights w (the signals that an unweighted fit predicts), and the rows X of the

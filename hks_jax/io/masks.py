@@ -28,7 +28,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         ImportError: NIfTI without nibabel, NRRD without pynrrd.
     """
     name = os.fspath(path)
-    values, place = _image(path, affine, IMAGES)
+    values, place = _image(name, affine, IMAGES)
     if affine is not None and place is not None:
         shift = np.linalg.norm(corners(values.shape) @ (place - affine).T, axis=1).max()
         if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
@@ -70,7 +70,7 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
-    values, place = _image(path, affine, (*nifti.SUFFIXES, ".npy"))
+    values, place = _image(name, affine, (*nifti.SUFFIXES, ".npy"))
     if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim == 3:
         values = _at_voxels(name, values, np.linalg.solve(place, affine), on)
     if values.shape != shape:
@@ -113,13 +113,11 @@ def names_beside(path: str | os.PathLike[str]) -> str | None:
     return str(table) if table.is_file() else None
 
 
-def _image(
-    path: str | os.PathLike[str], affine: np.ndarray | None, suffixes: tuple[str, ...]
-) -> tuple[np.ndarray, np.ndarray | None]:
+def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the voxel values, without a fourth axis of one entry, and the affine where the file has one."""
-    read = format_of(path, suffixes).read_image
+    read = format_of(name, suffixes).read_image
     assert read is not None
-    values, place = read(path, affine)
+    values, place = read(name, affine)
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     return values, place

@@ -218,10 +218,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
 def _without_thin(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "m 3"], int]:
-    """Flip the longest edges of triangles that have hardly a height: the surface stays, and has no crack.
-
-    Returns the triangles, without those that lie on a boundary, and how many edges were flipped.
-    """
+    """Return triangles after flips at those with hardly a height, which go at a boundary, and the number of flips."""
     cells, gone, flipped = cells.copy(), np.zeros(len(cells), bool), 0
     corners = vertices[cells]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

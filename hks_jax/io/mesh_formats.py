@@ -187,10 +187,7 @@ def _triangles(cells: Int[np.ndarray, "n corners"], points: Float[np.ndarray, "V
 
 
 def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "n m 3"]:
-    """Return each polygon cut into triangles around one of its corners; −1 where no corner sees all others.
-
-    It is the first corner from which all triangles lie on one side; of a flat polygon the first corner of all.
-    """
+    """Return polygons cut into triangles around the first corner that sees all others; −1 where none does."""
     n, size = polygons.shape
     found = np.full((n, size - 2, 3), -1)
     for first in reversed(range(size)):

@@ -6,8 +6,6 @@ up to ``END``, and the voxels at the offset that ``file`` names, in the order th
 
 import gzip
 import math
-import os
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,16 +18,9 @@ _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
-class Image(NamedTuple):
-    """The voxel values, in the header's order of axes, and the affine: voxel indices to scanner coordinates, in mm."""
-
-    values: np.ndarray
-    affine: Float[np.ndarray, "4 4"]
-
-
-def load(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Image:
-    """Read an image, whatever lies beside it. A compressed one is read to its end, where its checksum is compared."""
-    file = existing(path)
+def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"]]:
+    """Return the voxel values, with the header's axes, and the affine to the scanner's coordinates in mm."""
+    file = existing(name)
     with reading(file, "a readable image of MRtrix (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
         header, offset = _header(content)
@@ -51,7 +42,7 @@ def load(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Imag
         affine[:3, :3] *= [float(word) for word in header["vox"][0].split(",")[:3]]
         if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
             raise ValueError("transform and vox place the voxels nowhere")
-    return Image(values, affine)
+    return values, affine
 
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:

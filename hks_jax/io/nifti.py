@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -38,21 +38,15 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
-def load(path: str | os.PathLike[str]) -> Any:
+def load(name: str) -> Any:
     """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared."""
-    nib, file = optional("nibabel"), existing(path)
+    nib, file = optional("nibabel"), existing(name)
     with reading(file, "a readable NIfTI image"):
+        image, length = nib.load(file), file.stat().st_size
         if file.name.lower().endswith(".gz"):
             with gzip.open(file) as stream:
                 content = stream.read()
-            kinds = {348: nib.Nifti1Image, 540: nib.Nifti2Image}
-            orders: tuple[Literal["little", "big"], ...] = ("little", "big")
-            kind = next((kinds[n] for order in orders if (n := int.from_bytes(content[:4], order)) in kinds), None)
-            if kind is None:
-                raise ValueError("it does not begin with the size of NIfTI's header")
-            image, length = kind.from_bytes(content), len(content)
-        else:
-            image, length = nib.load(file), file.stat().st_size
+            image, length = type(image).from_bytes(content), len(content)
         data = image.dataobj
         declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
         if declared != length:
@@ -60,13 +54,13 @@ def load(path: str | os.PathLike[str]) -> Any:
     return image
 
 
-def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
+def voxels(name: str, image: Any) -> np.ndarray:
     """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64."""
-    with reading(path, "a readable NIfTI image"):
+    with reading(name, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
-    require_real(os.fspath(path), data)
+    require_real(name, data)
     if data.dtype.kind not in "fiub":
-        raise ValueError(f"{os.fspath(path)}: has voxels of type {data.dtype}; expected real numbers")
+        raise ValueError(f"{name}: has voxels of type {data.dtype}; expected real numbers")
     dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
     return np.ascontiguousarray(data, dtype=dtype.newbyteorder("="))
 
@@ -80,14 +74,11 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
-def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the voxel values of an image, and its affine in mm.
-
-    Without a unit of its own it has that of the image whose affine is `beside` (see `scaled_beside`).
-    """
-    image = load(path)
-    own, unit = affine_in_mm(os.fspath(path), image)
-    return voxels(path, image), own if unit or beside is None else scaled_beside(own, beside)
+def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image's voxel values, and its affine in mm; without a unit, in that of the image `beside` it."""
+    image = load(name)
+    own, unit = affine_in_mm(name, image)
+    return voxels(name, image), own if unit or beside is None else scaled_beside(own, beside)
 
 
 def sidecar_of(path: str | os.PathLike[str]) -> Path:
@@ -115,11 +106,7 @@ def _encoding(path: str) -> dict[str, Any]:
 
 
 def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
-    """Return the record that `save_tensors` wrote into the file; empty if another program wrote the file.
-
-    Where the affine's directions are no longer those that were recorded, another program has moved the voxels, and
-    the record is no longer true.
-    """
+    """Return the record of `save_tensors`; empty if another program wrote the file, or turned its voxels since."""
     for extension in image.header.extensions:
         record = own_record(extension.get_content()) if extension.get_code() == COMMENT else {}
         if "axes" in record and np.allclose(record["axes"], affine[:3, :3], rtol=1e-4, atol=1e-4):

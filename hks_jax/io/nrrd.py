@@ -1,6 +1,5 @@
 """NRRD through pynrrd, which is optional: tensors of every kind that the format defines, masks and results."""
 
-import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -50,9 +49,9 @@ class Placement(NamedTuple):
         return affine
 
 
-def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
+def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the array, first axis fastest in the file, in native floating point or as it is; and the header."""
-    nrrd, file = optional("nrrd"), existing(path)
+    nrrd, file = optional("nrrd"), existing(name)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not
         header = dict(nrrd.read_header(stream))
@@ -65,15 +64,10 @@ def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
     return data.astype(data.dtype.newbyteorder("=")), header
 
 
-def read_image(
-    path: str | os.PathLike[str], beside: np.ndarray | None = None
-) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
-    """Return the voxel values of a scalar image, and its affine if it has one.
-
-    Without a unit of its own it has that of the image whose affine is `beside` (see `scaled_beside`).
-    """
-    data, header = load(path)
-    place = _placement(os.fspath(path), header, list(range(data.ndim)))
+def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
+    """Return an image's voxel values, and its affine if any; without a unit, in that of the image `beside` it."""
+    data, header = load(name)
+    place = _placement(name, header, list(range(data.ndim)))
     affine = place.affine
     return data, affine if affine is None or beside is None or place.unit else scaled_beside(affine, beside)
 
@@ -144,8 +138,8 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
 def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
     """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
 
-    It has one more axis for tensor components, of some `kind`, first, or for times last. A slice that has an affine
-    must come one voxel thick. More arrays go as text into the header.
+    Tensor components, of some `kind`, are along the first axis, times along the last. A slice with an affine must come
+    one voxel thick. More arrays go as text into the header.
     """
     nrrd = optional("nrrd")
     placed = volume.affine is not None and not kind.startswith("2D")
@@ -221,10 +215,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
 
 
 def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
-    """Return the unit of the file's lengths, empty if it declares none, and how many mm it is along each axis.
-
-    Directions are in the units of the axes of space, spacings in those of the voxels' axes.
-    """
+    """Return the unit of the file's lengths, empty if it declares none, and how many mm it is along each axis."""
     if "space directions" in header:
         field, given = "space units", list(header.get("space units", ()))[: len(domain)]
     else:

@@ -59,11 +59,7 @@ def check_header(text: bytes, header: Mapping[str, Any]) -> None:
 
 
 def space_of(header: Mapping[str, Any]) -> str:
-    """Return the space in full and in lower case, whose time does not count; the empty text if there is none.
-
-    Raises:
-        ValueError: none of the format's.
-    """
+    """Return the space in full and in lower case, without its time; the empty text if there is none."""
     space = str(header.get("space", "")).lower()
     name = _SHORT.get(space.removesuffix("t"), space.removesuffix("-time"))
     if name and name not in _SPACES:

@@ -83,10 +83,8 @@ def coherence(volume: TensorVolume) -> Coherence | None:
     """Measure whether fibres continue along their own direction, along the axes of the file and along others.
 
     A principal direction v is compared with the mean of those of the two neighbours nearest to ±v, where both are
-    anisotropic, too. Tensors along the right axes agree best. The axes compared are the frames of
-    `hks_jax.io.read_tensors`, and the file's own with one axis reversed, of the voxels or of the scanner.
-
-    Returns None for a slice, and where fewer than a thousand voxels have such neighbours.
+    anisotropic, too. Tensors along the right axes agree best. Compared are the frames of `hks_jax.io.read_tensors`, and
+    the file's own with one axis reversed. None for a slice, and for fewer than a thousand voxels with such neighbours.
     """
     if volume.dimension != 3:
         return None
@@ -151,10 +149,7 @@ def _angles(
 
 
 def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarray, "3 3"]]]:
-    """Return other axes by name, whether they are a frame, and what turns directions, as read, to them.
-
-    Each is there once, the frames first; those that are the file's own are not among them.
-    """
+    """Return other axes, frames first: name, whether they are a frame, and a matrix that turns directions to them."""
     affine = volume.volume_affine
     to_voxel = {
         "voxel": np.eye(3),
@@ -204,10 +199,7 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the volume with notes about its fibres, and the questions.
-
-    The note of an open frame is then a question, or settled.
-    """
+    """Return the volume with notes about its fibres, in place of the note of an open frame, and the questions."""
     found = coherence(volume) if volume.length_unit == "mm" else None
     notes = [note for note in volume.notes if note != OPEN_FRAME]
     wrong_frame, settled = "", False

@@ -126,8 +126,7 @@ class InvalidByOrder(NamedTuple):
 def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> InvalidByOrder | None:
     """Count the tensors that are not positive definite under each order; None where few are under their own.
 
-    Validity does not depend on the axes that components are along, only on their order. It tells ``"nifti"``,
-    ``"fsl"`` and the orders with the diagonal first apart, but hardly ``"mrtrix"`` and ``"vtk"``, which exchange two
+    The axes of components do not matter for this. It hardly tells ``"mrtrix"`` from ``"vtk"``, which exchange two
     components beside the diagonal.
     """
     rows = components.reshape(-1, components.shape[-1])
@@ -156,14 +155,8 @@ class Matrices(NamedTuple):
 def matrices(name: str, components: Float[np.ndarray, "*shape n"], order: str | None, declared: str = "") -> Matrices:
     """Return the tensors that components make: all d² entries of matrices, or the d(d+1)/2 of symmetric ones.
 
-    Args:
-        name: the file.
-        components: along the last axis.
-        order: the one asked for.
-        declared: the one that the file declares; empty if it does not.
-
     Raises:
-        ValueError: an unknown order; one for whole matrices; none for symmetric ones.
+        ValueError: an unknown order; one for whole matrices; neither an order nor a `declared` one for symmetric ones.
     """
     n = components.shape[-1]
     if n in (4, 9):

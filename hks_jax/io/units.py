@@ -75,10 +75,7 @@ def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
 
 
 def length_question(volume: TensorVolume) -> str:
-    """Ask whether the unit of length is wrong where no scan has such voxels; the empty text where they are plausible.
-
-    Lengths that have no unit are not asked about.
-    """
+    """Ask whether lengths in mm are wrong, where no scan has such voxels; else return the empty text."""
     low, high = _VOXELS
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""
@@ -90,11 +87,7 @@ def length_question(volume: TensorVolume) -> str:
 
 
 def unit_question(volume: TensorVolume) -> str:
-    """Ask whether the unit is wrong where no living tissue has the mean diffusivity that mm²/s give.
-
-    The empty text where the median over the voxels inside is plausible, and where nothing says that the volume is one
-    of tissue: lengths without a unit.
-    """
+    """Ask whether the unit is wrong, where no living tissue has such a mean diffusivity and lengths are in mm."""
     if volume.length_unit != "mm":
         return ""
     median = median_mean_diffusivity(volume)

@@ -198,11 +198,7 @@ class TensorVolume:
 
 
 def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 4"], **known: Any) -> TensorVolume:
-    """Return the tensors of a file whose voxels an affine places, taken from the axes of `frame` to the voxels'.
-
-    Raises:
-        ValueError: an unknown frame; an affine that is singular or not finite.
-    """
+    """Return the tensors of a file whose voxels an affine places, taken from the axes of `frame` to the voxels'."""
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not (np.isfinite(affine).all() and spacing.min() > 0):
         raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
@@ -260,10 +256,7 @@ def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str
 
 
 def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:
-    """Return the same of tensors that are written: their order, frame, axes and units are those in the new file.
-
-    What the file had that they came from is ``source_order`` and ``source_frame``.
-    """
+    """Return the same of tensors that are written, with their order, frame, axes and units in the new file."""
     stored = {"order": order, "frame": frame, "source_order": volume.order, "source_frame": volume.frame}
     stored |= {"axes": volume.volume_affine[:3, :3].tolist(), "length_unit": volume.length_unit, "unit": volume.unit}
     return describe(volume, {**stored, **(more or {})})

@@ -118,10 +118,7 @@ def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> d
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, record: str, more: dict[str, Any]) -> None:
-    """Write point arrays over the voxels of a volume, the mask, and `more` and the provenance as field data.
-
-    Arrays are (*shape,) or (*shape, 3, 3), the latter as tensors along the axes of space.
-    """
+    """Write arrays of points, (*shape, 3, 3) as tensors, the mask, and `more` and the provenance as field data."""
     optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkStringArray

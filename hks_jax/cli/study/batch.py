@@ -121,10 +121,7 @@ def _is_there(study: Study, subject: Subject) -> bool:
 
 
 def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
-    """Return why subjects are refused whose diffusivities are so far from the others' that the unit must be another.
-
-    Files that declare no lengths in mm, such as NumPy's, can be compared with each other alone.
-    """
+    """Return why subjects are refused whose diffusivities are too far from the others' for the same unit."""
     if study.settings.metric == "tensor":  # which need not be diffusion
         return {}
     inputs = {subject.name: read_json(study.path(subject, f"{MAP}.json")).get("Input", {}) for subject in done}
@@ -140,10 +137,7 @@ def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
 
 
 def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> Study:
-    """Return the study, described in its folder, its times settled: as given, or as it has them, or as they suit all.
-
-    A folder of a study of other settings, which is not to be replaced, is refused.
-    """
+    """Return the study, described in its folder, with its times settled; refuse a folder of another study."""
     study = Study(args.output, Settings.of(args, times=times), args.time_unit, reading_options(args), args.save_pairs)
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = study.record, dict(before)

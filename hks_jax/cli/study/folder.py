@@ -97,10 +97,7 @@ class Study:
     def write_signature(
         self, subject: Subject, fingerprint: str, result: Result, warnings: list[str], draw: Callable[[Path], Any]
     ) -> None:
-        """Write a subject's signature, its picture and, last, the sidecar that says it is done.
-
-        Nothing in the files depends on when or where they were computed.
-        """
+        """Write a subject's signature, its picture and, last, the sidecar that says it is done; all without dates."""
         self.forget(subject)
         args, report, scaled = subject.args, result.report, result.arrays.get("scaled_times")
         target = self.path(subject, MAP)
@@ -174,10 +171,7 @@ class Study:
         write_table(self.folder / "participants.tsv", ("participant_id", *covariates), rows)
 
     def write_group(self, subjects: list[Subject], problems: Mapping[str, str], with_regions: bool) -> list[Path]:
-        """Write the table of all subjects and, of those that are done, that of all regions; return their paths.
-
-        Of the others, `problems` says by their names why they are not done.
-        """
+        """Write the tables of all subjects and of all regions; `problems` says by name why some are not done."""
         n = 1 + any(subject.session for subject in subjects)
         head, ids = ("participant_id", "session_id")[:n], {s.name: (s.participant, s.session)[:n] for s in subjects}
         summary = [(*ids[s.name], *_summary(self.path(s, f"{MAP}.json"), problems.get(s.name))) for s in subjects]
@@ -195,10 +189,7 @@ class Study:
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return by name the options of reading and, where error bars are asked for, of noise.
-
-    A second scan is one of the files, and said to be one alone: its path may change.
-    """
+    """Return by name the options of reading and noise; a second scan is "file", as its path may change."""
     names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
     return reading if second_scan(args) is None else {**reading, "noise": "file"}

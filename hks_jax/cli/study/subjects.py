@@ -57,8 +57,8 @@ class _RowParser(argparse.ArgumentParser):
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     """Read the table, and join each row with the arguments that hold for all subjects.
 
-    A row with wrong options becomes a subject with a problem. What is wrong for all raises ValueError: no table, no
-    columns `participant_id` and `file`, labels that BIDS does not allow, or a subject (and session) twice.
+    A row with wrong options becomes a subject with a problem. ValueError is for the table itself: no columns
+    `participant_id` and `file`, labels that BIDS does not allow, or a subject (and session) twice.
     """
     rows, parser = read_table(path), _RowParser(add_help=False)
     add_options(parser, f"@file {READING} @noise @atlas @names")
