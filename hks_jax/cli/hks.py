@@ -38,7 +38,6 @@ from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
-from hks_jax.cli.values import parse_times
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN, is_mesh
@@ -69,13 +68,12 @@ _NO_NOISE = "it is for tensors on a grid; leave it out for meshes and for eigenp
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    times = parse_times(args.times)
     if is_mesh(args.file):
-        return _on_mesh(args, Settings.of(args, metric=args.metric, times=times), progress)
+        return _on_mesh(args, Settings.of(args, metric=args.metric), progress)
     refuse(args, ("clean",), "it is for meshes; leave it out for tensors on a grid, and see --repair")
     refuse(args, ("inside",), "it is for meshes; leave it out for tensors on a grid, and see --mask")
     refuse(args, ("tensors",), "it is for a mesh that lies in a volume; leave it out for the volume itself")
-    return _on_grid(args, Settings.of(args, times=times), progress)
+    return _on_grid(args, Settings.of(args), progress)
 
 
 def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:

@@ -11,7 +11,7 @@ import numpy as np
 import hks_jax as hj
 from hks_jax.cli.options import SOLVING, as_options, defaults
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.values import DEFAULT_TIMES, Times
+from hks_jax.cli.values import Times, parse_times
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
 from hks_jax.eigen.automatic import choose_solver
@@ -49,7 +49,7 @@ class Settings:
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
         """Return the arguments' settings, or the defaults, with those that are given in their place."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
-        given = {"metric": chosen["metric"] or "tensor", "times": DEFAULT_TIMES, **given}
+        given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
 

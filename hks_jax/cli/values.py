@@ -60,14 +60,11 @@ class Times(NamedTuple):
     automatic: int
 
 
-DEFAULT_TIMES = Times((), 6)
-
-
 def parse_times(words: list[str] | None) -> Times:
     """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``."""
     text = ",".join(piece for word in words or ["auto"] for piece in word.split(",") if piece)
     if auto := re.fullmatch(r"auto(?::0*([1-9]\d*))?", text):
-        return Times((), int(auto[1])) if auto[1] else DEFAULT_TIMES
+        return Times((), int(auto[1] or 6))
     times = _numbers(text)
     if not times or min(times) <= 0:
         raise ValueError(f"--times: got {' '.join(words or ())!r}; expected positive numbers, or auto, or auto:N")

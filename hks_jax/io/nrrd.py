@@ -33,8 +33,9 @@ class Placement(NamedTuple):
     origin: Float[np.ndarray, " d"]  # in the file's space
     # The signs that take the file's space to right, anterior, superior; None where it is not patient-based.
     signs: Float[np.ndarray, " d"] | None
+    measured: Float[np.ndarray, "m n"] | None  # the vectors of the measurement frame as columns
     placed: bool  # whether the file gives directions at all, and not spacings alone
-    unit: str = ""  # of length in the file; empty if it declares none
+    unit: str  # of length in the file; empty if it declares none
 
     @property
     def affine(self) -> Float[np.ndarray, "4 4"] | None:
@@ -92,7 +93,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
     place = _placement(name, header, domain)
     spacing = np.linalg.norm(place.directions, axis=0)
     affine = place.affine
-    tensors, frame = _to_voxel_axes(name, found.tensors, frame, place, header.get("measurement frame"), notes)
+    tensors, frame = _to_voxel_axes(name, found.tensors, frame, place, notes)
     if affine is not None and place.signs is None:
         notes.append(f"space {header.get('space', 'unnamed')!r}: the affine's axes are those of the file")
     elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
@@ -199,9 +200,12 @@ def _rows(header: Mapping[str, Any], n: int) -> Float[np.ndarray, "n d"] | None:
 def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Placement:
     d, rows = len(domain), _rows(header, int(header["dimension"]))
     unit, scales = _lengths(name, header, domain)
+    measured = np.asarray(header.get("measurement frame", np.nan), np.float64).T  # the file lists it by columns
+    frame = measured if np.isfinite(measured).all() else None
     if rows is None:
         spacings = np.asarray(header.get("spacings", np.full(int(header["dimension"]), np.nan)), np.float64)[domain]
-        return Placement(np.diag(np.where(np.isnan(spacings), 1.0, spacings * scales)), np.zeros(d), None, False, unit)
+        directions = np.diag(np.where(np.isnan(spacings), 1.0, spacings * scales))
+        return Placement(directions, np.zeros(d), None, frame, False, unit)
     directions = rows[domain].T
     if directions.shape != (d, d) or not np.isfinite(directions).all() or np.linalg.norm(directions, axis=0).min() == 0:
         raise ValueError(
@@ -211,7 +215,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
     origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
     signs = PATIENT.get(space_of(header)) if d == 3 else None
     to_ras = None if signs is None else np.array(signs)
-    return Placement(scales[:, None] * directions, origin, to_ras, True, unit)
+    return Placement(scales[:, None] * directions, origin, to_ras, frame, True, unit)
 
 
 def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
@@ -231,16 +235,11 @@ def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[s
 
 
 def _to_voxel_axes(
-    name: str,
-    tensors: Float[np.ndarray, "*shape d d"],
-    frame: str | None,
-    place: Placement,
-    measurement: Any,
-    notes: list[str],
+    name: str, tensors: Float[np.ndarray, "*shape d d"], frame: str | None, place: Placement, notes: list[str]
 ) -> tuple[Float[np.ndarray, "*shape d d"], str]:
     """Return the tensors along the voxel axes, and the frame that they were in."""
-    d, directions = tensors.shape[-1], place.directions
-    if measurement is None or not np.isfinite(np.asarray(measurement, np.float64)).all():
+    d, directions, columns = tensors.shape[-1], place.directions, place.measured
+    if columns is None:
         if frame == "measurement":
             raise ValueError(f'frame: {name} has no measurement frame; expected "voxel" or "world"')
         rotation = nearest_rotation(directions)
@@ -253,7 +252,6 @@ def _to_voxel_axes(
             )
         frame = frame or ("world" if place.placed else "voxel")
     elif frame in (None, "measurement"):
-        columns = np.asarray(measurement, np.float64).T  # the file lists the matrix by columns
         if columns.shape != (d, d):
             raise ValueError(f"{name}: got a measurement frame of shape {columns.shape}; expected {(d, d)}")
         if np.abs(columns.T @ columns - np.eye(d)).max() > 1e-3:

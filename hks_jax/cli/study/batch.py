@@ -48,7 +48,7 @@ from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.cli.study.folder import MAP, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
-from hks_jax.cli.values import Times, parse_times
+from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import recorded_boundary
 from hks_jax.io.tables import read_json
@@ -79,8 +79,7 @@ def run(args: argparse.Namespace, _: Progress) -> None:
         why = "is a scan of one subject; expected a number, residuals or roughness"
         raise ValueError(f"--noise: {args.noise} {why}. Second scans belong into a column noise of the table")
     args.strict_unit = True
-    times, settle = parse_times(args.times), args.boundary is None
-    if settle:  # subjects are compared, and so have the same boundary, with or without a mask
+    if settle := args.boundary is None:  # subjects are compared, and so have the same boundary, with or without a mask
         before = {} if args.replace else read_json(args.output / "study.json")
         args.boundary = recorded_boundary(before.get("settings", {})) or "mean"
     subjects = read_subjects(args.subjects, args)
@@ -96,7 +95,7 @@ def run(args: argparse.Namespace, _: Progress) -> None:
     if settle:
         progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
     with progress.catching_warnings():
-        study = _open(args, times, subjects, progress)
+        study = _open(args, subjects, progress)
         problems = {subject.name: "" for subject in subjects if subject not in chosen}
         problems |= run_all(study, chosen, progress, args.debug)
         if args.only:  # what others have done in the meantime
@@ -136,9 +135,10 @@ def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
     }
 
 
-def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> Study:
+def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
     """Return the study, described in its folder, with its times settled; refuse a folder of another study."""
-    study = Study(args.output, Settings.of(args, times=times), args.time_unit, reading_options(args), args.save_pairs)
+    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
+    times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = study.record, dict(before)
     if times.automatic:  # they remain those of before
