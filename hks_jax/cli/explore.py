@@ -49,17 +49,15 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("names",), "it names labels; pass --labels too")
     with progress.stage("reading", str(source)):
         result = Result.read(source, "hks", over_times=True)
-        place, shape, affine, world = result.place, result.values.shape[1:], None, None
+        place, affine, world = result.place, None, None
         if isinstance(place, TetMesh):
-            raise ValueError(
-                f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu beside it"
-            )
+            raise ValueError(f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu there")
         if isinstance(place, TensorVolume) and place.affine is not None:
             affine, axes = place.affine, [a for a in range(4) if place.dimension == 3 or a != place.thin_axis]
             world = affine[:3, axes]
         labels, names = None, None
         if args.labels is not None:
-            labels = read_labels(args.labels, shape, affine, getattr(place, "slice_axis", None))
+            labels = read_labels(args.labels, place)
             names = names_of(args.labels, args.names)[1] or None
     with progress.stage("writing", str(page)):
         explore(
