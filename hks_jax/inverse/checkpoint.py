@@ -29,16 +29,18 @@ class Checkpoint:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and settings."""
+    """Return a hash of arrays and settings; functions count by their names, which are those of the next session too."""
     digest = hashlib.blake2b(digest_size=16)
     for leaf in jax.tree.leaves(parts):
-        digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else repr(leaf).encode())
+        text = getattr(leaf, "__qualname__", repr(leaf)).encode()
+        digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else text)
     return digest.hexdigest()
 
 
 def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> None:
     """Write a checkpoint."""
-    rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], np.float64)
+    columns = np.dtype([(field.name, field.type) for field in dataclasses.fields(Step)])
+    rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], columns)
     content = vars(checkpoint) | {"mark": mark, "history": rows, "losses": np.array(checkpoint.losses)}
     write_npz(path, content, compressed=False)
 
@@ -58,18 +60,9 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
             f"checkpoint: {path} is of another fit (another target, initial field or setting); give another name, "
             "or remove it"
         )
-    history = []
-    for step, loss, misfit, gradient, accepted, seconds, stage, start in data["history"]:
-        history.append(Step(int(step), loss, misfit, gradient, bool(accepted), float(seconds), int(stage), int(start)))
-    return Checkpoint(
-        data["values"],
-        history,
-        int(data["start"]),
-        int(data["stage"]),
-        float(data["step_size"]),
-        data["best"],
-        list(map(float, data["losses"])),
-    )
+    history = [Step(*row) for row in data["history"].tolist()]
+    start, stage, step_size = (data[name].item() for name in ("start", "stage", "step_size"))
+    return Checkpoint(data["values"], history, start, stage, step_size, data["best"], data["losses"].tolist())
 
 
 @dataclasses.dataclass

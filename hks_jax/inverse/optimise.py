@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.compilation import jit_quickly
 from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.problem import Outcome, Problem, residuals_and_outcome
+from hks_jax.inverse.problem import Outcome, Problem
 from hks_jax.inverse.unknowns import Values
 
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -34,7 +34,7 @@ def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
 
     They are scaled by the number of nodes, so that a step's curvature is of order one whatever the grid.
     """
-    data, penalties, outcome = residuals_and_outcome(problem, values)
+    data, penalties, outcome = problem.evaluate(values)
     everything = jnp.sqrt(len(values)) * jnp.concatenate([data, penalties])
     return everything, _Told(values, outcome, jnp.full((), jnp.nan, data.dtype))
 
@@ -91,12 +91,7 @@ def _strongly_typed(state: Any) -> Any:
 
 
 def optimise(
-    problem: Problem,
-    values: Values,
-    optimiser: Optimiser,
-    noise: float | None,
-    max_steps: int,
-    log: Log,
+    problem: Problem, values: Values, optimiser: Optimiser, noise: float | None, max_steps: int, log: Log
 ) -> tuple[Values, Outcome | None, str]:
     """Run until the solver, the noise level or the number of steps says stop.
 

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_number
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.inverse.parametrisation import to_coordinates
-from hks_jax.inverse.unknowns import Unknowns, Values
+from hks_jax.inverse.unknowns import Unknowns, Values, to_coordinates
 
 
 class Regulariser(eqx.Module):

@@ -1,8 +1,12 @@
-"""The unknowns of a fit: arrays of parameters, and the field that they stand for."""
+"""The unknowns of a fit: which metrics it searches among, and by which numbers.
+
+A parametrisation has a few numbers at each node, and gives symmetric positive definite tensors for any numbers.
+"""
 
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,11 +15,166 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from hks_jax.checks import require_real
+from hks_jax.domain import spd
+from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.inverse.parametrisation import Parametrisation
+from hks_jax.linear.dense_eigh import differentiable_eigh
 from hks_jax.static_array import StaticArray
 
 Values = Float[Array, "..."]
+Tensors = Float[Array, "n d d"]
+Parameters = Float[Array, "n c"]
+
+
+def named(argument: str, given: Any, table: Mapping[str, Any], others: str) -> Any:
+    """Return what a name stands for; raise ValueError, with the names and what else may be given, if it is none."""
+    if isinstance(given, str) and given in table:
+        return table[given]
+    raise ValueError(f"{argument}: got {given!r}; expected {', '.join(map(repr, table))}, {others}")
+
+
+def flat_field(grid: Grid, dtype: Any = float) -> TensorField:
+    """Return the flat metric: the identity everywhere."""
+    d = grid.dimension
+    return TensorField(grid, np.broadcast_to(np.eye(d, dtype=dtype), (*grid.shape, d, d)))
+
+
+class Parametrisation(eqx.Module):
+    """Maps c numbers at each node to a tensor, given the tensor of the initial field there.
+
+    Attributes:
+        name: what `fit_metric` calls it.
+        smooth: whether the data determine high frequencies so weakly that steps should be smooth.
+    """
+
+    name: ClassVar[str]
+    smooth: ClassVar[bool] = True
+
+    @abstractmethod
+    def start(self, base: Tensors) -> Parameters:
+        """Return the parameters of the initial tensors."""
+
+    @abstractmethod
+    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
+        """Return the tensors that the parameters stand for."""
+
+
+class LogEuclidean(Parametrisation):
+    """T = exp S: the matrix logarithm, in coordinates in which the Frobenius norm is the Euclidean one."""
+
+    name: ClassVar[str] = "log-euclidean"
+
+    def start(self, base: Tensors) -> Parameters:
+        """Return log T₀."""
+        return to_coordinates(spd.log(base))
+
+    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
+        """Return exp S."""
+        return spd.exp(from_coordinates(parameters, base.shape[-1]))
+
+
+class Cholesky(Parametrisation):
+    """T = LLᵀ, L lower triangular: the logarithms of its diagonal, then what is below it."""
+
+    name: ClassVar[str] = "cholesky"
+
+    def start(self, base: Tensors) -> Parameters:
+        """Return the Cholesky factor of T₀."""
+        factor, d = spd.cholesky(base), base.shape[-1]
+        below = [factor[:, i, j] for i in range(d) for j in range(i)]
+        return jnp.stack([*(jnp.log(factor[:, i, i]) for i in range(d)), *below], axis=-1)
+
+    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
+        """Return LLᵀ."""
+        d = base.shape[-1]
+        rows, columns = np.tril_indices(d, -1)
+        factor = jnp.zeros_like(base).at[:, rows, columns].set(parameters[:, d:])
+        factor = factor.at[:, np.arange(d), np.arange(d)].set(jnp.exp(parameters[:, :d]))
+        return jnp.matmul(factor, jnp.swapaxes(factor, 1, 2), precision="highest")
+
+
+class Conformal(Parametrisation):
+    """T = e^u T₀: one number, angles stay."""
+
+    name: ClassVar[str] = "conformal"
+    smooth: ClassVar[bool] = False
+
+    def start(self, base: Tensors) -> Parameters:
+        """Return u = 0."""
+        return jnp.zeros((len(base), 1), base.dtype)
+
+    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
+        """Return e^u T₀."""
+        return jnp.exp(parameters)[:, :, None] * base
+
+
+class Eigenvalues(Parametrisation):
+    """T = V diag(e^uᵢ λᵢ) Vᵀ: the eigenvectors of T₀ stay."""
+
+    name: ClassVar[str] = "eigenvalues"
+
+    def start(self, base: Tensors) -> Parameters:
+        """Return u = 0."""
+        return jnp.zeros(base.shape[:2], base.dtype)
+
+    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
+        """Return V diag(e^uᵢ λᵢ) Vᵀ."""
+        values, vectors = jax.vmap(partial(differentiable_eigh, None))(base)
+        return jnp.einsum("nia,na,nja->nij", vectors, jnp.exp(parameters) * values, vectors, precision="highest")
+
+
+class Rotation(Parametrisation):
+    """T = R T₀ Rᵀ: the eigenvalues stay. In 2D the angle of R, in 3D its rotation vector, in radians."""
+
+    name: ClassVar[str] = "rotation"
+
+    def start(self, base: Tensors) -> Parameters:
+        """Return the angle 0."""
+        return jnp.zeros((len(base), 1 if base.shape[-1] == 2 else 3), base.dtype)
+
+    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
+        """Return R T₀ Rᵀ."""
+        d = base.shape[-1]
+        vectors = parameters if d == 3 else jnp.pad(parameters, ((0, 0), (2, 0)))  # across the plane
+        rotation = _rotation(vectors)[:, :d, :d]
+        return jnp.einsum("nia,nab,njb->nij", rotation, base, rotation, precision="highest")
+
+
+PARAMETRISATIONS: dict[str, Callable[[], Parametrisation]] = {
+    each.name: each for each in (LogEuclidean, Cholesky, Conformal, Eigenvalues, Rotation)
+}
+
+
+def to_coordinates(symmetric: Tensors) -> Parameters:
+    """Return the diagonal, then √2 times what is below it: the Euclidean norm is the Frobenius norm."""
+    d = symmetric.shape[-1]
+    rows, columns = np.tril_indices(d, -1)
+    diagonal = jnp.diagonal(symmetric, axis1=1, axis2=2)
+    return jnp.concatenate([diagonal, np.sqrt(2) * symmetric[:, rows, columns]], axis=1)
+
+
+def from_coordinates(coordinates: Parameters, d: int) -> Tensors:
+    """Undo `to_coordinates`."""
+    rows, columns = np.tril_indices(d, -1)
+    below = coordinates[:, d:] / np.sqrt(2)
+    matrix = jnp.zeros((len(coordinates), d, d), coordinates.dtype)
+    matrix = matrix.at[:, np.arange(d), np.arange(d)].set(coordinates[:, :d])
+    return matrix.at[:, rows, columns].set(below).at[:, columns, rows].set(below)
+
+
+def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
+    """Return rotations by Rodrigues' formula, in functions of the squared angle that are smooth at zero."""
+    square = jnp.sum(vector**2, axis=1)
+    small = square < 1e-4
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    sinc = jnp.where(small, 1 - square / 6 + square**2 / 120, jnp.sin(angle) / angle)
+    versine = jnp.where(small, 0.5 - square / 24 + square**2 / 720, (1 - jnp.cos(angle)) / angle**2)
+    x, y, z = vector.T
+    o = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack(row, axis=-1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
+    square_of_cross = jnp.matmul(cross, cross, precision="highest")
+    return jnp.eye(3, dtype=vector.dtype) + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
 
 
 class Unknowns(eqx.Module):
@@ -39,7 +198,8 @@ class Nodal(Unknowns):
 
     parametrisation: Parametrisation  # what they mean
     init: TensorField  # the initial field, which stays as it is outside the domain
-    nodes: StaticArray = eqx.field(static=True)  # the flat indices of the domain's nodes
+    # The flat indices of the domain's nodes, made of the domain (*shape).
+    nodes: Any = eqx.field(static=True, converter=lambda domain: StaticArray(np.flatnonzero(domain)))
 
     @property
     def _base(self) -> Float[Array, "n d d"]:
@@ -73,11 +233,21 @@ class Nodal(Unknowns):
 
 
 class Free(Unknowns):
-    """The parameters of a function of the user's."""
+    """Parameters of a function, as the parametrisation of `hks_jax.fit_metric`.
 
-    function: Callable[[Any], Any] = eqx.field(static=True)  # maps them to a field, or to tensors on its grid
-    parameters: Any  # where to start, any pytree of floating point arrays
-    init: TensorField  # the initial field, for its grid and interpolation
+    Attributes:
+        function: maps the parameters to a `TensorField`, or to tensors on the grid of the initial field.
+        parameters: where to start, any pytree of floating point arrays.
+        init: the initial field, for its grid and interpolation; the fit gives it.
+    """
+
+    function: Callable[[Any], Any] = eqx.field(static=True)
+    parameters: Any
+    init: TensorField | None = None
+
+    def __check_init__(self) -> None:
+        """Check the parameters."""
+        require_real("parameters", self.parameters)
 
     def start(self) -> Values:
         """Return the initial parameters, flat."""
@@ -88,9 +258,15 @@ class Free(Unknowns):
         tensors = self.function(ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values))
         if isinstance(tensors, TensorField):
             return tensors
+        assert self.init is not None
         return TensorField(self.init.grid, tensors, self.init.interpolation)
 
 
-def nodes_of(domain: np.ndarray) -> StaticArray:
-    """Return the flat indices of the nodes of a domain."""
-    return StaticArray(np.flatnonzero(domain))
+def unknowns_for(parametrisation: str | Parametrisation | Free, init: TensorField, domain: np.ndarray) -> Unknowns:
+    """Return what varies, for a field that a fit starts from."""
+    if isinstance(parametrisation, Free):
+        return Free(parametrisation.function, parametrisation.parameters, init)
+    if isinstance(parametrisation, Parametrisation):
+        return Nodal(parametrisation, init, domain)
+    others = "a Parametrisation, or Free(function, parameters)"
+    return Nodal(named("parametrisation", parametrisation, PARAMETRISATIONS, others)(), init, domain)

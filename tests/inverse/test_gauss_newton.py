@@ -11,9 +11,8 @@ from fields import random_spd
 import hks_jax as hj
 from hks_jax.inverse.conformal import conformal_information
 from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.parametrisation import PARAMETRISATIONS
 from hks_jax.inverse.search import choose_inner_product
-from hks_jax.inverse.unknowns import Nodal, nodes_of
+from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
 from hks_jax.linear import conjugate_gradients
 
 
@@ -115,7 +114,7 @@ def test_no_step_is_chosen_where_what_was_taken_will_do():
 
 def preconditioner(field, times):
     """Return the unknowns, the inner product and the inverse of the preconditioner as a function of damping."""
-    unknowns = Nodal(PARAMETRISATIONS["conformal"](), field, nodes_of(hj.assemble(field).space.domain))
+    unknowns = Nodal(PARAMETRISATIONS["conformal"](), field, hj.assemble(field).space.domain)
     mass = choose_inner_product(unknowns, 0.0, None)
     information = conformal_information(unknowns, mass, jnp.asarray(times))
     eye = jnp.eye(unknowns.start().size)
