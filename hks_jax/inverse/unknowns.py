@@ -66,12 +66,20 @@ class LogEuclidean(Parametrisation):
     name: ClassVar[str] = "log-euclidean"
 
     def start(self, base: Tensors) -> Parameters:
-        """Return log T₀."""
-        return to_coordinates(spd.log(base))
+        """Return log T₀: its diagonal, then √2 times what is below it."""
+        logarithm, d = spd.log(base), base.shape[-1]
+        rows, columns = np.tril_indices(d, -1)
+        return jnp.concatenate(
+            [jnp.diagonal(logarithm, axis1=1, axis2=2), np.sqrt(2) * logarithm[:, rows, columns]], axis=1
+        )
 
     def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
         """Return exp S."""
-        return spd.exp(from_coordinates(parameters, base.shape[-1]))
+        d = base.shape[-1]
+        rows, columns = np.tril_indices(d, -1)
+        below = parameters[:, d:] / np.sqrt(2)
+        matrix = jnp.zeros_like(base).at[:, np.arange(d), np.arange(d)].set(parameters[:, :d])
+        return spd.exp(matrix.at[:, rows, columns].set(below).at[:, columns, rows].set(below))
 
 
 class Cholesky(Parametrisation):
@@ -144,23 +152,6 @@ class Rotation(Parametrisation):
 PARAMETRISATIONS: dict[str, Callable[[], Parametrisation]] = {
     each.name: each for each in (LogEuclidean, Cholesky, Conformal, Eigenvalues, Rotation)
 }
-
-
-def to_coordinates(symmetric: Tensors) -> Parameters:
-    """Return the diagonal, then √2 times what is below it: the Euclidean norm is the Frobenius norm."""
-    d = symmetric.shape[-1]
-    rows, columns = np.tril_indices(d, -1)
-    diagonal = jnp.diagonal(symmetric, axis1=1, axis2=2)
-    return jnp.concatenate([diagonal, np.sqrt(2) * symmetric[:, rows, columns]], axis=1)
-
-
-def from_coordinates(coordinates: Parameters, d: int) -> Tensors:
-    """Undo `to_coordinates`."""
-    rows, columns = np.tril_indices(d, -1)
-    below = coordinates[:, d:] / np.sqrt(2)
-    matrix = jnp.zeros((len(coordinates), d, d), coordinates.dtype)
-    matrix = matrix.at[:, np.arange(d), np.arange(d)].set(coordinates[:, :d])
-    return matrix.at[:, rows, columns].set(below).at[:, columns, rows].set(below)
 
 
 def _rotation(vector: Float[Array, "n 3"]) -> Tensors:

@@ -41,7 +41,7 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
     rows = fig.subplots(2, 5, width_ratios=(1, 1, 1, 1, 1.25))
     for row, (name, metric) in zip(rows, {"flat metric": flat, "curved metric": bump}.items(), strict=True):
         field = TensorField.from_function(metric, grid)
-        echo(f"figure2: {name}, {n}² nodes, three boundaries")
+        echo(f"{name}, {n}² nodes, three boundaries")
         _row(row, field, name)
     for ax, title in zip(rows[0], TITLES, strict=True):
         ax.set_title(title)

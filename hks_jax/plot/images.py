@@ -98,7 +98,7 @@ def scalar_image(
     if orientation is not None:
         orientation.letter(ax)
     if colorbar:
-        colour_bar(ax, image, label, extend=beyond(array, low, high))
+        colour_bar(ax, image, label)
     return image
 
 
@@ -171,12 +171,6 @@ def panel_titles(
     elif len(titles) != t.size:
         raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
     return t, titles
-
-
-def beyond(values: np.ma.MaskedArray, low: float, high: float) -> str:
-    """Return at which ends of a colour bar values lie beyond it, in matplotlib's words."""
-    ends = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-    return ends[bool(values.min() < low), bool(values.max() > high)]
 
 
 def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
