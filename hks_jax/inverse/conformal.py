@@ -28,31 +28,19 @@ class Preconditioner(eqx.Module):
 
 
 class InnerProduct(Preconditioner):
-    """A symmetric positive definite operator on unknowns."""
+    """A symmetric positive definite operator on unknowns: the identity, unless a subclass says otherwise."""
 
-    @abstractmethod
     def apply(self, values: Values) -> Values:
         """Return its product with the unknowns."""
+        return values
 
-    @abstractmethod
     def solve(self, values: Values) -> Values:
         """Return the product of its inverse with the unknowns."""
+        return values
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
         """Return `solve`: of JᵀJ nothing is known."""
         return self.solve(values)
-
-
-class Euclidean(InnerProduct):
-    """The identity."""
-
-    def apply(self, values: Values) -> Values:
-        """Return the values."""
-        return values
-
-    def solve(self, values: Values) -> Values:
-        """Return the values."""
-        return values
 
 
 class Smoothing(InnerProduct):

@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.inverse.conformal import Euclidean, InnerProduct, Preconditioner
+from hks_jax.inverse.conformal import InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Values
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
@@ -118,7 +118,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         self.rtol = self.atol = jnp.asarray(tolerance)
         self.norm, self.growth, self.damping = optx.rms_norm, jnp.asarray(growth), jnp.asarray(damping)
         self.inner_tolerance, self.inner_steps = jnp.asarray(inner_tolerance), jnp.asarray(inner_steps)
-        self.inner_product = inner_product or Euclidean()
+        self.inner_product = inner_product or InnerProduct()
         self.preconditioner = preconditioner or self.inner_product
 
     def accepted(self, y: Values, state: _State) -> _State:

@@ -11,12 +11,12 @@ import optimistix as optx
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.inverse.checkpoint import Log
-from hks_jax.inverse.conformal import Euclidean, InnerProduct, Preconditioner, conformal_information, smoothing
+from hks_jax.inverse.conformal import InnerProduct, Preconditioner, conformal_information, smoothing
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.optimise import Optimiser, optimise
 from hks_jax.inverse.problem import Outcome, Problem, more_pairs, outcome_of, truncation_shows
 from hks_jax.inverse.signature import SIGNATURES
-from hks_jax.inverse.unknowns import Conformal, Nodal, Unknowns, Values, named
+from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal, Unknowns, Values, named
 
 OPTIMISERS: dict[str, Any] = {"gauss-newton": GaussNewton, "lbfgs": optx.LBFGS, "bfgs": optx.BFGS}
 
@@ -70,7 +70,7 @@ class Search:
 def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: float | None) -> InnerProduct:
     """Return that in which steps are small, of a given smoothness; see `Search` for its default."""
     if not isinstance(unknowns, Nodal):
-        return Euclidean()
+        return InnerProduct()
     grid = unknowns.init.grid
     if smoothness is None:
         extent = max(h * (n - 1) for h, n in zip(grid.spacing, grid.shape, strict=True))
@@ -129,7 +129,7 @@ class Run:
     def _preconditioner(self, problem: Problem) -> Preconditioner:
         """Return what resembles JᵀJ where that is known, else the inner product."""
         unknowns, observation = problem.unknowns, problem.observation
-        if isinstance(unknowns, Nodal) and isinstance(unknowns.parametrisation, Conformal):
+        if isinstance(unknowns, Nodal) and unknowns.parametrisation == PARAMETRISATIONS["conformal"]:
             rough = getattr(self.inner_product, "factor", None) is None
             if rough and observation.signature == SIGNATURES["hks"] and not problem.regularisers:
                 times = jnp.asarray(np.unique(observation.observed_times))

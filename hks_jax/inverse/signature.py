@@ -65,7 +65,7 @@ class Signature(eqx.Module):
         return wanted
 
 
-def wave_kernel(sigma: float) -> Signature:
+def wave_kernel(sigma: float | Float[Array, ""]) -> Signature:
     """Return the wave kernel signature, a `Signature` for `Data`.
 
     Args:

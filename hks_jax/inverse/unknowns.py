@@ -1,12 +1,9 @@
-"""The unknowns of a fit: which metrics it searches among, and by which numbers.
-
-A parametrisation has a few numbers at each node, and gives symmetric positive definite tensors for any numbers.
-"""
+"""The unknowns of a fit: which metrics it searches among, and by which numbers."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -41,117 +38,66 @@ def flat_field(grid: Grid, dtype: Any = float) -> TensorField:
 
 
 class Parametrisation(eqx.Module):
-    """Maps c numbers at each node to a tensor, given the tensor of the initial field there.
+    """A few numbers at each node that stand for a tensor, given the tensor of the initial field there.
 
     Attributes:
-        name: what `fit_metric` calls it.
+        start: maps the initial tensors (n, d, d) to their parameters (n, c).
+        tensors: maps parameters (n, c) and the initial tensors to those that the parameters stand for; they must be
+            symmetric positive definite for any parameters.
         smooth: whether the data determine high frequencies so weakly that steps should be smooth.
     """
 
-    name: ClassVar[str]
-    smooth: ClassVar[bool] = True
-
-    @abstractmethod
-    def start(self, base: Tensors) -> Parameters:
-        """Return the parameters of the initial tensors."""
-
-    @abstractmethod
-    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
-        """Return the tensors that the parameters stand for."""
+    start: Callable[[Tensors], Parameters] = eqx.field(static=True)
+    tensors: Callable[[Parameters, Tensors], Tensors] = eqx.field(static=True)
+    smooth: bool = eqx.field(static=True, default=True)
 
 
-class LogEuclidean(Parametrisation):
-    """T = exp S: the matrix logarithm, in coordinates in which the Frobenius norm is the Euclidean one."""
-
-    name: ClassVar[str] = "log-euclidean"
-
-    def start(self, base: Tensors) -> Parameters:
-        """Return log T₀: its diagonal, then √2 times what is below it."""
-        logarithm, d = spd.log(base), base.shape[-1]
-        rows, columns = np.tril_indices(d, -1)
-        return jnp.concatenate(
-            [jnp.diagonal(logarithm, axis1=1, axis2=2), np.sqrt(2) * logarithm[:, rows, columns]], axis=1
-        )
-
-    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
-        """Return exp S."""
-        d = base.shape[-1]
-        rows, columns = np.tril_indices(d, -1)
-        below = parameters[:, d:] / np.sqrt(2)
-        matrix = jnp.zeros_like(base).at[:, np.arange(d), np.arange(d)].set(parameters[:, :d])
-        return spd.exp(matrix.at[:, rows, columns].set(below).at[:, columns, rows].set(below))
+def _logarithm(base: Tensors) -> Parameters:
+    """Return the diagonal of log T, then √2 times what is below it: their Euclidean norm is the Frobenius norm."""
+    logarithm = spd.log(base)
+    rows, columns = np.tril_indices(base.shape[-1], -1)
+    diagonal = jnp.diagonal(logarithm, axis1=1, axis2=2)
+    return jnp.concatenate([diagonal, np.sqrt(2) * logarithm[:, rows, columns]], axis=1)
 
 
-class Cholesky(Parametrisation):
-    """T = LLᵀ, L lower triangular: the logarithms of its diagonal, then what is below it."""
-
-    name: ClassVar[str] = "cholesky"
-
-    def start(self, base: Tensors) -> Parameters:
-        """Return the Cholesky factor of T₀."""
-        factor, d = spd.cholesky(base), base.shape[-1]
-        below = [factor[:, i, j] for i in range(d) for j in range(i)]
-        return jnp.stack([*(jnp.log(factor[:, i, i]) for i in range(d)), *below], axis=-1)
-
-    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
-        """Return LLᵀ."""
-        d = base.shape[-1]
-        rows, columns = np.tril_indices(d, -1)
-        factor = jnp.zeros_like(base).at[:, rows, columns].set(parameters[:, d:])
-        factor = factor.at[:, np.arange(d), np.arange(d)].set(jnp.exp(parameters[:, :d]))
-        return jnp.matmul(factor, jnp.swapaxes(factor, 1, 2), precision="highest")
+def _exponential(parameters: Parameters, base: Tensors) -> Tensors:
+    d = base.shape[-1]
+    rows, columns = np.tril_indices(d, -1)
+    below = parameters[:, d:] / np.sqrt(2)
+    matrix = jnp.zeros_like(base).at[:, np.arange(d), np.arange(d)].set(parameters[:, :d])
+    return spd.exp(matrix.at[:, rows, columns].set(below).at[:, columns, rows].set(below))
 
 
-class Conformal(Parametrisation):
-    """T = e^u T₀: one number, angles stay."""
-
-    name: ClassVar[str] = "conformal"
-    smooth: ClassVar[bool] = False
-
-    def start(self, base: Tensors) -> Parameters:
-        """Return u = 0."""
-        return jnp.zeros((len(base), 1), base.dtype)
-
-    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
-        """Return e^u T₀."""
-        return jnp.exp(parameters)[:, :, None] * base
+def _cholesky(base: Tensors) -> Parameters:
+    """Return the logarithms of the diagonal of L, T = LLᵀ, then what is below it."""
+    factor, d = spd.cholesky(base), base.shape[-1]
+    rows, columns = np.tril_indices(d, -1)
+    diagonal = jnp.diagonal(factor, axis1=1, axis2=2)
+    return jnp.concatenate([jnp.log(diagonal), factor[:, rows, columns]], axis=1)
 
 
-class Eigenvalues(Parametrisation):
-    """T = V diag(e^uᵢ λᵢ) Vᵀ: the eigenvectors of T₀ stay."""
-
-    name: ClassVar[str] = "eigenvalues"
-
-    def start(self, base: Tensors) -> Parameters:
-        """Return u = 0."""
-        return jnp.zeros(base.shape[:2], base.dtype)
-
-    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
-        """Return V diag(e^uᵢ λᵢ) Vᵀ."""
-        values, vectors = jax.vmap(partial(differentiable_eigh, None))(base)
-        return jnp.einsum("nia,na,nja->nij", vectors, jnp.exp(parameters) * values, vectors, precision="highest")
+def _from_cholesky(parameters: Parameters, base: Tensors) -> Tensors:
+    d = base.shape[-1]
+    rows, columns = np.tril_indices(d, -1)
+    factor = jnp.zeros_like(base).at[:, rows, columns].set(parameters[:, d:])
+    factor = factor.at[:, np.arange(d), np.arange(d)].set(jnp.exp(parameters[:, :d]))
+    return jnp.matmul(factor, jnp.swapaxes(factor, 1, 2), precision="highest")
 
 
-class Rotation(Parametrisation):
-    """T = R T₀ Rᵀ: the eigenvalues stay. In 2D the angle of R, in 3D its rotation vector, in radians."""
-
-    name: ClassVar[str] = "rotation"
-
-    def start(self, base: Tensors) -> Parameters:
-        """Return the angle 0."""
-        return jnp.zeros((len(base), 1 if base.shape[-1] == 2 else 3), base.dtype)
-
-    def tensors(self, parameters: Parameters, base: Tensors) -> Tensors:
-        """Return R T₀ Rᵀ."""
-        d = base.shape[-1]
-        vectors = parameters if d == 3 else jnp.pad(parameters, ((0, 0), (2, 0)))  # across the plane
-        rotation = _rotation(vectors)[:, :d, :d]
-        return jnp.einsum("nia,nab,njb->nij", rotation, base, rotation, precision="highest")
+def _scaled(parameters: Parameters, base: Tensors) -> Tensors:
+    return jnp.exp(parameters)[:, :, None] * base
 
 
-PARAMETRISATIONS: dict[str, Callable[[], Parametrisation]] = {
-    each.name: each for each in (LogEuclidean, Cholesky, Conformal, Eigenvalues, Rotation)
-}
+def _stretched(parameters: Parameters, base: Tensors) -> Tensors:
+    values, vectors = jax.vmap(partial(differentiable_eigh, None))(base)
+    return jnp.einsum("nia,na,nja->nij", vectors, jnp.exp(parameters) * values, vectors, precision="highest")
+
+
+def _turned(parameters: Parameters, base: Tensors) -> Tensors:
+    d = base.shape[-1]
+    vectors = parameters if d == 3 else jnp.pad(parameters, ((0, 0), (2, 0)))  # across the plane
+    rotation = _rotation(vectors)[:, :d, :d]
+    return jnp.einsum("nia,nab,njb->nij", rotation, base, rotation, precision="highest")
 
 
 def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
@@ -166,6 +112,21 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
     cross = jnp.stack([jnp.stack(row, axis=-1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
     square_of_cross = jnp.matmul(cross, cross, precision="highest")
     return jnp.eye(3, dtype=vector.dtype) + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
+
+
+def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
+    """Return a function to parameters that are zero for the initial tensors, so many for d dimensions."""
+    return lambda base: jnp.zeros((len(base), count(base.shape[-1])), base.dtype)
+
+
+PARAMETRISATIONS = {
+    # T = exp S, T = LLᵀ, T = e^u T₀, T = V diag(e^uᵢ λᵢ) Vᵀ with the eigenvectors of T₀, and T = R T₀ Rᵀ.
+    "log-euclidean": Parametrisation(_logarithm, _exponential),
+    "cholesky": Parametrisation(_cholesky, _from_cholesky),
+    "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),
+    "eigenvalues": Parametrisation(_zeros(lambda d: d), _stretched),
+    "rotation": Parametrisation(_zeros(lambda d: 1 if d == 2 else 3), _turned),  # an angle, or a rotation vector
+}
 
 
 class Unknowns(eqx.Module):
@@ -260,4 +221,4 @@ def unknowns_for(parametrisation: str | Parametrisation | Free, init: TensorFiel
     if isinstance(parametrisation, Parametrisation):
         return Nodal(parametrisation, init, domain)
     others = "a Parametrisation, or Free(function, parameters)"
-    return Nodal(named("parametrisation", parametrisation, PARAMETRISATIONS, others)(), init, domain)
+    return Nodal(named("parametrisation", parametrisation, PARAMETRISATIONS, others), init, domain)

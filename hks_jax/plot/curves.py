@@ -19,6 +19,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.weyl import weyl_count
 from hks_jax.plot.figure import SMALL, number_text
+from hks_jax.plot.panels import checked_times
 
 
 def hks_curves(
@@ -56,13 +57,9 @@ def hks_curves(
     Raises:
         ValueError: shapes that do not agree, or a point whose nearest node is outside the mask.
     """
-    t = np.asarray(times, dtype=np.float64)
+    t = checked_times(times, grid, values=values, expansion=expansion)
     curves = np.asarray(values, dtype=np.float64)
-    if curves.shape != (t.size, *grid.shape):
-        raise ValueError(f"values: got shape {curves.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}")
     series = None if expansion is None else np.asarray(expansion, dtype=np.float64)
-    if series is not None and series.shape != curves.shape:
-        raise ValueError(f"expansion: got shape {series.shape}; expected that of values, {curves.shape}")
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)
     if labels is None:
         labels = ["(" + ", ".join(f"{c:.3g}" for c in grid.nodes[node]) + ")" for node in nodes]

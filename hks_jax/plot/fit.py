@@ -15,6 +15,7 @@ from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_
 from hks_jax.plot.glyphs import ellipses
 from hks_jax.plot.images import scalar_image
 from hks_jax.plot.orientation import Orientation
+from hks_jax.plot.panels import checked_times
 
 if TYPE_CHECKING:  # slow to import
     from hks_jax.inverse.metric_fit import MetricFit, Step
@@ -57,13 +58,8 @@ def fit_panels(
         raise ValueError("times: got None, and the fit has none; expected one number per image of the target")
     if max_times < 1:
         raise ValueError(f"max_times: got {max_times}; expected at least 1")
-    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
-    for name, array in (("target", wanted), ("fit.hks", fitted)):
-        if array.shape != (t.size, *grid.shape):
-            raise ValueError(
-                f"{name}: got shape {array.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}"
-            )
+    t = checked_times(times, grid, **{"target": wanted, "fit.hks": fitted})
     field = fit.field
     if orientation is not None:
         wanted, fitted, grid = orientation.array(wanted), orientation.array(fitted), orientation.grid(grid)

@@ -15,8 +15,9 @@ from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
-from hks_jax.plot.images import colours_of, masked, panel_titles, scalar_image, shared_colours
+from hks_jax.plot.images import colours_of, masked, scalar_image, shared_colours
 from hks_jax.plot.orientation import Orientation
+from hks_jax.plot.panels import checked_times, panel_titles
 
 AXES = "xyz"
 PLANES = ((0, 1), (0, 2), (1, 2))
@@ -70,7 +71,7 @@ def orthogonal_slices(
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
     require_volume(grid)
     array, grid, node = _turned(masked("values", values, grid), grid, node, orientation)
-    kwargs = shared_colours(array.compressed(), kwargs)
+    kwargs = shared_colours([array], kwargs)
     return _slices(axes, array, grid, node, orientation, cross=cross, **kwargs)
 
 
@@ -142,7 +143,8 @@ def volume_panels(
         ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
     """
     require_volume(grid)
-    t, titles = panel_titles(values, times, grid, titles, unit)
+    t = checked_times(times, grid, values=values)
+    titles = panel_titles(t, titles, unit)
     volumes = [masked("values", each, grid) for each in np.asarray(values)]
     noise = [None] * t.size if z is None else [masked("z", each, grid) for each in np.asarray(z)]
     if limits is None:

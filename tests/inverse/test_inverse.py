@@ -48,7 +48,7 @@ def signature(field, k=K, times=TIMES):
 def problem_of(target, times, init, k, weights=None):
     """The problem of a fit of conformal factors, without the fit."""
     space = hj.assemble(init).space
-    unknowns = Nodal(PARAMETRISATIONS["conformal"](), init, space.domain)
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], init, space.domain)
     observation, _ = observe(target, times, Data(weights=weights), space, np.float64)
     return Problem(unknowns, observation, (), k, "neumann", "dense")
 
@@ -74,7 +74,7 @@ def test_exponential_and_logarithm_are_smooth_at_multiple_eigenvalues(rng, d):
 @pytest.mark.parametrize("d", [2, 3])
 def test_parametrisations_start_at_the_initial_field_and_stay_positive_definite(rng, name, d):
     base = jnp.asarray(random_spd(rng, (3,) * d).reshape(-1, d, d))
-    parametrisation = PARAMETRISATIONS[name]()
+    parametrisation = PARAMETRISATIONS[name]
     start = parametrisation.start(base)
     np.testing.assert_allclose(parametrisation.tensors(start, base), base, rtol=1e-12, atol=1e-12)
     moved = parametrisation.tensors(start + jnp.asarray(rng.standard_normal(start.shape)), base)
@@ -312,7 +312,7 @@ def test_penalties_are_means_over_the_domain():
     grid = hj.Grid((40, 60), (1 / 39, 2 / 59))
     x, y = grid.nodes[..., 0], grid.nodes[..., 1]
     flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (40, 60, 2, 2)))
-    unknowns = Nodal(PARAMETRISATIONS["conformal"](), flat, grid.inside)
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], flat, grid.inside)
     values = jnp.asarray((3 * x + 2 * y).reshape(-1, 1))
     field = unknowns.field(values)
 

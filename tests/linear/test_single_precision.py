@@ -24,7 +24,7 @@ def residuals_with(tolerance, boundary="neumann", signature="hks"):
     target = pairs.eigenvalues if signature == "eigenvalues" else 2 * hj.hks(pairs, TIMES)
     target = np.where(np.isfinite(target) & (target > 0), target, 1.0)
     observed, _ = observe(target, TIMES, Data(signature, "log" if signature == "hks" else "absolute"), space, float)
-    unknowns = Nodal(PARAMETRISATIONS["log-euclidean"](), FIELD, space.domain)
+    unknowns = Nodal(PARAMETRISATIONS["log-euclidean"], FIELD, space.domain)
     solver = hj.BlockLanczos(adjoint=FactorisedAdjoint(tolerance))
     problem = Problem(unknowns, observed, (), K, boundary, solver)
     return lambda values: problem.residuals(values)[0], unknowns.start(), problem
