@@ -1,17 +1,14 @@
-"""Checkpoints of a fit, which appear whole or not at all, and the log of its steps."""
+"""Checkpoints of a fit, which appear whole or not at all."""
 
 import dataclasses
 import hashlib
 import os
-import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
 from hks_jax.inverse.metric_fit import Step
-from hks_jax.inverse.unknowns import Values
 from hks_jax.npz import load_npz, write_npz
 
 
@@ -63,26 +60,3 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
     history = [Step(*row) for row in data["history"].tolist()]
     start, stage, step_size = (data[name].item() for name in ("start", "stage", "step_size"))
     return Checkpoint(data["values"], history, start, stage, step_size, data["best"], data["losses"].tolist())
-
-
-@dataclasses.dataclass
-class Log:
-    """Called after each step of a fit, it tells and saves it."""
-
-    now: Checkpoint  # where the fit stands
-    progress: Callable[[Step], None] | None  # called with each step
-    path: str | os.PathLike[str] | None  # of the checkpoint
-    mark: str  # of what fit it is
-    clock: float  # when the fit began, by `time.perf_counter`
-
-    def __call__(
-        self, number: int, told: tuple[float, float, float], accepted: bool, values: Values, step_size: float
-    ) -> None:
-        """Take up a step by its number within the stage: loss, misfit and gradient, and whether it was taken."""
-        now, seconds = self.now, time.perf_counter() - self.clock
-        now.values, now.step_size = values, step_size
-        now.history.append(Step(number, *told, accepted, seconds, now.stage, now.start))
-        if self.progress is not None:
-            self.progress(now.history[-1])
-        if self.path is not None:
-            save(self.path, self.mark, now)

@@ -101,7 +101,7 @@ def fit_metric(
     if checkpoint is not None and Path(checkpoint).exists():
         now = files.load(checkpoint, mark)
         clock -= now.history[-1].seconds
-    run = Run(search, first, noise, inner_product, files.Log(now, progress, checkpoint, mark, clock))
+    run = Run(search, first, noise, inner_product, now, progress, checkpoint, mark, clock)
     renewed = partial(problem_of, observed) if k is None else None
     reached, problem = run.with_enough_pairs(run.from_starts(problems), problems[-1], renewed)
     values, outcome, result = reached

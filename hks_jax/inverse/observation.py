@@ -161,7 +161,10 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
     used = weights > 0
     if not used.any():
         raise ValueError("weights: all are zero inside the domain; expected some observed entries")
-    _check_values(values, used, positive=data.loss in ("log", "relative"))
+    remedy = "Give them the weight 0, take their nodes out of the mask, or correct them"
+    _refuse("target", values, used & ~np.isfinite(values), used, "NaN or infinite", remedy)
+    if data.loss in ("log", "relative"):
+        _refuse("target", values, used & (values <= 0), used, "not positive", remedy)
     entries = np.flatnonzero(used)
     share = weights.ravel()[entries]
     observation = Observation(
@@ -185,12 +188,8 @@ def _weights(values: np.ndarray, data: Data) -> tuple[np.ndarray, float | None]:
         return given, data.noise
     size = _broadcast("deviation", data.deviation, values.shape)
     used = (given > 0) & np.isfinite(values)
-    if (bad := used & ~(np.isfinite(size) & (size > 0))).any():
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"deviation: {int(bad.sum())} of {int(used.sum())} are not positive numbers (the first at {first}: "
-            f"{size[first]:.4g}); expected one for every observed value. Give others the weight 0"
-        )
+    remedy = "Expected one for every observed value; give others the weight 0"
+    _refuse("deviation", size, used & ~(np.isfinite(size) & (size > 0)), used, "not positive numbers", remedy)
     of_residuals = np.where(used, size if data.loss == "absolute" else size / np.abs(values), 1.0)
     weighed = np.where(used, given / of_residuals**2, 0.0)
     stated = float(np.sqrt(np.sum(given, where=used) / np.sum(weighed)))
@@ -207,12 +206,11 @@ def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
         ) from None
 
 
-def _check_values(values: np.ndarray, used: np.ndarray, positive: bool) -> None:
-    finite = np.isfinite(values)
-    for bad, what in ((used & ~finite, "NaN or infinite"), (used & finite & (values <= 0), "not positive")):
-        if bad.any() and (positive or what != "not positive"):
-            first = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise ValueError(
-                f"target: {int(bad.sum())} of {int(used.sum())} observed values are {what} (the first at {first}: "
-                f"{values[first]:.4g}). Give them the weight 0, take their nodes out of the mask, or correct them"
-            )
+def _refuse(name: str, values: np.ndarray, bad: np.ndarray, used: np.ndarray, what: str, remedy: str) -> None:
+    """Raise ValueError if some of the observed values are bad."""
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name}: {int(bad.sum())} of {int(used.sum())} observed values are {what} (the first at {first}: "
+            f"{values[first]:.4g}). {remedy}"
+        )

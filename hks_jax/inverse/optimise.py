@@ -1,7 +1,7 @@
 """The loop: steps of an optimistix solver, each compiled, with what lies between them in Python."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +11,6 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.problem import Outcome, Problem
 from hks_jax.inverse.unknowns import Values
@@ -90,14 +89,23 @@ def _strongly_typed(state: Any) -> Any:
     return jax.tree.map(lambda x: x.astype(x.dtype) if eqx.is_array(x) else x, state)
 
 
-def optimise(
-    problem: Problem, values: Values, optimiser: Optimiser, noise: float | None, max_steps: int, log: Log
-) -> tuple[Values, Outcome | None, str]:
-    """Run until the solver, the noise level or the number of steps says stop.
+class Reached(NamedTuple):
+    """Where a search has come to."""
 
-    Returns the best unknowns seen, their outcome (None where none was computed), and one of the keys of
-    `metric_fit.RESULTS`.
-    """
+    values: Values  # the unknowns
+    outcome: Outcome | None  # what a fit has come to with them; None where it is not known
+    result: str  # one of the keys of `metric_fit.RESULTS`
+
+    @property
+    def stopped(self) -> bool:
+        """Whether there is nothing to go on with."""
+        return self.result in ("interrupted", "not finite")
+
+
+def optimise(
+    problem: Problem, values: Values, optimiser: Optimiser, noise: float | None, max_steps: int, log: Callable
+) -> Reached:
+    """Run until the solver, the noise level or the number of steps says stop; return the best unknowns seen."""
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
     best, least, seen = values, np.inf, None
     outcome: Outcome | None = None
@@ -117,17 +125,17 @@ def optimise(
                 seen, loss, misfit = told.values, float(told.outcome.loss), float(told.outcome.misfit)
                 gradient = float(told.gradient) / np.sqrt(len(values))
                 if not np.isfinite(loss):
-                    return best, outcome, "not finite"
+                    return Reached(best, outcome, "not finite")
                 if loss <= least:
                     best, least, outcome = seen, loss, told.outcome
                 log(number, (loss, misfit, gradient), new, seen, float(size))
                 number += 1
                 if misfit <= explained:
-                    return best, outcome, "noise level reached"
+                    return Reached(best, outcome, "noise level reached")
             if end:
-                return best, outcome, end
+                return Reached(best, outcome, end)
             if not bool(fine):
-                return best, outcome, "not finite"
+                return Reached(best, outcome, "not finite")
             if bool(done):
                 end = "converged"
             elif rejected >= _REJECTIONS:
@@ -135,7 +143,7 @@ def optimise(
             elif count == max_steps:
                 end = "steps exhausted"
             if end and not bool(jnp.any(values != seen)):
-                return best, outcome, end
+                return Reached(best, outcome, end)
     except KeyboardInterrupt:
-        return best, outcome, "interrupted"
-    return best, outcome, end
+        return Reached(best, outcome, "interrupted")
+    return Reached(best, outcome, end)

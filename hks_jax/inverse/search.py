@@ -1,8 +1,10 @@
 """The search for unknowns: its methods and starts, stage by stage, with more eigenpairs where they are too few."""
 
 import dataclasses
+import os
+import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +12,12 @@ import numpy as np
 import optimistix as optx
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.inverse.checkpoint import Log
+from hks_jax.inverse.checkpoint import Checkpoint, save
 from hks_jax.inverse.conformal import InnerProduct, Preconditioner, conformal_information, smoothing
 from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.optimise import Optimiser, optimise
-from hks_jax.inverse.problem import Outcome, Problem, more_pairs, outcome_of, truncation_shows
+from hks_jax.inverse.metric_fit import Step
+from hks_jax.inverse.optimise import Optimiser, Reached, optimise
+from hks_jax.inverse.problem import Problem, more_pairs, outcome_of, truncation_shows
 from hks_jax.inverse.signature import SIGNATURES
 from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal, Unknowns, Values, named
 
@@ -82,19 +85,6 @@ _EARLY = 100.0
 """How many tolerances will do in the stages before the last, which need no last digits."""
 
 
-class Reached(NamedTuple):
-    """Where a search has come to."""
-
-    values: Values  # the unknowns
-    outcome: Outcome | None  # what a fit has come to with them; None where it is not known
-    result: str  # one of the keys of `metric_fit.RESULTS`
-
-    @property
-    def stopped(self) -> bool:
-        """Whether there is nothing to go on with."""
-        return self.result in ("interrupted", "not finite")
-
-
 @dataclasses.dataclass(frozen=True)
 class Run:
     """One search, from the unknowns `first` on."""
@@ -103,13 +93,29 @@ class Run:
     first: Values  # the unknowns of the initial field
     noise: float | None  # the standard deviation of the residuals that noise explains
     inner_product: InnerProduct  # in which steps are small
-    log: Log  # what happens is told to it
+    now: Checkpoint  # where the fit stands
+    progress: Callable[[Step], None] | None  # called with each step
+    path: str | os.PathLike[str] | None  # of the checkpoint
+    mark: str  # of what fit it is
+    clock: float  # when the fit began, by `time.perf_counter`
+
+    def told(
+        self, number: int, told: tuple[float, float, float], accepted: bool, values: Values, step_size: float
+    ) -> None:
+        """Take up a step by its number within the stage: loss, misfit and gradient, and whether it was taken."""
+        now, seconds = self.now, time.perf_counter() - self.clock
+        now.values, now.step_size = values, step_size
+        now.history.append(Step(number, *told, accepted, seconds, now.stage, now.start))
+        if self.progress is not None:
+            self.progress(now.history[-1])
+        if self.path is not None:
+            save(self.path, self.mark, now)
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
         """Solve one problem from given unknowns; the tolerances are multiplied by a factor."""
         method = self._optimiser(problem, tolerances * self.search.tolerance, step_size)
         with jax.debug_nans(False):  # what nobody computed is told as NaN
-            return Reached(*optimise(problem, values, method, self.noise, self.search.max_steps, self.log))
+            return optimise(problem, values, method, self.noise, self.search.max_steps, self.told)
 
     def _optimiser(self, problem: Problem, tolerance: float, step_size: float) -> Optimiser:
         """Return the solver; a step size below 1 begins with as much more damping."""
@@ -139,7 +145,7 @@ class Run:
     def through_stages(self, problems: Sequence[Problem], values: Values, first: int, step_size: float) -> Reached:
         """Solve the problems from the first on, one after another; the outcome is that of the last of them."""
         reached, last = Reached(values, None, "interrupted"), len(problems) - 1
-        now = self.log.now
+        now = self.now
         for now.stage in range(first, len(problems)):
             tolerances = 1.0 if now.stage == last else _EARLY
             reached = self.solve(problems[now.stage], reached.values, tolerances, step_size)
@@ -152,7 +158,7 @@ class Run:
 
     def from_starts(self, problems: Sequence[Problem]) -> Reached:
         """Return the best of several starts: where the log stands, then at random changes of the first unknowns."""
-        now, start = self.log.now, self.log.now.start
+        now, start = self.now, self.now.start
         where = jnp.asarray(now.values), now.stage, now.step_size
         if now.stage == len(problems):  # with more eigenpairs; no start is open any more
             return Reached(where[0], None, "converged")

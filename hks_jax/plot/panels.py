@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Real
+from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
@@ -60,16 +61,20 @@ def hks_panels(
     rows, columns = _layout(t.size)
     width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
     fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
-    panels = fig.subplots(rows, columns, squeeze=False)
-    for index, ax in enumerate(panels.flat):
-        if index >= t.size:
-            ax.remove()
-            continue
-        faded = None if z is None else np.asarray(z)[index]
-        scalar_image(ax, images[index], grid, orientation=orientation, z=faded, **kwargs)
+    noise = [None] * t.size if z is None else np.asarray(z)
+    for index, ax in enumerate(axes_in_rows(fig, t.size, columns)):
+        scalar_image(ax, images[index], grid, orientation=orientation, z=noise[index], **kwargs)
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
     return finished(fig, suptitle, path)
+
+
+def axes_in_rows(figure: Figure, count: int, columns: int) -> list[Axes]:
+    """Return so many axes of a figure, in rows that are full but for the last."""
+    panels = figure.subplots(math.ceil(count / columns), columns, squeeze=False).ravel().tolist()
+    for ax in panels[count:]:
+        ax.remove()
+    return panels[:count]
 
 
 def time_rows(

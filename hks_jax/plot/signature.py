@@ -16,7 +16,7 @@ from hks_jax.io.result import Result
 from hks_jax.plot.figure import finished, new_figure
 from hks_jax.plot.images import Colours, colours_of, scalar_image
 from hks_jax.plot.orientation import Orientation, View
-from hks_jax.plot.panels import panel_titles
+from hks_jax.plot.panels import axes_in_rows, panel_titles
 from hks_jax.plot.volumes import volume_panels
 
 SPAN = (0.002, 0.998)
@@ -94,14 +94,12 @@ def signature_panels(
     rows = math.ceil(len(panels) / 4)
     columns = math.ceil(len(panels) / rows)
     figure = new_figure(columns * 3.3, rows * (2.4 * proportion(grid, orientation) + 0.4) + 0.4 * bool(title))
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, (text, image, (low, high, cmap), noise) in zip(axes, panels, strict=False):
+    axes = axes_in_rows(figure, len(panels), columns)
+    for ax, (text, image, (low, high, cmap), noise) in zip(axes, panels, strict=True):
         image = np.where(inside, image, np.nan)
         scalar_image(ax, image, grid, cmap=cmap, vmin=low, vmax=high, orientation=orientation, z=noise)
         ax.set_title(text, fontsize="medium")
         ax.set_axis_off()
-    for ax in axes[len(panels) :]:
-        ax.remove()
     return finished(figure, title, path)
 
 
