@@ -15,6 +15,9 @@ from hks_jax.inverse.conformal import InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Values
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
+_Options = dict[str, Any]
+_Tags = frozenset[object]
+
 _TIGHTER, _LONGER = 30, 3
 """By what the linear systems are solved more exactly in steps that may be the last."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
@@ -168,14 +171,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         return -x, eqx.tree_at(lambda s: (s.gradient, s.promised), state, (gradient, promised))
 
     def init(
-        self,
-        fn: Callable,
-        y: Values,
-        args: Any,
-        options: dict[str, Any],
-        f_struct: Any,
-        aux_struct: Any,
-        tags: frozenset[object],
+        self, fn: Callable, y: Values, args: Any, options: _Options, f_struct: Any, aux_struct: Any, tags: _Tags
     ) -> _Progress:
         """Return the state before the first step, in which ``y`` is looked at."""
         structure, _ = eqx.filter_eval_shape(_linearise, fn, y, args)
@@ -183,7 +179,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         return _Progress(yes, y, one, _empty(structure), _empty(aux_struct), begun(y), yes)
 
     def step(
-        self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
+        self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Values, _Progress, Any]:
         """Look at the trial, take it or not, and choose the next; return the unknowns and what is told of them.
 
@@ -211,7 +207,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         return values, _Progress(no, values + step, step_size, linearised, aux, descent, finite), aux
 
     def terminate(
-        self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
+        self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Tell whether the unknowns have converged."""
         successful, not_finite = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
@@ -223,10 +219,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         y: Values,
         aux: Any,
         args: Any,
-        options: dict[str, Any],
+        options: _Options,
         state: _Progress,
-        tags: frozenset[object],
-        result: optx.RESULTS,
+        tags: _Tags,
+        result: Any,
     ) -> tuple[Values, Any, dict[str, Any]]:
         """Return the unknowns and what is told of them as they are."""
         return y, aux, {}

@@ -11,12 +11,7 @@ from matplotlib.colors import Colormap
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import (
-    cell_extent,
-    colour_bar,
-    frame,
-    require_plane,
-)
+from hks_jax.plot.figure import cell_extent, colour_bar, frame, require_plane
 from hks_jax.plot.orientation import Orientation
 
 FADED = 2.0
