@@ -107,8 +107,7 @@ def optimise(
 ) -> Reached:
     """Run until the solver, the noise level or the number of steps says stop; return the best unknowns seen."""
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
-    best, least, seen = values, np.inf, None
-    outcome: Outcome | None = None
+    best, least, seen = Reached(values, None, ""), np.inf, None
     rejected, number, end = 0, 0, ""
     explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # as rounded in `_advance`
     try:
@@ -125,25 +124,25 @@ def optimise(
                 seen, loss, misfit = told.values, float(told.outcome.loss), float(told.outcome.misfit)
                 gradient = float(told.gradient) / np.sqrt(len(values))
                 if not np.isfinite(loss):
-                    return Reached(best, outcome, "not finite")
+                    return best._replace(result="not finite")
                 if loss <= least:
-                    best, least, outcome = seen, loss, told.outcome
+                    best, least = Reached(seen, told.outcome, ""), loss
                 log(number, (loss, misfit, gradient), new, seen, float(size))
                 number += 1
                 if misfit <= explained:
-                    return Reached(best, outcome, "noise level reached")
+                    end = "noise level reached"
             if end:
-                return Reached(best, outcome, end)
+                break
             if not bool(fine):
-                return Reached(best, outcome, "not finite")
-            if bool(done):
+                end = "not finite"
+            elif bool(done):
                 end = "converged"
             elif rejected >= _REJECTIONS:
                 end = "stalled"
             elif count == max_steps:
                 end = "steps exhausted"
-            if end and not bool(jnp.any(values != seen)):
-                return Reached(best, outcome, end)
+            if end == "not finite" or (end and not bool(jnp.any(values != seen))):
+                break
     except KeyboardInterrupt:
-        return Reached(best, outcome, "interrupted")
-    return Reached(best, outcome, end)
+        end = "interrupted"
+    return best._replace(result=end)
