@@ -117,8 +117,8 @@ def influence_map(
     Raises:
         ValueError: a 3D grid, or values that are not of its shape.
     """
-    image = scalar_image(ax, influence, grid, cmap=cmap, vmin=0.0, vmax=1.0, label=label, **kwargs)
-    values = np.ma.masked_invalid(np.where(grid.inside, np.asarray(influence, dtype=np.float64), np.nan))
+    values = masked("influence", influence, grid)
+    image = scalar_image(ax, values, grid, cmap=cmap, vmin=0.0, vmax=1.0, label=label, **kwargs)
     reached = [level for level in levels if values.min() < level < values.max()]
     if reached:
         lines = ax.contour(*grid.axes, values.T, levels=reached, colors="white", linewidths=1.0)
