@@ -22,8 +22,7 @@ from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.stats import names_of
-from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io.masks import read_labels
 from hks_jax.io.result import Result, signature_file
 from hks_jax.io.volume import TensorVolume

@@ -14,9 +14,7 @@ from scipy.spatial import cKDTree
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.atomic import atomic_path
 from hks_jax.domain.simplices import WORDS, signed_measure
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.domain.simplicial_mesh import SimplicialMesh, SurfaceMesh, TetMesh
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.io import cortex
 from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hks_jax import __version__
+from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
-from hks_jax.describe import describe_array
 from hks_jax.domain.grid import Grid
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
 
