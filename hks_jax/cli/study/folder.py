@@ -148,7 +148,8 @@ class Study:
         now = read_json(self.folder / "study.json")
         if any(now.get(name) != value for name, value in self.record.items()):
             raise ValueError(
-                f"--output: another process gave the study {self.folder} other settings or times; choose another folder"
+                f"--output: another process has given the study {self.folder} other settings or times meanwhile; "
+                "choose another folder for one of them"
             )
 
     def write_description(self, subjects: list[Subject], chosen: str) -> None:
