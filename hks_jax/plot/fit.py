@@ -59,7 +59,7 @@ def fit_panels(
     if max_times < 1:
         raise ValueError(f"max_times: got {max_times}; expected at least 1")
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
-    t = checked_times(times, grid, **{"target": wanted, "fit.hks": fitted})
+    t = checked_times(times, grid.shape, **{"target": wanted, "fit.hks": fitted})
     with np.errstate(divide="ignore", invalid="ignore"):
         difference = np.where(wanted != 0, (fitted - wanted) / np.abs(wanted), np.nan)
     rows = np.unique(np.linspace(0, t.size - 1, max_times).round().astype(int))
