@@ -51,7 +51,6 @@ from hks_jax.linear.multifrontal import _eliminate, factorise, try_out  # noqa: 
 
 accelerators.at_hand = accelerators.kernels_compile = lambda: True  # as if there were a GPU here
 
-TOLERANCE = 1e-8
 GRIDS = ((256, 500), (1024, 500))
 VOLUMES = ((64, 200), (128, 500), (256, 500))
 COLUMNS = ("launches", "waits", "peak_GB", "least_ms")
@@ -94,10 +93,10 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     )
 
     def consider(problem: Any, negative: Any, trial: Any, state: Any) -> Any:
-        return slicing._consider(problem, negative, trial, plan, TOLERANCE, state)
+        return slicing._consider(problem, negative, trial, plan, state)
 
     def accept(problem: Any, ritz: Any, interval: Any, state: Any) -> Any:
-        return slicing._accept(problem, plan, TOLERANCE, ritz, interval, state)
+        return slicing._accept(problem, plan, ritz, interval, state)
 
     def steps(pencil: Any, factor: Any, shift: Any, going: Any, first: Any) -> Any:
         shifted = recurrence.ShiftedSolve(factor, shift, None)

@@ -62,14 +62,14 @@ def stalling(n: int) -> Pencil:
 
 def count(pencil: Pencil, k: int) -> tuple[int, int, bool]:
     """Return the factorisations and searches beyond the ideal numbers, and whether all was found."""
-    plan = hj.BlockLanczos().plan(k, pencil.space.n_null)
+    plan = hj.BlockLanczos(TOLERANCE).plan(k, pencil.space.n_null)
     problem = expected(pencil, plan)
     slices = max(round(k / 170), 1)
     dissection, state, searches = jax.device_put(dissect(pencil.pattern)), first_state(problem, plan), 0
     while unfinished(plan, state):
-        factor, searchable, state = cut(problem, dissection, plan, TOLERANCE, state)
+        factor, searchable, state = cut(problem, dissection, plan, state)
         if searchable:
-            state, searches = search(problem, factor, plan, TOLERANCE, state), searches + 1
+            state, searches = search(problem, factor, plan, state), searches + 1
     return int(state.slices) - slices - 1, searches - slices, bool(state.finished)
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.checks import checked_times, require_number, require_real
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -18,7 +19,6 @@ from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.inverse.signature import SIGNATURES, Signature
 from hks_jax.inverse.unknowns import named
-from hks_jax.static_array import StaticArray
 
 Loss = Callable[[Array, Array], Array]
 
@@ -144,7 +144,7 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
     if signature.symbol == "e" and times is None:
         raise ValueError("times: got None; expected energies (n_energies,) for a wave kernel signature")
     if signature.symbol == "t":
-        times = checked_times("times", times, dtype)
+        times = checked_times(times, dtype)
     else:
         times = jnp.asarray(times, dtype) if signature.symbol else None
     nodes = space.node_shape if signature.at_nodes else ()

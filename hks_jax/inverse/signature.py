@@ -15,7 +15,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.weyl import weyl_count
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.signatures.hks import hks_of_pairs
+from hks_jax.signatures.hks import hks
 from hks_jax.signatures.kernels import heat_trace, wks
 from hks_jax.signatures.truncation import resolving, truncation, truncation_map
 
@@ -79,7 +79,7 @@ def wave_kernel(sigma: float | Float[Array, ""]) -> Signature:
 
 
 SIGNATURES = {
-    "hks": Signature(hks_of_pairs, "t", at_nodes=True, left_out=truncation_map),
+    "hks": Signature(hks, "t", at_nodes=True, left_out=truncation_map),
     "heat-trace": Signature(heat_trace, "t", left_out=lambda pairs, times: truncation(pairs, times).tail),
     "eigenvalues": Signature(lambda pairs: pairs.eigenvalues, lowest=True),
 }

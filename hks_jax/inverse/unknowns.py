@@ -12,12 +12,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.checks import require_real
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.linear.dense_eigh import differentiable_eigh
-from hks_jax.static_array import StaticArray
 
 Values = Float[Array, "..."]
 Tensors = Float[Array, "n d d"]

@@ -17,8 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from hks_jax.domain.components import active_elements
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.optional import optional
 from hks_jax.plot.figure import inches
 from hks_jax.plot.images import colours_of, masked

@@ -18,7 +18,7 @@ from matplotlib import colormaps
 from hks_jax import __version__
 from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh
 from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
 from hks_jax.plot.orientation import LETTERS
 from hks_jax.plot.panels import checked_times
