@@ -26,7 +26,7 @@ ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
     "figure6": figure6.make,
     "triangles": triangles.make,
 }
-"""What makes each: a picture, or texts by the names of their files."""
+"""A function for each, which returns a picture, or texts by the names of their files."""
 
 
 def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:

@@ -42,7 +42,7 @@ LENGTHS: dict[str, Callable[[Tensors, Tensors, Vectors], Float[np.ndarray, " n"]
 
 
 class Count(NamedTuple):
-    """What is wrong with the edge lengths of a triangulated grid."""
+    """The faults of the edge lengths of a triangulated grid."""
 
     triangles: int  # how many triangles there are
     violating: int  # how many have a side longer than the other two together
