@@ -31,7 +31,8 @@ class Identifiability(eqx.Module):
         directions: (n, *values) their eigenvectors, of length one.
         weak_strengths: (n_weak,) estimates from above of the smallest eigenvalues, ascending.
         weak_directions: (n_weak, *values) directions that the data hardly see.
-        resolution: (nodes,) the share of each node's unknowns that the data determine: 0 … 1. A lower bound, by the n directions alone.
+        resolution: (nodes,) the share of each node's unknowns that the data determine: 0 … 1. A lower bound, by the n
+            directions alone.
         deviation: (nodes,) the standard deviation of a node's unknowns (root mean square) that is left, by the n
             directions alone: an upper bound of that of the exact posterior, to first order, under a white prior
             (unknowns independent of each other, of standard deviation τ each). Under a prior that expects
