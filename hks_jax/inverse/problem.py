@@ -56,7 +56,7 @@ class Problem(eqx.Module):
         return eigenpairs(field, self.k, self.boundary, self.solver, multiplet="complete")
 
     def evaluate(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
-        """Return the residuals of the data and those of the penalties, half of whose squares is the loss; and the outcome."""
+        """Return the residuals of the data, those of the penalties, and the outcome."""
         field = self.unknowns.field(values)
         pairs = self._pairs_of(field)
         data = _residuals_of(self.observation, pairs, self.solver)
