@@ -254,8 +254,7 @@ def fit() -> Figure:
     hidden = hj.TensorField(grid, jnp.exp(0.4 * jnp.sin(3 * x) * jnp.cos(2 * y))[..., None, None] * jnp.eye(2))
     times = jnp.geomspace(0.01, 0.1, 4)
     target = hj.hks(hj.eigenpairs(hidden, k=400), times)
-    start = hj.TensorField(grid, jnp.broadcast_to(jnp.eye(2), (20, 20, 2, 2)))
-    return plot.fit_panels(hj.fit_metric(target, times, start, "conformal"), target, times, max_times=2)
+    return plot.fit_panels(hj.fit_metric(grid, target, times, "conformal"), target, times, max_times=2)
 
 
 def volume() -> Figure:

@@ -61,8 +61,8 @@ target TARGET  the signature: .npz
 """
 
 
-_PASSED_ON = ("noise", "k", "boundary", "optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
-"""Options that `fit_metric` takes as they are, with the checkpoint."""
+_OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
+"""Options that `Search` takes as they are."""
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -74,8 +74,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors, which are no metric"
         )
     from hks_jax import fit_metric
+    from hks_jax.inverse import H1, Data, Search, TotalVariation
     from hks_jax.inverse.metric_fit import RESULTS
-    from hks_jax.inverse.regulariser import H1, TotalVariation
 
     use_dtype(args.dtype)
     with progress.stage("reading", str(args.target)):
@@ -93,20 +93,23 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     weights = ((H1, args.h1), (TotalVariation, args.tv))
     with progress.stage("fitting", f"{args.parametrisation}, {int(grid.inside.sum())} nodes"):
         fit = fit_metric(
+            init,
             target.values,
             target.times,
-            init,
             args.parametrisation,
+            data=Data(noise=args.noise),
+            k=args.k,
+            boundary=args.boundary,
+            search=Search(**{name: getattr(args, name) for name in _OF_SEARCH}),
             regularisers=[kind(weight) for kind, weight in weights if weight is not None],
             progress=lambda step: progress.update(str(step)),
             checkpoint=args.checkpoint,
-            **{name: getattr(args, name) for name in _PASSED_ON},
         )
     if not math.isfinite(fit.loss):
         raise ComputationError(f"no fit: {RESULTS['not finite']}. Check --init and -k")
     if not fit.converged:
         progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; the best metric so far is written")
-    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", *_PASSED_ON)
+    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", "noise", "boundary", *_OF_SEARCH)
     report = {
         "target": {
             "source": str(args.target),
