@@ -12,7 +12,7 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.volume import TensorVolume, as_mask, corners
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
