@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, one process at a time; read files that came to harm; NumPy's own files."""
+"""Files written whole or not at all, one process at a time; files that came to harm, read; and NumPy's own files."""
 
 import io
 import math
