@@ -98,8 +98,7 @@ def _encoding(path: str) -> dict[str, Any]:
     reference = encoding.get("Reference")
     if reference is not None and not (isinstance(reference, str) and reference in _REFERENCES):
         raise ValueError(
-            f"{sidecar}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Correct it, or "
-            "remove it and pass frame"
+            f"{sidecar}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Edit or remove it"
         )
     return encoding
 

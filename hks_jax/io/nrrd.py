@@ -208,8 +208,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
     directions = rows[domain].T
     if directions.shape != (d, d) or not np.isfinite(directions).all() or np.linalg.norm(directions, axis=0).min() == 0:
         raise ValueError(
-            f"{name}: space directions {rows[domain].tolist()} of the {d} voxel axes; expected {d} vectors of {d} "
-            "finite numbers, none of them zero"
+            f"{name}: space directions {rows[domain].tolist()}; expected {d} of {d} finite numbers, none of them zero"
         )
     origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
     signs = PATIENT.get(space_of(header)) if d == 3 else None

@@ -98,9 +98,7 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
     """Write tensors, along the axes of space; those of a slice with zeros out of its plane."""
     tensors = volume.tensors
     if volume.dimension == 2:
-        keep = [a for a in range(3) if a != volume.thin_axis]
-        tensors = np.zeros((*volume.shape, 3, 3), tensors.dtype)
-        tensors[..., np.ix_(keep, keep)[0], np.ix_(keep, keep)[1]] = volume.tensors
+        tensors = np.insert(np.insert(tensors, volume.thin_axis, 0, axis=-1), volume.thin_axis, 0, axis=-2)
     rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
     record = describe_tensors(volume, "matrix", "world", provenance)
     _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record, {})

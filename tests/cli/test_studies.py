@@ -101,8 +101,9 @@ def test_names_are_read_from_what_there_is(tmp_path):
     assert names("color\tname\tindex\n#ff\tleft thalamus\t10\n") == {10: "left thalamus"}
     assert names("# No. Name: R G B A\n10  Left-Thalamus  0 118 14 0\n") == {10: "Left-Thalamus"}
     assert names("10 left thalamus\n4\tbelow it\tB\n") == {10: "left thalamus", 4: "below it"}
-    with pytest.raises(ValueError, match="no line has a number and a name"):
-        names("index\tname\n")
+    for text, message in (("index\tname\n", "index, name and 0 rows"), ("left\n", "no line has a number and a name")):
+        with pytest.raises(ValueError, match=message):
+            names(text)
     assert names_beside(tmp_path / "n.nii.gz") == str(tmp_path / "n.tsv")
     assert names_beside(tmp_path / "m.nii.gz") is None
 
