@@ -47,13 +47,13 @@ plane, again = scan(folder, rng), scan(folder, rng)
 print(*plane.notes, sep="\n")
 
 # %% [markdown]
-# `noise="residuals"` asks for the covariance of the tensors, from what the fit leaves in each voxel. It should be half
-# that of the difference of two scans:
+# `noise="residuals"` asks for the noise of the tensors, from what the fit leaves of each image. Its covariance should
+# be half that of the difference of two scans:
 
 # %%
 grid = plane.grid("largest")
 inside = grid.inside
-noise = hj.TensorNoise(plane.covariance, grid)
+noise = plane.noise(grid)
 two = hj.TensorNoise.from_scans(plane.tensors, again.tensors, grid)
 stated, seen = (np.median(np.trace(each.covariance[inside], axis1=-2, axis2=-1)) for each in (noise, two))
 print(f"variance of a tensor: by residuals {stated:.3g}, by two scans {seen:.3g}; shared over {two.correlation:.2g} mm")

@@ -77,7 +77,7 @@ def _noise(args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progre
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: residuals are those of a fit to diffusion-weighted images (--bval, --bvec)")
-        return hj.TensorNoise(volume.covariance, grid)
+        return volume.noise(grid)
     if args.noise == "roughness":
         return hj.TensorNoise.from_roughness(volume.tensors, grid)
     if (second := second_scan(args)) is not None:

@@ -146,10 +146,11 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         )
         source = tuple(index[bad] for index in nearest)
         tensors[bad] = volume.tensors[source]
-        if volume.covariance is not None:
-            covariance = volume.covariance.copy()
-            covariance[bad] = volume.covariance[source]
-            changed = replace(changed, covariance=covariance)
+        for name in ("covariance", "modes"):
+            if (of_noise := getattr(volume, name)) is not None:
+                of_noise = of_noise.copy()
+                of_noise[bad] = of_noise[source]
+                changed = replace(changed, **{name: of_noise})
     return replace(changed, tensors=tensors)
 
 
@@ -260,7 +261,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
     note = f"{formula} of all tensors S, {before} of {int(inside.sum())} of which are not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
-    return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))
+    return replace(volume, tensors=tensors, covariance=None, modes=None, repair=report, notes=(*volume.notes, note))
 
 
 def require_symmetric(volume: TensorVolume) -> None:
