@@ -24,8 +24,7 @@ HEAD = """\
 # Gallery
 
 Every picture of `hks_jax.plot`, with the function of [gallery.py](gallery.py) that draws it. The site shows its code
-below the picture. Most functions draw on given axes, so pictures compose. `hks_panels`, `volume_panels`, `time_rows`
-and `fit_panels` make a figure. `python docs/gallery.py` draws the pictures and writes this page.
+below the picture. `python docs/gallery.py` draws the pictures and writes this page.
 """
 
 IMPORTS = """\

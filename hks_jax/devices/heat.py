@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.stencil import Stencil
-from hks_jax.linear.chebyshev import chebyshev_recurrence, gershgorin, heat_coefficients, least_degree
+from hks_jax.linear.chebyshev import chebyshev_heat_coefficients, chebyshev_recurrence, gershgorin, least_degree
 from hks_jax.traced import is_traced
 
 
@@ -62,7 +62,7 @@ def heat_columns(
         if times.size and not float(jnp.min(times)) >= 0:
             raise ValueError(f"times: got {times}; expected no negative ones")
         degree = least_degree(float(jnp.max(times, initial=0)) * float(top) / 2, tolerance)
-    return chebyshev_series(slabs, stiffness, lumped, columns, top, heat_coefficients(times, top, degree))
+    return chebyshev_series(slabs, stiffness, lumped, columns, top, chebyshev_heat_coefficients(times, top, degree))
 
 
 @partial(jax.jit, static_argnames="slabs")

@@ -77,7 +77,7 @@ class Smoothing(InnerProduct):
         """Return the inverse's product."""
         if self.factor is None:
             return values * (self.cell / self.pencil.mass.diagonal())[:, None]
-        return (self.factor.solve(values.T) * self.cell / self.length**2).T
+        return self.factor.solve(values) * self.cell / self.length**2
 
 
 def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:

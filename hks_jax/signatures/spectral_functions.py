@@ -16,7 +16,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.not_differentiable import first_order_only
+from hks_jax.linear.linear_map import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
 from hks_jax.nan_outside import nan_outside
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances

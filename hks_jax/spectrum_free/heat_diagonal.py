@@ -16,7 +16,7 @@ from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import AnyPencil, Pencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.sparse_input import pencil_of
-from hks_jax.linear.chebyshev import heat_coefficients
+from hks_jax.linear.chebyshev import chebyshev_heat_coefficients
 from hks_jax.linear.dissection import dissect
 from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.spectrum_free.colours import Colouring
@@ -144,7 +144,7 @@ def _diagonal(
 @partial(jax.jit, static_argnums=0)
 def _by_colours(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     assert isinstance(part.space, GridSpace)
-    coefficients = heat_coefficients(times, settings.top, settings.degree)
+    coefficients = chebyshev_heat_coefficients(times, settings.top, settings.degree)
     return coloured_diagonal(settings, settings.colours(part.space), nodal_pencil(part), coefficients)
 
 

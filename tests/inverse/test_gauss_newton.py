@@ -42,9 +42,9 @@ def solve(matrix, scale, rhs, tolerance, most=1000):
             product, precondition, jnp.zeros_like(column), jnp.full(1, tolerance), **settings
         )
 
-    x, _, right, steps = solution()
-    np.testing.assert_array_equal(right[:, 0], rhs)
-    return x[:, 0], steps
+    found = solution()
+    np.testing.assert_array_equal(found.rhs[:, 0], rhs)
+    return found.x[:, 0], found.steps
 
 
 def test_rounding_costs_no_steps(rng):
