@@ -66,10 +66,12 @@ def correlation(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
     return float(np.corrcoef(a[where], b[where])[0, 1])
 
 
-def maps(signature, tensors: np.ndarray, noise: hj.TensorNoise) -> tuple[hj.Uncertainty, np.ndarray]:
+def maps(
+    signature, tensors: np.ndarray, noise: hj.TensorNoise, draws: int = DRAWS
+) -> tuple[hj.Uncertainty, np.ndarray]:
     """Return error bars, and the samples of noise of which they are made."""
     samples: list[np.ndarray] = []
-    settings = {"draws": DRAWS, "method": "resample", "progress": print}
+    settings = {"draws": draws, "method": "resample", "progress": print}
     bars = hj.uncertainty(signature, tensors, noise, **settings, each=lambda one: samples.append(np.asarray(one)))
     print(bars.summary())
     return bars, np.stack(samples)
@@ -122,7 +124,7 @@ def study(volumes: list[hj.io.TensorVolume], z: int) -> tuple[dict, dict]:
     bars = [each for each, _ in found]
     whole, first, second = bars
     known = np.isfinite(np.asarray(whole.value[0])) & grid.inside
-    near = [maps(signature, p.tensors, hj.TensorNoise(p.covariance, grid, width)) for p in planes[1:]]
+    near = [maps(signature, p.tensors, hj.TensorNoise(p.covariance, grid, width), 8) for p in planes[1:]]
     judged, shared_nearby = ratios(found[1:], known), ratios(near, known)
     others = [scalars(plane, volume, z, grid) for plane, volume in zip(planes[1:], volumes[1:], strict=True)]
     rows = []
