@@ -20,9 +20,9 @@ from hks_jax.curvature import scalar_curvature as scalar_curvature
 from hks_jax.domain.degenerate import DegeneratePoints as DegeneratePoints
 from hks_jax.domain.degenerate import degenerate_points as degenerate_points
 from hks_jax.domain.grid import Grid as Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh as SurfaceMesh
+from hks_jax.domain.simplicial_mesh import TetMesh as TetMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
-from hks_jax.domain.tet_mesh import TetMesh as TetMesh
 from hks_jax.eigen.complement.adjoint import Adjoint as Adjoint
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint as FactorisedAdjoint
 from hks_jax.eigen.dense import Dense as Dense

@@ -39,13 +39,12 @@ from hks_jax.eigen.lanczos.block_lanczos import expected  # noqa: E402
 from hks_jax.eigen.lanczos.slicing_state import first_state, make_room  # noqa: E402
 from hks_jax.fem.nodal import nodal_pencil  # noqa: E402
 from hks_jax.fem.pencil import Pencil  # noqa: E402
-from hks_jax.inverse import optimise  # noqa: E402
+from hks_jax.inverse import Data, optimise  # noqa: E402
 from hks_jax.inverse.conformal import smoothing  # noqa: E402
 from hks_jax.inverse.gauss_newton import GaussNewton  # noqa: E402
 from hks_jax.inverse.observation import observe  # noqa: E402
-from hks_jax.inverse.parametrisation import choose_parametrisation  # noqa: E402
 from hks_jax.inverse.problem import Problem  # noqa: E402
-from hks_jax.inverse.unknowns import Nodal, nodes_of  # noqa: E402
+from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal, flat_field  # noqa: E402
 from hks_jax.linear import accelerators  # noqa: E402
 from hks_jax.linear.dissection import dissect  # noqa: E402
 from hks_jax.linear.multifrontal import _eliminate, factorise, try_out  # noqa: E402
@@ -175,10 +174,10 @@ def derivatives(n: int, k: int) -> Iterator[Task]:
     yield "gradient of the HKS", f"{n}²", k, lambda: (jax.value_and_grad(loss), (tensors,))
 
     def fit_step() -> tuple:
-        flat = hj.TensorField(grid, jnp.broadcast_to(jnp.eye(2), (n, n, 2, 2)))
+        flat = flat_field(grid)
         space, dtype = hj.assemble(flat).space, np.dtype(float)
-        unknowns = Nodal(choose_parametrisation("log-euclidean"), flat, nodes_of(space.domain))
-        observation = observe(np.ones((3, n, n)), times, None, "hks", "log", None, space, dtype)
+        unknowns = Nodal(PARAMETRISATIONS["log-euclidean"], flat, space.domain)
+        observation, _ = observe(np.ones((3, n, n)), times, Data(), space, dtype)
         problem = Problem(unknowns, observation, (), k, "neumann", "block-lanczos")
         method = GaussNewton(1e-4, 1e-4, 10.0, smoothing(grid, 0.1, dtype))
         values = unknowns.start()

@@ -12,7 +12,7 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from machine import RESULTS, write
 
 import hks_jax as hj
 from hks_jax.domain import spd
-from hks_jax.inverse import H1
+from hks_jax.inverse import H1, Data, Regulariser, Search
 
 
 def conformal(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -63,30 +63,38 @@ def setting(n: int, kind: str, refined: int = 1) -> tuple[hj.TensorField, np.nda
     return fields[0], times, np.asarray(target), k
 
 
-def run(n: int, kind: str, noise: float = 0.0, refined: int = 1, bias: bool = False, **options: Any) -> dict:
+def run(
+    n: int,
+    kind: str,
+    noise: float = 0.0,
+    refined: int = 1,
+    bias: bool = False,
+    regularisers: Sequence[Regulariser] = (),
+    **search: Any,
+) -> dict:
     """Fit once; with bias, the discretisation's difference at the truth counts as noise."""
     truth, times, target, k = setting(n, kind, refined)
     target = target * np.exp(noise * np.random.default_rng(1).standard_normal(target.shape))
-    init = hj.TensorField(truth.grid, np.broadcast_to(np.eye(2), truth.tensors.shape))
-    if noise and "regularisers" not in options:
-        options["noise"] = noise
+    level = noise if noise and not regularisers else None
     if bias:
         difference = np.log(np.asarray(hj.hks(hj.eigenpairs(truth, k), times)) / target)
-        options["noise"] = float(np.sqrt(np.mean(difference**2)))
+        level = float(np.sqrt(np.mean(difference**2)))
     start = time.perf_counter()
-    fit = hj.fit_metric(target, times, init, kind, k=k, **options)
+    fit = hj.fit_metric(
+        truth.grid, target, times, kind, k=k, data=Data(noise=level), regularisers=regularisers, search=Search(**search)
+    )
     seconds = time.perf_counter() - start
     error = float(np.linalg.norm(fit.field.tensors - truth.tensors) / np.linalg.norm(truth.tensors))
     row = {"nodes": n * n, "parametrisation": kind, "noise": noise, "refined": refined, "k": k, "error": error}
     row |= {
-        "level": options.get("noise"),
+        "level": level,
         "seconds": seconds,
         "result": fit.result,
         "loss": fit.loss,
         "misfit": fit.misfit,
     }
     row["history"] = [{"loss": step.loss, "seconds": step.seconds} for step in fit.history]
-    told = f", stops at {options['noise']:.2g}" if "noise" in options else ""
+    told = "" if level is None else f", stops at {level:.2g}"
     print(f"{n}² {kind}, noise {noise:g}, target on {refined}× finer grid{told}: error {error:.2e}, ", end="")
     print(f"{fit.steps} steps, {seconds:.0f} s, {fit.result}, misfit {fit.misfit:.2e}", flush=True)
     return row

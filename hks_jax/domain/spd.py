@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.linear.dense_eigh import differentiable_eigh
+from hks_jax.linear.products import matmul
 
 
 @jax.jit
@@ -19,17 +20,16 @@ def symmetrise(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 
 
 def identity_outside(
-    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray, "*shape"]
+    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
     """Return the tensors, and the identity at nodes that are not inside."""
-    return tensors if inside.all() else identity_unless(inside, tensors)
+    return tensors if isinstance(inside, np.ndarray) and inside.all() else _identity_outside(tensors, inside)
 
 
 @jax.jit
-def identity_unless(
-    inside: Bool[np.ndarray | Array, "*shape"], tensors: Float[Array, "*shape d d"]
+def _identity_outside(
+    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
-    """Return the tensors, and the identity at nodes that are not inside, where these may be traced."""
     return jnp.where(inside[..., None, None], tensors, jnp.eye(tensors.shape[-1], dtype=tensors.dtype))
 
 
@@ -75,19 +75,18 @@ def is_spd(tensors: np.ndarray) -> np.ndarray:
     """Tell, by Sylvester's criterion, which matrices (..., d, d) are finite and positive definite (on the host)."""
     t = np.asarray(tensors, dtype=np.float64)
     finite = np.isfinite(t).all(axis=(-2, -1), keepdims=True)
-    t = np.where(finite, t, 0.0)
-    minors = [np.linalg.det(t[..., :m, :m]) > 0 for m in range(1, t.shape[-1] + 1)]
-    return np.logical_and.reduce(minors)
+    return _positive(np.where(finite, t, 0.0))
+
+
+def _positive(t: Any) -> Any:
+    return (t[..., 0, 0] > 0) & (determinant(t[..., :2, :2]) > 0) & (determinant(t) > 0)
 
 
 # A product and not a choice: the derivative at the tensor itself is NaN too.
 @jax.jit
 def positive_or_nan(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the matrices, d = 2 or 3, NaN in place of those that are not positive definite (Sylvester's criterion)."""
-    t = tensors
-    minors = t[..., 0, 0], t[..., 0, 0] * t[..., 1, 1] - t[..., 0, 1] * t[..., 1, 0], determinant(t)
-    positive = (minors[0] > 0) & (minors[1] > 0) & (minors[2] > 0)
-    return t * jnp.where(positive, 1, jnp.nan).astype(t.dtype)[..., None, None]
+    return tensors * jnp.where(_positive(tensors), 1, jnp.nan).astype(tensors.dtype)[..., None, None]
 
 
 @jax.jit
@@ -129,7 +128,7 @@ def _exp_in_2d(deviator: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Arr
 
 def _exp_in_3d(deviator: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]:
     """Return [S, S²] and the coefficients of I, S and S² in exp S − I; tr S = 0."""
-    square = _matmul(deviator, deviator)
+    square = matmul(deviator, deviator)
     p, r = 0.5 * jnp.trace(square, axis1=-2, axis2=-1), determinant(deviator)
     small_p, small_r = p / 4**_SQUARINGS, r / 8**_SQUARINGS
     a = b = c = jnp.zeros_like(p)
@@ -184,7 +183,7 @@ def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tu
     values, vectors = eigh(primals[0])
     a, b = values[..., :, None], values[..., None, :]
     differences = 2 / (a + b) * _atanhc((a - b) / (a + b))
-    inner = _matmul(_matmul(jnp.swapaxes(vectors, -1, -2), tangents[0]), vectors)
+    inner = matmul(jnp.swapaxes(vectors, -1, -2), tangents[0], vectors)
     return _log_of_pairs(values, vectors), _compose(vectors, differences * inner)
 
 
@@ -198,11 +197,7 @@ def _log_of_pairs(values: Float[Array, "... d"], vectors: Float[Array, "... d d"
 
 
 def _compose(vectors: Float[Array, "... d d"], inner: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    return symmetrise(_matmul(_matmul(vectors, inner), jnp.swapaxes(vectors, -1, -2)))
-
-
-def _matmul(a: Float[Array, "... d d"], b: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    return jnp.matmul(a, b, precision="highest")
+    return symmetrise(matmul(vectors, inner, jnp.swapaxes(vectors, -1, -2)))
 
 
 def _atanhc(x: Float[Array, "..."]) -> Float[Array, "..."]:

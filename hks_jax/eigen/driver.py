@@ -18,8 +18,8 @@ from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval,
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.quadrature import Quadrature
 from hks_jax.traced import is_traced
 
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.arrays import describe_array
 from hks_jax.compilation import numpy_where_known
-from hks_jax.describe import describe_array
 from hks_jax.domain.tensor_checks import MANY
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import FunctionSpace

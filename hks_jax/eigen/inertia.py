@@ -14,8 +14,8 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.quality import largest
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.fem.quadrature import Quadrature
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.dissection import Dissection, dissect

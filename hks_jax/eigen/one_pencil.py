@@ -19,7 +19,7 @@ from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Eigensolver, Report
-from hks_jax.fem.all_nodes import on_all_nodes
+from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced

@@ -11,17 +11,16 @@ from jaxtyping import Array, Float
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
-from hks_jax.inverse.unknowns import Nodal, Values
+from hks_jax.inverse.unknowns import Nodal, Values, flat_field
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 
 
 class Preconditioner(eqx.Module):
-    """What resembles JᵀJ + μB, up to a factor: symmetric, positive definite, and with an inverse."""
+    """An approximation of JᵀJ + μB up to a factor: symmetric, positive definite, and easily inverted."""
 
     @abstractmethod
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
@@ -29,31 +28,19 @@ class Preconditioner(eqx.Module):
 
 
 class InnerProduct(Preconditioner):
-    """A symmetric positive definite operator on unknowns."""
+    """A symmetric positive definite operator on unknowns: the identity, unless a subclass says otherwise."""
 
-    @abstractmethod
     def apply(self, values: Values) -> Values:
         """Return its product with the unknowns."""
+        return values
 
-    @abstractmethod
     def solve(self, values: Values) -> Values:
         """Return the product of its inverse with the unknowns."""
+        return values
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
         """Return `solve`: of JᵀJ nothing is known."""
         return self.solve(values)
-
-
-class Euclidean(InnerProduct):
-    """The identity."""
-
-    def apply(self, values: Values) -> Values:
-        """Return the values."""
-        return values
-
-    def solve(self, values: Values) -> Values:
-        """Return the values."""
-        return values
 
 
 class Smoothing(InnerProduct):
@@ -82,9 +69,7 @@ class Smoothing(InnerProduct):
 
 def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     """Return the inner product for numbers at the nodes of a grid's domain."""
-    d = grid.dimension
-    flat = TensorField(grid, np.broadcast_to(np.eye(d, dtype=dtype), (*grid.shape, d, d)))
-    pencil = assemble(flat, mass="lumped")
+    pencil = assemble(flat_field(grid, dtype), mass="lumped")
     assert isinstance(pencil, Pencil)
     assert isinstance(pencil.space, GridSpace)
     factor = None
@@ -95,7 +80,7 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
 
 
 _TOP = 0.03
-"""About what the eigenvalues of JᵀJ are where a(λt)² is largest, for weights that add up to one."""
+"""The size of the eigenvalues of JᵀJ where a(λt)² is largest, for weights that add up to one."""
 _POWER, _REACH = 3, 9.0
 """In fits on 32² and 64² nodes from t = 0.0045 on, (1 + λt/9)³ takes the fewest steps among such powers, or nearly."""
 
@@ -107,7 +92,7 @@ _POWER, _REACH = 3, 9.0
 #
 # x/6 for small x, which is the curvature's share tK/3, and of the order of 1/x for large. So JᵀJ is about Σₜ wₜ a(tL)²,
 # L the Laplacian, and its eigenvalues fall off with those of L, beyond the first few. On a grid they do so faster: the
-# factor is interpolated between nodes, which takes away what oscillates from node to node.
+# factor is interpolated between nodes, which damps oscillations from node to node.
 class ConformalInformation(Preconditioner):
     """B½ (1 + L/λ₁)⁻³ B½, B the lumped mass and L the Laplacian of the initial metric by differences along edges.
 

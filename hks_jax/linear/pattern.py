@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int
 
+from hks_jax.arrays import StaticArray
 from hks_jax.linear.bisection import Parts, bisect_graph
-from hks_jax.static_array import StaticArray
 
 
 class Pattern:

@@ -1,21 +1,57 @@
-"""Heat on a grid cut into slabs: polynomials in D⁻¹K, D the lumped mass, for fields that outgrow a device.
+"""Several devices: batches shared out, and space cut into slabs. docs/devices.md says what is exchanged."""
 
-The Chebyshev expansion of exp(−tD⁻¹K) needs one stencil product a degree, and with it the exchange of one plane of
-nodes with each neighbour; all times come from the same products.
-"""
-
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number, require_real
-from hks_jax.fem.halo import Slabs
+from hks_jax.fem.halo import Slabs as Slabs
+from hks_jax.fem.halo import checked_mesh
 from hks_jax.fem.stencil import Stencil
 from hks_jax.linear.chebyshev import chebyshev_heat_coefficients, chebyshev_recurrence, gershgorin, least_degree
 from hks_jax.traced import is_traced
+
+
+def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
+    """Apply a function to each entry of a batch, every device to its share, one entry after another.
+
+    Nothing is exchanged. Differentiable where the function is. Called again with the same function object, it is not
+    compiled again.
+
+    Args:
+        function: of one entry, such as ``lambda T: hj.hks(hj.eigenpairs(hj.TensorField(grid, T), k, solver="dense"),
+            times)``; traceable.
+        batch: arrays (n, …), a pytree of them.
+        mesh: devices along one axis.
+
+    Returns:
+        What ``jax.lax.map(function, batch)`` would: arrays (n, …). They stay where they were computed if n is a
+        multiple of the number of devices; otherwise every device has them whole.
+
+    Raises:
+        ValueError: arrays of different lengths, or none; a mesh with several axes.
+    """
+    mesh = checked_mesh(mesh)
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
+    if len(lengths) != 1 or lengths & {(), (0,)}:
+        raise ValueError(f"batch: got leading axes {sorted(lengths)}; expected arrays of the same length, at least 1")
+    return _map(function, batch, mesh)
+
+
+@partial(jax.jit, static_argnames=("function", "mesh"))
+def _map(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
+    n, spec = jax.tree.leaves(batch)[0].shape[0], PartitionSpec(mesh.axis_names[0])
+    # Copies of the last entry fill the shares up: of zeros, a function might make NaN, or an endless loop.
+    filled = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(-(-n // mesh.size) * mesh.size), n - 1)], batch)
+    share = jax.shard_map(
+        lambda own: jax.lax.map(function, own), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+    )
+    return jax.tree.map(lambda x: x[:n], share(filled))
 
 
 def heat_columns(
@@ -28,6 +64,9 @@ def heat_columns(
     degree: int | None = None,
 ) -> Float[Array, "n_times *padded b"]:
     """Return exp(−tD⁻¹K) applied to columns, for each time. Sources D⁻¹eᵢ give columns of the heat kernel.
+
+    For fields that outgrow a device. The Chebyshev expansion needs one stencil product a degree, and with it the
+    exchange of one plane of nodes with each neighbour; all times come from the same products.
 
     Args:
         slabs: how the grid is cut.
@@ -88,7 +127,7 @@ def chebyshev_series(
         start = jnp.multiply.outer(jnp.zeros_like(series[:, 0]), x)
         return chebyshev_recurrence(lambda y: scaled(y) - y, x, series.shape[1] - 1, start, add)[2]
 
-    everywhere = jax.sharding.PartitionSpec()
+    everywhere = PartitionSpec()
     specs = slabs.spec(1), slabs.spec(0), slabs.spec(0), everywhere, everywhere
     return jax.shard_map(share, mesh=slabs.mesh, in_specs=specs, out_specs=slabs.spec(1))(
         stiffness, lumped, columns, top, series
