@@ -78,12 +78,13 @@ def fit_dwi(
             ms/µm². None: mm²/s.
         noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
             ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
-            for n images. None: no covariance.
+            for n images; these also tell what voxels share of an image's noise (24 bytes for each voxel and image).
+            None: no covariance.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s, and with `noise` their covariance, to first order in it. DIPY replaces
-        eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at the rim:
-        erode the mask).
+        Tensors along the voxel axes, in mm²/s, and with `noise` theirs, to first order (`TensorVolume.noise`). DIPY
+        replaces eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at
+        the rim: erode the mask).
 
     Raises:
         ImportError: DIPY or nibabel is missing.

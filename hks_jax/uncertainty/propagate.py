@@ -69,7 +69,8 @@ def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the noise Jη (3, …) that four maps are made of, and their even part: the bias, on average."""
 
     def linear(*y: Array) -> Array:
-        return jnp.tensordot(jnp.asarray(_SIGNS.T, y[0].dtype), jnp.stack(y), 1) * (math.sqrt(3) / (4 * _SCALE))
+        signs = jnp.asarray(_SIGNS.T * (math.sqrt(3) / (4 * _SCALE)), y[0].dtype)
+        return jnp.tensordot(signs, jnp.stack(y), 1, precision=jax.lax.Precision.HIGHEST)
 
     return (
         jax.tree.map(linear, *maps),
@@ -250,7 +251,9 @@ def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
 def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
     """Return tensors with noise that adds up to zero, and the share that whole noise makes indefinite, in all four."""
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
-    changes = jnp.tensordot(jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1)
+    changes = jnp.tensordot(
+        jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1, precision=jax.lax.Precision.HIGHEST
+    )
     lost = jnp.stack([_positive(measured, measured + change)[1] for change in changes])
     return [_positive(measured, measured + _SCALE * change)[0] for change in changes], lost.sum()
 
