@@ -249,7 +249,7 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     refused("--noise: got 'roughness'; for tensors at the vertices", *of_tensors, "--noise", "roughness")
     refused("--metric: a mesh has the metric of space unless --array names tensors", "--metric", "tensor")
     refused("--interpolation: a mesh has the metric of space", "--interpolation", "log-euclidean")
-    refused("--metric: choose what the tensors at the vertices stand for", "--array", "D")
+    refused("--metric: choose the metric of the tensors at the vertices", "--array", "D")
     refused("--array: got 'E'; the arrays at the vertices are D", "--array", "E", "--metric", "tensor")
     refused("--slice: it is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
     refused("--boundary: got 'mirror'; a mesh takes one of neumann, dirichlet, mean", "--boundary", "mirror")
