@@ -99,7 +99,7 @@ file FILE...
     neighbours differ by. Adds deviation and bias to the .npz, signal to noise at each t to the report, the column error
     to tables of regions, and fades in the picture what noise could make; automatic times of one subject begin where
     signal is
---draws N = 16  noisy maps that error bars are made of
+--draws N = 8  noisy maps that error bars are made of
 [atlas]
 --atlas FILE  labels on the voxels of the image, whole numbers, 0 for none: NIfTI, or .npy of the image's shape
 [names]

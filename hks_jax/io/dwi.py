@@ -22,6 +22,8 @@ from hks_jax.storage import existing, reading
 
 _LENGTH = 0.05
 """By how much the length of a direction may differ from 1: it is rounding then."""
+_SEEN = 0.01
+"""The share of an image's noise that its residual has at least, to tell it."""
 
 
 class ExampleBrain(NamedTuple):
@@ -76,12 +78,13 @@ def fit_dwi(
             ms/µm². None: mm²/s.
         noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
             ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
-            for n images. None: no covariance.
+            for n images; these also tell what voxels share of an image's noise (24 bytes for each voxel and image).
+            None: no covariance.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s, and with `noise` their covariance, to first order in it. DIPY replaces
-        eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at the rim:
-        erode the mask).
+        Tensors along the voxel axes, in mm²/s, and with `noise` theirs, to first order (`TensorVolume.noise`). DIPY
+        replaces eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at
+        the rim: erode the mask).
 
     Raises:
         ImportError: DIPY or nibabel is missing.
@@ -119,9 +122,9 @@ def fit_dwi(
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
     fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
-    covariance = None
+    covariance = modes = None
     if noise is not None:
-        covariance = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
+        covariance, modes = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
     notes = [
         f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
@@ -137,7 +140,7 @@ def fit_dwi(
         notes.append(f"covariances of the tensors from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
-    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance)
+    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance, modes=modes)
     return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
@@ -145,6 +148,9 @@ def fit_dwi(
 # design, least squares minimise Σ w²(y − Xβ)². A logarithm has the variance σ²/w² to first order, so that β has the
 # covariance σ²(XᵀW²X)⁻¹, and σ² is the signals' sum of squared residuals over as many as there are more images than
 # unknowns (Koay, Chang, Pierpaoli and Basser 2007).
+# Image n alone changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ, its residual r being that of a signal. A residual has the variance
+# σ²(1 − h), h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so that rₙ/√(1 − h) has that of the noise (MacKinnon and White 1985, HC2). Random
+# signs of whole images keep what voxels share of them.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],
@@ -152,8 +158,11 @@ def _covariance(
     noise: float | Literal["residuals"],
     frame: str,
     affine: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "nx ny nz 6 6"]:
-    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask."""
+) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask.
+
+    And, from residuals, the part of each image in the noise of the tensors.
+    """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
     y = np.log(np.maximum(data, positive.min() if positive.size else 1.0))
@@ -170,7 +179,8 @@ def _covariance(
             )
         # Of the signals, not of their logarithms, which near zero are far off.
         fitted = np.exp(np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True))
-        variance = np.sum((data - fitted) ** 2, axis=1) / freedom
+        left = data - fitted
+        variance = np.sum(left**2, axis=1) / freedom
         if (zero := variance <= 1e-20 * weights.mean(axis=1)).any():
             raise ValueError(
                 f'noise: got "residuals", which are zero in {int(zero.sum())} of {len(zero)} voxels; expected images '
@@ -182,7 +192,17 @@ def _covariance(
     turned = pack(to_voxel_axes(unpack(np.eye(6), "nifti"), frame, affine), "nifti").T
     covariance = np.zeros((*inside.shape, 6, 6))
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
-    return covariance
+    if noise != "residuals":
+        return covariance, None
+    # An image that its own unknown follows, as the only one without weighting, has no residual: a sign by chance.
+    unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
+    modes = np.zeros((*inside.shape, len(design), 6), np.float32)
+    for i, x in enumerate(design):  # to need no more memory than the result
+        change = inverse @ x * np.sqrt(weights[:, i, None])
+        rest = 1 - np.sqrt(weights[:, i]) * (change @ x)
+        size = np.where(rest > _SEEN, left[:, i] / np.sqrt(np.maximum(rest, _SEEN)), unseen[:, i])
+        modes[inside, i] = size[:, None] * change[:, :6] @ turned.T
+    return covariance, modes
 
 
 def _of_length_one(

@@ -16,6 +16,7 @@ from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
 from hks_jax.domain.grid import Grid
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
+from hks_jax.uncertainty.noise import TensorNoise
 
 AXES = "xyz"
 
@@ -59,6 +60,8 @@ class TensorVolume:
         unit: ``"mm²/s"`` where the tensors' unit is known, because it was told, or they were fitted; else empty.
         covariance: (*shape, m, m) of the components xx xy yy (xz yz zz) along the voxel axes, in the squared unit of
             the tensors, where it is known (`fit_dwi`); else None.
+        modes: (*shape, n, m), the part of each of the n images in the noise of these components, where residuals tell
+            it (`fit_dwi`, in float32); else None. What voxels share of an image's noise is in them.
 
     Raises:
         ValueError: shapes that do not agree; spacings that are not positive, numbers that are not finite.
@@ -80,6 +83,7 @@ class TensorVolume:
     length_unit: str = ""
     unit: str = ""
     covariance: Float[np.ndarray, "*shape m m"] | None = None
+    modes: Float[np.ndarray, "*shape n m"] | None = None
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
@@ -160,11 +164,13 @@ class TensorVolume:
                 where = f"{AXES[a]} = {filled[0]} … {filled[-1]}" if filled.size else "no slice at all"
                 raise ValueError(f"mask: empty in slice {AXES[a]} = {index}; it has voxels inside at {where}")
         keep = [b for b in range(3) if b != a]
-        affine = covariance = None
+        affine = covariance = modes = None
+        rows, columns = np.tril_indices(3)
+        within = np.flatnonzero((rows != a) & (columns != a))
         if self.covariance is not None:
-            rows, columns = np.tril_indices(3)
-            within = np.flatnonzero((rows != a) & (columns != a))
             covariance = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
+        if self.modes is not None:
+            modes = np.take(self.modes, index, axis=a)[..., within]
         if self.affine is not None:
             affine = self.affine.copy()
             affine[:3, 3] += index * affine[:3, a]
@@ -177,8 +183,24 @@ class TensorVolume:
             affine=affine,
             slice_axis=a,
             covariance=covariance,
+            modes=modes,
             notes=(*self.notes, f"slice {AXES[a]} = {index}: the in-plane block of each tensor"),
         )
+
+    def noise(self, grid: Grid) -> TensorNoise:
+        """Return the noise that the fit of the tensors has told (`fit_dwi`): of images, if residuals have.
+
+        Raises:
+            ValueError: nothing is known of it.
+        """
+        if self.modes is not None:
+            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # of a fit, a signal without weighting included
+        if self.covariance is None:
+            raise ValueError(
+                "noise: nothing is known of it; fit the tensors by `fit_dwi` with noise=, or state it by "
+                "`TensorNoise.relative`"
+            )
+        return TensorNoise(self.covariance, grid)
 
     @property
     def volume_affine(self) -> Float[np.ndarray, "4 4"]:
