@@ -1,4 +1,4 @@
-"""Files: tensors, masks, meshes and results in many formats; tensors fitted to diffusion-weighted images."""
+"""Read and write files of tensors, masks, meshes and results; fit tensors to diffusion-weighted images."""
 
 from hks_jax.atomic import atomic_folder as atomic_folder
 from hks_jax.atomic import atomic_path as atomic_path
