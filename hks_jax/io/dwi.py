@@ -111,7 +111,7 @@ def fit_dwi(
     if weighted < 6 or weighted == used.sum():
         raise ValueError(
             f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
-            "at least 6 and 1. Raise b_max"
+            "at least 6 and 1. Raise the limit"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(name, image)[..., used]

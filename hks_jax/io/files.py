@@ -194,7 +194,7 @@ def save_tensors(
     neither `order` nor `frame`. Units are written except to VTK's files.
 
     Raises:
-        ValueError: the suffix is unknown; a slice is written as NIfTI; unsymmetric tensors are written as NIfTI or NRRD.
+        ValueError: the suffix is unknown; the format is NIfTI for a slice, or NIfTI or NRRD for unsymmetric tensors.
         ImportError: an optional library is missing; the message gives the command that installs it.
     """
     file = Path(path)

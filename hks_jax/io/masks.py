@@ -34,8 +34,8 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         shift = np.linalg.norm(corners(values.shape) @ (place - affine).T, axis=1).max()
         if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
             raise ValueError(
-                f"{name}: the affines put voxels of the mask up to {shift:.3g} away from those of the tensors; expected "
-                "equal affines. Resample the mask to the tensors' voxels"
+                f"{name}: the mask's affine displaces it by up to {shift:.3g} from the tensors; expected the same "
+                "position. Resample the mask to the tensors' voxels"
             )
     return as_mask(name, values)
 
