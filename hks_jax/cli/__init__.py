@@ -34,7 +34,7 @@ COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, co
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
-# Errors that users can correct, such as wrong values, missing files and missing extras. Others mean a failed computation.
+# Errors that users can correct: wrong values, missing files, missing extras. Other errors mean a failed computation.
 INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
 
 
@@ -61,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
-    Output files are written atomically and together at the end, so unless the exit code is 0, there are none. Exceptions
+    Output files are written atomically and together at the end, so there are none unless the exit code is 0. Exceptions
     are `paper`, `batch`, the checkpoint of `fit` and the eigenpairs that `hks` saves.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()

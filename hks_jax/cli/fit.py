@@ -47,7 +47,7 @@ target TARGET  the signature, an .npz file
 -k K  number of eigenpairs (default: enough for all but 1e-6 of the heat trace at the smallest time)
 --noise SIGMA  standard deviation of the logarithm of the target (0.01 for 1 %); the fit stops at this misfit
 --smoothness LENGTH
-    smoothing length of the steps, in units of the spacing (default a tenth of the domain, or 0 for conformal without
+    smoothing length of the steps, in coordinate units (default a tenth of the domain, or 0 for conformal without
     --noise)
 --h1 WEIGHT  penalise slopes by ½ WEIGHT · mean |∇p|² of the parameters p
 --tv WEIGHT  penalise the total variation, which keeps edges sharp
@@ -68,10 +68,10 @@ _OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.init is None:
-        refuse(args, ("metric", "order"), "this option describes the tensors in --init, which are missing; pass --init too")
+        refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
     elif args.metric is None and image_suffix(args.init):
         raise ValueError(
-            "--metric: --init has diffusion tensors, from which a metric must be made. Choose inverse, tensor or adjugate"
+            "--metric: --init has diffusion tensors, so a metric must be chosen: inverse, tensor or adjugate"
         )
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation

@@ -149,7 +149,7 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
         why = "this option needs tensors, but without --array and --tensors a mesh has the metric of space"
         refuse(args, _OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
     elif args.metric is None:
-        raise ValueError("--metric: a metric must be made of the tensors. Choose inverse, tensor or adjugate")
+        raise ValueError("--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate")
 
 
 def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:
@@ -186,7 +186,7 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
         return read_mask(path)
     numbers = optional("nibabel.freesurfer").read_label(path)
     if numbers.size == 0 or numbers.max() >= n_vertices:
-        raise ValueError(f"--inside: got {numbers.size} vertices in {path}; expected vertices from 0 to {n_vertices - 1}")
+        raise ValueError(f"--inside: got {numbers.size} vertices in {path}; expected indices 0 … {n_vertices - 1}")
     return np.isin(np.arange(n_vertices), numbers)
 
 
