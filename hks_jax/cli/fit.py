@@ -129,7 +129,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> TensorField:
-    """Return the initial field on the target's grid."""
     if args.init is None:
         unit = np.eye(grid.dimension, dtype=args.dtype)
         return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
@@ -154,7 +153,6 @@ def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> Tensor
 
 
 def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str, Any], progress: Progress) -> Done:
-    """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json."""
     from hks_jax.plot import fit_panels, save_figure
     from hks_jax.plot.signature import placed
 

@@ -107,7 +107,6 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
 
 
 def _lines(description: dict[str, Any]) -> list[str]:
-    """Return the description as lines of text."""
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     words = next((words for words in WORDS.values() if words.simplices in description), None)
     if words is not None:

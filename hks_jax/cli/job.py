@@ -31,8 +31,7 @@ class ComputationError(RuntimeError):
 class Settings:
     """The settings of a computation, with the names of the options.
 
-    The metric is None only for meshes. If the boundary is None, a volume has its `default_boundary`, and a mesh has the
-    natural boundary condition.
+    The metric is None only for meshes. The boundary None means `default_boundary` for a volume, natural for a mesh.
     """
 
     metric: MetricChoice | None

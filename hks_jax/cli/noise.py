@@ -73,7 +73,6 @@ def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -
 
 
 def _noise(args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progress: Progress) -> hj.TensorNoise:
-    """Return the noise of the tensors according to ``--noise``."""
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: got residuals, which need a fit to diffusion-weighted images (--bval, --bvec)")

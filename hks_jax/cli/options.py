@@ -54,8 +54,7 @@ file FILE...
 [invalid] tensors that are not positive definite: by default, they raise an error
 --repair HOW[:FLOOR]
     repair of a few tensors: clip raises their eigenvalues to FLOOR (1 % of the median mean eigenvalue), mask leaves
-    their voxels out, nearest uses the nearest valid tensor. With FLOOR, tensors with a smaller eigenvalue are repaired
-    too
+    their voxels out, nearest uses the nearest valid tensor. FLOOR also adds tensors with a smaller eigenvalue
 --positive HOW:NUMBER
     map for tensors T that are naturally indefinite, such as stress: exp:S uses exp(T/S) and shift:C uses T + C·I as the
     metric; combine it with --metric tensor
@@ -181,7 +180,6 @@ class Section(NamedTuple):
 
 
 def _sections(text: str) -> list[Section]:
-    """Parse options in the format of the table."""
     found = [Section("", "", "", [])]
     for line in re.sub(r"\n {4}", "  ", text).splitlines():
         if line.startswith("@"):

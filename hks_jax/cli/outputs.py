@@ -48,8 +48,7 @@ def writing(
 ) -> Iterator[tuple[Path, Done]]:
     """Yield a temporary folder, and a `Done` to which the report and the paths of the results are added at the end.
 
-    At the end, the function also writes report.json, moves all files to `folder` atomically, and deletes the files that
-    `stale` returns.
+    Then the function also writes report.json, moves all files to `folder` atomically, and deletes the `stale` files.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:

@@ -124,7 +124,6 @@ class Progress:
                     self._draw()
 
     def _draw(self) -> None:
-        """Redraw the last line on the terminal."""
         with self._lock:
             self.stream.write(f"\r{self._line()[: shutil.get_terminal_size().columns - 1]}\x1b[K")
             self.stream.flush()

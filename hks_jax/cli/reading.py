@@ -44,8 +44,7 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
     """Read or fit the tensors, and apply the options for the slice, the mask and the repair.
 
-    Questions are passed to `ask`, or else become warnings. If ``args.strict_unit`` is set, an implausible unit without
-    ``--unit`` raises an error.
+    Questions go to `ask` or become warnings. With ``args.strict_unit``, an implausible unit without ``--unit`` fails.
     """
     with progress.stage("reading", str(args.file)):
         volume, mask = _load(args)

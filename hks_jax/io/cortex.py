@@ -1,9 +1,8 @@
 """Read surfaces in GIFTI and FreeSurfer's format through the optional library nibabel.
 
-A file may give vertices in a local coordinate system, and a transformation to the scanner's coordinates. FreeSurfer's
-origin is the centre c of a volume with the axes x̂, ŷ, ẑ, all of which the file states. In FreeSurfer's coordinates
-these axes are −e₁, −e₃ and e₂, the columns of S ([coordinate
-systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)), so the vertex v is at c + [x̂ ŷ ẑ] Sᵀv.
+A file may have vertices in local coordinates, and a transformation to the scanner's coordinates. FreeSurfer's origin is
+the centre c of a volume with axes x̂, ŷ, ẑ. In its coordinates, these axes are −e₁, −e₃ and e₂, the columns of S
+([systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)), so the vertex v is at c + [x̂ ŷ ẑ] Sᵀv.
 """
 
 import gzip
@@ -88,10 +87,7 @@ def load_gifti(path: Path, in_space: bool = False) -> Loaded:
             raise ValueError(f"got {numbers} arrays of points and of triangles; expected one of each")
         vertices, faces = (np.asarray(arrays[0].data) for arrays in arrays_of_kinds)
         if vertices.ndim != 2 or faces.ndim != 2 or faces.dtype.kind not in "iu":
-            raise ValueError(
-                f"got points of shape {vertices.shape} and triangles of shape {faces.shape}, {faces.dtype}; expected "
-                "(V, 3) and integers (n, 3)"
-            )
+            raise ValueError(f"got shapes {vertices.shape}, {faces.shape} ({faces.dtype}); expected (V, 3), (n, 3)")
     vertices = vertices.astype(np.float64)
     if in_space:
         vertices = _in_space(path, vertices, arrays_of_kinds[0][0])

@@ -55,9 +55,7 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
         return mask
     eroded = ndimage.binary_erosion(mask, iterations=iterations, border_value=1)
     if not eroded.any():
-        raise ValueError(
-            f"iterations: got {iterations}, which removes all {int(mask.sum())} voxels. Choose fewer iterations"
-        )
+        raise ValueError(f"iterations: got {iterations}, which removes all {int(mask.sum())} voxels. Choose fewer")
     return eroded
 
 

@@ -47,8 +47,7 @@ def through_meshio(path: Path) -> Loaded:
     others = {block.type for block in read.cells} - _OF_BOUNDARIES - {"tetra"}
     if others:
         raise ValueError(
-            f"{path}: got {', '.join(sorted(others))} cells; expected triangles, quadrilaterals or tetrahedra. Convert "
-            "the mesh first"
+            f"{path}: got {', '.join(sorted(others))} cells; expected triangles, quadrilaterals or tetrahedra"
         )
     blocks = tetrahedra or triangles
     if not blocks:
@@ -271,8 +270,7 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
         if (cut < 0).any():
             bad = which[np.argmax((cut < 0).any(axis=(1, 2)))]
             raise ValueError(
-                f"{file}: face {bad} with {size} corners has none from which all others are visible. Cut it into "
-                "triangles"
+                f"{file}: face {bad} with {size} corners is not star-shaped from a corner. Cut it into triangles"
             )
         order.append(np.repeat(which, size - 2))
         triangles.append(cut.reshape(-1, 3))

@@ -82,10 +82,9 @@ class Coherence(NamedTuple):
 def coherence(volume: TensorVolume) -> Coherence | None:
     """Measure how well fibres of neighbouring voxels line up, in the frame of the file and along alternative axes.
 
-    At each anisotropic voxel, the principal direction v is compared with the mean of the principal directions of the
-    two neighbours nearest to ±v, if both are anisotropic. In the correct frame the angle is smallest. The alternatives
-    are the frames of `hks_jax.io.read_tensors` and reversals of one axis. The result is None for a slice, and for fewer
-    than a thousand voxels with two such neighbours.
+    At an anisotropic voxel, the principal direction v is compared with the mean of the directions at the neighbours
+    nearest to ±v, if both are anisotropic. The angle is smallest in the correct frame. Alternatives are the frames of
+    `read_tensors` and reversals of an axis. The result is None for a slice, and for fewer than 1000 such voxels.
     """
     if volume.dimension != 3:
         return None

@@ -42,8 +42,7 @@ LISTED = 20
 """The largest number of voxels that a report lists."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
-"""The relative difference up to which tensors count as equal, the relative size up to which they count as zero, and
-the least share of voxels that counts as background."""
+"""The relative difference of equal tensors, the relative size of zero tensors, and the least share of background."""
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -170,8 +169,7 @@ def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> st
     return (
         "Noise does not explain this number. Tensors that are naturally indefinite, such as stress S, need a map to "
         f"positive definite ones: exp(S/s) with a scale s (|eigenvalue| ≤ {largest:.3g} for the invalid tensors), or "
-        f"S + c·I with a shift c > {-least_eigenvalue(finite):.3g}. Use positive_tensors, or --positive on the command "
-        "line"
+        f"S + c·I with a shift c > {-least_eigenvalue(finite):.3g}. Use positive_tensors or --positive"
     )
 
 

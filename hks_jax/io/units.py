@@ -54,8 +54,7 @@ def by_axis(values: Iterable[float]) -> str:
 def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Convert to mm the affine `own` of an image without a unit of length, which belongs to an image with `affine`.
 
-    Some programs lose the unit of masks and labels. Of mm, m and µm, the function chooses the unit with which both
-    images have the most similar voxel sizes.
+    Some programs lose the unit of masks and labels. The function chooses mm, m or µm for similar voxel sizes.
     """
     ratio = np.linalg.norm(affine[:3, :3]) / np.linalg.norm(own[:3, :3])
     scale = min((1.0, 1e3, 1e-3), key=lambda s: abs(math.log(ratio / s)))
@@ -81,9 +80,8 @@ def length_question(volume: TensorVolume) -> str:
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""
     return (
-        f"Wrong unit of length? The voxels have the sizes {by_axis(volume.spacing)} mm, but scans have {low:g} to "
-        f"{high:g} mm, and times scale with the square of lengths. Correct the unit in the header (NIfTI: xyzt_units; "
-        "NRRD: space units), or the voxel sizes"
+        f"Wrong unit of length? The voxel sizes are {by_axis(volume.spacing)} mm, but scans have {low:g} to {high:g} "
+        "mm. Correct the unit in the header (NIfTI: xyzt_units; NRRD: space units), or the voxel sizes"
     )
 
 

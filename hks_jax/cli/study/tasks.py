@@ -120,7 +120,6 @@ class _Task(NamedTuple):
         return left if left.signature or left.regions else None
 
     def run(self, progress: StudyProgress) -> None:
-        """Compute the missing parts."""
         study, subject = self.study, self.subject
         if self.signature:
             _compute(study, subject, self.fingerprint, progress)
@@ -135,7 +134,6 @@ class _Task(NamedTuple):
 
 
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
-    """Compute and write the signature of a subject."""
     study.forget(subject)
     args, solved = subject.args, _pairs(study, subject, progress)
     scaled: dict[str, np.ndarray] = {}
