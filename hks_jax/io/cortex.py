@@ -14,7 +14,7 @@ import numpy as np
 
 from hks_jax.io.mesh_formats import Loaded
 from hks_jax.optional import optional
-from hks_jax.reading import reading
+from hks_jax.storage import reading
 
 _TRIANGLES = b"\xff\xff\xfe"
 """The first bytes of FreeSurfer's files of triangles."""

@@ -21,7 +21,7 @@ from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
 from hks_jax.io.volume import TensorVolume, as_mask, describe, digest
 from hks_jax.io.vtk_image import by_time
-from hks_jax.npz import write_npz
+from hks_jax.storage import write_npz
 
 
 def read_tensors(

@@ -13,7 +13,7 @@ from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
 from hks_jax.io.volume import TensorVolume, as_mask, corners
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:

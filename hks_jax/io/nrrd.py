@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import PATIENT, check_data, check_header, space_of
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, reading
 
 KINDS = {
     f"{d}D-{masked}{symmetric}matrix": (d * (d + 1) // 2 if symmetric else d * d) + bool(masked)

@@ -14,12 +14,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from hks_jax.atomic import atomic_path
 from hks_jax.io.tensor_order import matrices, nearest_rotation
 from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors, placed
-from hks_jax.npz import load_npz
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, load_npz, reading
 
 _ROOM, _RATIO = 8 << 30, 200
 """The limit of memory for reading a file, in bytes, and its increase per byte of the file."""

@@ -20,7 +20,6 @@ import pytest
 from annotations import unchecked
 
 import hks_jax as hj
-from hks_jax.atomic import claim
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.job import Settings
 from hks_jax.cli.progress import StudyProgress
@@ -32,6 +31,7 @@ from hks_jax.io.components import component_of
 from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.pairs import pairs_of
 from hks_jax.io.tables import read_table, write_table
+from hks_jax.storage import claim
 
 ROOT = Path(__file__).resolve().parents[2]
 BRAINS = ROOT.parent / "shared" / "data"
@@ -530,7 +530,7 @@ def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypat
 @pytest.mark.slow
 def test_a_claim_is_free_again_when_its_process_dies(tmp_path):
     file = tmp_path / "deep" / "claim"
-    code = f"from hks_jax.atomic import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
+    code = f"from hks_jax.storage import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
         assert process.stdout.readline() == "mine\n"
