@@ -31,8 +31,8 @@ file FILE...
     the metric that is made of the diffusion tensors D. inverse: D⁻¹, in which two points are near if water diffuses
     quickly between them, as along a fibre; t is then the time of diffusion, in s for D in mm2/s and voxels in mm. This
     is the usual choice for diffusion MRI. tensor: D itself, in which points are near if diffusion is slow. adjugate:
-    |D|D⁻¹, which is D⁻¹ with other areas. The option is required except for NumPy's files, whose tensors are the metric
-    by default
+    |D|D⁻¹, which is D⁻¹ times the determinant of D. The option is required except for NumPy's files, whose tensors are
+    the metric by default
 [voxels] voxels
 --slice AXIS=N  one slice, such as z=14, instead of the volume
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
@@ -83,8 +83,8 @@ file FILE...
     different conditions at the two sides of an axis, as in neumann:dirichlet,neumann (default: mean if the domain has a
     mask, otherwise neumann; neumann for meshes and spectra; for a study, its previous condition, at first mean)
 -k K
-    number of eigenpairs, for mean of both problems together (default 200, or 100 for a volume, or a quarter of the
-    unknowns if that is less)
+    number of eigenpairs; for the boundary mean, the number for both problems together (default 200, or 100 for a
+    volume, or a quarter of the unknowns if that is less)
 --solver SOLVER = auto  eigensolver
 [signature] the signature
 --times T...
@@ -92,8 +92,8 @@ file FILE...
     auto:6). 'hks-jax info FILE' shows suitable times
 --normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
 --method spectral|spectrum-free|auto = spectral
-    method: a sum over eigenpairs (default), an approximation without eigenpairs, or a choice by t, k and the spacing.
-    For auto, the report lists the times of each method and their agreement
+    method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For
+    auto, the report lists the times of each method and their agreement
 [noise] error bars
 --noise NOISE
     noise of the tensors, for error bars: a number relative to the mean diffusivity, such as 0.1; residuals, for the
@@ -139,7 +139,7 @@ class Option(NamedTuple):
 
     @classmethod
     def of(cls, line: str) -> "Option":
-        """Read a line of the table."""
+        """Parse a line of the table."""
         written, _, text = line.partition("  ")
         flags, _, rest = written.partition(" ")
         word, _, default = rest.partition(" = ")

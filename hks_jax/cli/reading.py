@@ -142,4 +142,4 @@ def _repaired(volume: TensorVolume, args: argparse.Namespace) -> TensorVolume:
     if args.repair is None:
         return volume
     volume = repair_tensors(volume, *args.repair)
-    return volume if volume.repair["voxels"] else replace(volume, notes=(*volume.notes, "repair: not needed"))
+    return volume if volume.repair["voxels"] else replace(volume, notes=(*volume.notes, "repair: no tensor needs it"))

@@ -195,7 +195,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
     flat = (np.diff(np.sort(cells, axis=1), axis=1) == 0).any(axis=1)
     if cells.shape[1] == 3:
         cells, flipped = _without_thin(loaded.vertices, cells[~flat])
-        say(flipped, "edges flipped that passed through a vertex")
+        say(flipped, "edges through a vertex flipped")
     else:
         inverted = signed_measure(loaded.vertices, cells)[0] < 0
         say(int(inverted.sum()), f"{words.simplices} of negative orientation reversed")

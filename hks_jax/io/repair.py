@@ -133,7 +133,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
     mask, tensors, covariance = volume.mask, volume.tensors.copy(), volume.covariance
     if method == "mask":
-        mask, done = inside & ~bad, "left out"
+        mask, done = inside & ~bad, "their voxels are left out"
     elif method == "clip":
         if report["not_finite"]:
             raise ValueError(
@@ -145,18 +145,18 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             report["floor"] = floor = 0.01 * float(np.median(typical))
         tensors[bad], done = (
             _of_eigenvalues(tensors[bad], partial(np.maximum, floor)),
-            f"eigenvalues raised to {floor:.3g}",
+            f"their eigenvalues are raised to {floor:.3g}",
         )
     else:
         nearest = ndimage.distance_transform_edt(
             bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
         )
-        source, done = tuple(index[bad] for index in nearest), "replaced by the nearest valid one"
+        source, done = tuple(index[bad] for index in nearest), "they are replaced by the nearest valid tensor"
         tensors[bad] = tensors[source]
         if covariance is not None:
             covariance = covariance.copy()
             covariance[bad] = covariance[source]
-    notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}: {done}")
+    notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
     return replace(volume, tensors=tensors, mask=mask, covariance=covariance, repair=report, notes=notes)
 
 

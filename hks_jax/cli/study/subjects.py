@@ -71,7 +71,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
         words, covariates = _words(path.parent, row)
         try:
             if not words or words[0].startswith("--"):
-                raise ValueError("got no file; expected one in the column file")
+                raise ValueError("got no file; expected one per row")
             arguments, problem = parser.parse_args(words, copy.copy(common)), ""
             if second_scan(arguments) is not None:
                 arguments.noise = str(path.parent / arguments.noise)
