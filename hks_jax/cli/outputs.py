@@ -26,7 +26,7 @@ _OPTIONAL = ("nibabel", "dipy", "pynrrd", "vtk", "meshio")
 
 
 class Done(NamedTuple):
-    """The output of a command: the names of its files or a replacing text, and a summary for JSON."""
+    """The output of a command: the names of its files, or a text in place of the names, and a summary for JSON."""
 
     files: list[Path]
     summary: dict[str, Any]

@@ -47,7 +47,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
         end = start + 8 + 12 * (n_vertices + n_faces)
         if min(n_vertices, n_faces) < 0 or end > len(content):
             raise ValueError(
-                f"{n_vertices} vertices and {n_faces} triangles, as declared, need {end} bytes; got {len(content)}"
+                f"got {len(content)} bytes; expected {end} for the declared {n_vertices} vertices, {n_faces} triangles"
             )
         vertices, faces = library.freesurfer.read_geometry(path)
     vertices = np.asarray(vertices, np.float64)
@@ -94,8 +94,8 @@ def load_gifti(path: Path, in_space: bool = False) -> Loaded:
     return Loaded(vertices, faces.astype(np.int64), {})
 
 
-# Workbench declares the coordinates of every file as an atlas's. Coordinates so declared, or of an unknown space, stay
-# unchanged, unless FreeSurfer wrote the file in its own coordinates.
+# Workbench declares the coordinates of every file as coordinates of an atlas. With this declaration, or with an unknown
+# space, coordinates stay unchanged, unless FreeSurfer wrote the file in its own coordinates.
 def _in_space(path: Path, vertices: np.ndarray, points: Any) -> np.ndarray:
     """Return scanner coordinates, by the transformation in the file or by the position of FreeSurfer's volume."""
     system, told = points.coordsys, dict(points.meta)

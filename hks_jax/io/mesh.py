@@ -39,7 +39,7 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
     ``.vtp``; nibabel reads GIFTI (``.gii``) and FreeSurfer's surfaces (``lh.white``, …, recognised by their first
     bytes). The formats ``.obj`` and ``.off`` need no library.
 
-    Quadrilaterals are cut into triangles; in polygonal data, OBJ and OFF, so are all polygons. Vertices keep their
+    Quadrilaterals are cut into triangles. In polygonal data, OBJ and OFF, all polygons are cut. Vertices keep their
     order. In STL, coincident corners of triangles become one vertex. Cells of lower dimension beside tetrahedra are
     ignored. A warning reports coincident vertices, as at the seams of a texture, because the surface is torn there.
 

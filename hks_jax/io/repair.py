@@ -42,7 +42,7 @@ LISTED = 20
 """The largest number of voxels that a report lists."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
-"""The relative difference of equal tensors, the relative size of zero tensors, and the least share of background."""
+"""The tolerances for equal and for zero tensors, both relative, and the least share of voxels in the background."""
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -161,7 +161,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
-    """Return a possible reason why many tensors are invalid, such as a wrong order; `finite` holds the finite ones."""
+    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` holds their finite ones."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if question or not len(finite):
         return question or "Noise does not explain this number. Programs often write NaN outside a mask"

@@ -95,7 +95,7 @@ def _indices(order: str, d: int) -> list[tuple[int, int]]:
 
 
 _SAMPLE = 20_000
-"""The number of tensors that are checked first; only if many of these are invalid are all checked."""
+"""The number of tensors that are checked first; all tensors are checked only if many of these are invalid."""
 
 
 class InvalidByOrder(NamedTuple):

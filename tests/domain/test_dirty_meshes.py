@@ -245,4 +245,4 @@ def test_cleaning_says_all_that_it_did_on_the_command_line(tmp_path, capsys):
     capsys.readouterr()
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (5, 5, 2, 2)))
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "o"), "--clean"]) == 2
-    assert "--clean: it is for meshes" in capsys.readouterr().err
+    assert "--clean: this option is for meshes" in capsys.readouterr().err

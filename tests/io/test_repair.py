@@ -68,7 +68,9 @@ def test_mask_and_nearest(volume):
     far = TensorVolume(volume.tensors, (3.0, 1.0), (0.0, 0.0), volume.mask)
     np.testing.assert_array_equal(repair_tensors(far, "nearest").tensors[2, 3], volume.tensors[2, 4])
     assert not find_invalid(repair_tensors(far, "nearest")).any()
-    with pytest.raises(ValueError, match='NaN or infinite and have no eigenvalues to clip; choose "mask" or "nearest"'):
+    with pytest.raises(
+        ValueError, match=r'NaN or infinite and have no eigenvalues to clip\. Choose "mask" or "nearest"'
+    ):
         repair_tensors(far, "clip")
 
 

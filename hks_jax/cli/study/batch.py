@@ -11,7 +11,7 @@ Compute the signatures of many subjects at the same times, and tables of their r
   {columns}
                    options that differ between subjects, optional; a file of noise is relative to the table's folder
 
-and any others, such as age and group, which are copied to participants.tsv. The values in a row replace those of the
+Other columns, such as age and group, are copied to participants.tsv. The values in a row replace the values of the
 command's options.
 
 DIR becomes a BIDS derivative. It contains for each subject an image with its sidecar, an .npz for hks-jax explore, plot

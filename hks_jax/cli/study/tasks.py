@@ -152,7 +152,7 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
 
 
 def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
-    """Return saved eigenpairs, or compute eigenpairs and save them if the study does."""
+    """Return saved eigenpairs, or compute eigenpairs and save them if the study saves eigenpairs."""
     kept, fingerprint = study.path(subject, PAIRS), study.pairs_fingerprint(subject)
     if are_of(kept, fingerprint):
         return read_pairs(kept, study.settings, progress)[0]
