@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.compilation import jit_quickly, known_here
 from hks_jax.eigen.complement.adjoint import (
     SINGULAR,
     Adjoint,
@@ -83,6 +84,13 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     def prepare(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Shifted:
         """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
+        if known_here((pencil, values)):
+            # One after another: the solver has compiled that.
+            dissection = jax.device_put(dissection)
+            shifts = self._shifts(pencil, np.asarray(values), self._groups(dissection, values, k))
+            each = [factorise(dissection, pencil.shifted(jnp.asarray(shift))) for shift in shifts]
+            stacked = jax.tree.map(lambda *x: np.stack(x), *((f.downward, f.upward, f.pivots) for f in each))
+            return Factorisation(dissection, *jax.device_put(stacked)), jax.device_put(shifts)
         # Compiled without the dissection: what a compiled function hands through is copied.
         factors, shifts = _factorise(dissection, pencil, values, k, self)
         return Factorisation(dissection, *factors), shifts
@@ -191,7 +199,7 @@ def _left(pencil: LocatedPencil, values: Float[Array, " p"]) -> tuple[Float[Arra
     return jnp.min(values) - pencil.spacing, jnp.max(values) + pencil.spacing
 
 
-@partial(jax.jit, static_argnames=("k", "adjoint"))
+@jit_quickly(static_argnames=("k", "adjoint"))
 def _factorise(
     dissection: Dissection, pencil: SymmetricPencil, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint
 ) -> tuple[tuple[Any, ...], Float[Array, " groups"]]:
@@ -201,7 +209,7 @@ def _factorise(
     return (factors.downward, factors.upward, factors.pivots), shifts
 
 
-@partial(jax.jit, static_argnames="adjoint")
+@jit_quickly(static_argnames="adjoint")
 def _solve(
     factors: Factorisation,
     shifts: Float[Array, " groups"],

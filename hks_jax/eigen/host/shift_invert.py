@@ -80,8 +80,7 @@ class ShiftInvert(Eigensolver[Pencil]):
         if is_traced(inputs):
             shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))
             return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
-        # Where JAX differentiates, `asarray` leaves them NumPy's, and the barrier makes JAX's arrays of them.
-        return jax.lax.optimization_barrier(tuple(map(jnp.asarray, solve(*inputs))))
+        return jax.device_put(solve(*inputs))  # `asarray` leaves them NumPy's where JAX differentiates
 
     def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float, report: Report) -> HostPairs:
         n = K.shape[0]
