@@ -183,18 +183,20 @@ def _on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
     into = np.where(apart[:, :k], inverse[:, :k] * within, 0) + np.diag(of_values)
     force = into @ functions + onto(of_vectors + of_frame)
     moved = np.where(apart[:, :k], 0, -within / 2) @ functions - eigenvalues * force
-    return change_of(change, (force, functions), (moved, functions))
+    return change_of(change, functions, force, moved)
 
 
-def change_of(change: SymmetricPencil, *outer: tuple[np.ndarray, np.ndarray]) -> SymmetricPencil:
-    """Return a pencil of zeros, but for Σ pxᵀ in place of the entries of stiffness and mass, given (p, x) for each."""
+def change_of(
+    change: SymmetricPencil, x: Float[np.ndarray, "b n_dof"], *p: Float[np.ndarray, "b n_dof"]
+) -> SymmetricPencil:
+    """Return a pencil of zeros, but for Σ pxᵀ in place of the entries of stiffness and mass, given p for each."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
-    matrices = zeros.stiffness, zeros.mass
-    return eqx.tree_at(
-        lambda pencil: (pencil.stiffness, pencil.mass),
-        zeros,
-        tuple(matrix.outer(*each) for matrix, each in zip(matrices, outer, strict=True)),
+    columns = np.ascontiguousarray(x.T)
+    matrices = tuple(
+        matrix.outer(np.ascontiguousarray(each.T), columns)
+        for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True)
     )
+    return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
 
 
 def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:

@@ -45,8 +45,8 @@ class Operator(eqx.Module):
         """Return the entries and their static (rows, columns)."""
 
     @abstractmethod
-    def outer(self, p: Float[np.ndarray, "b n_dof"], x: Float[np.ndarray, "b n_dof"]) -> "Operator":
-        """Return Σ pxᵀ where the matrix has entries, by NumPy: the derivative of Σ p·Ax by A."""
+    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "Operator":
+        """Return pxᵀ where the matrix has entries, by NumPy: the derivative of Σ p·Ax by A."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -107,11 +107,10 @@ class PatternedOperator(Operator):
     def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
         """Return the matrix with other entries at the same places."""
 
-    def outer(self, p: Float[np.ndarray, "b n_dof"], x: Float[np.ndarray, "b n_dof"]) -> "PatternedOperator":
-        """Return Σ pxᵀ where the matrix has entries, by NumPy."""
+    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "PatternedOperator":
+        """Return pxᵀ where the matrix has entries, by NumPy."""
         where, rows, cols = self.pattern.places()
         entries = np.zeros(self.pattern.n_entries, x.dtype)
-        p, x = (np.ascontiguousarray(each.T) for each in (p, x))
         for start in range(0, where.size, _PLACES):
             some = slice(start, start + _PLACES)
             entries[where[some]] = np.einsum("ib,ib->i", p[rows[some]], x[cols[some]])
@@ -205,9 +204,9 @@ class DiagonalOperator(Operator):
         """The number of rows, n_dof."""
         return self.entries.shape[0]
 
-    def outer(self, p: Float[np.ndarray, "b n_dof"], x: Float[np.ndarray, "b n_dof"]) -> "DiagonalOperator":
-        """Return the diagonal of Σ pxᵀ, by NumPy."""
-        return DiagonalOperator(jax.device_put(np.einsum("bi,bi->i", p, x)))
+    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "DiagonalOperator":
+        """Return the diagonal of pxᵀ, by NumPy."""
+        return DiagonalOperator(jax.device_put(np.einsum("ib,ib->i", p, x)))
 
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""

@@ -109,4 +109,4 @@ def on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
     d_frame = np.zeros(x[3].shape, x[3].dtype)
     d_frame[rows] = np.where(kept[:, None], 2 * vectors * (weights.T @ y[0]), 0)
     images = (transferred(copies * each @ vectors, space, change.space) for each in (stiffness, mass))
-    return d_frame, change_of(change, *((image, moved) for image in images))
+    return d_frame, change_of(change, moved, *images)
