@@ -1,4 +1,4 @@
-"""What stands beside every measurement: the machine, the versions, and where the result is written."""
+"""The record of a measurement: the machine, the versions, and the file."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def timed_from_cold(function: Callable[..., Any], *args: Any, repeats: int) -> t
 
 
 def timed_once(function: Callable[..., Any], *args: Any, **more: Any) -> tuple[float, Any]:
-    """Return the time of one call, whatever it compiles included, and its result."""
+    """Return the time of one call, compilation included, and its result."""
     start = time.perf_counter()
     result = jax.block_until_ready(function(*args, **more))
     return time.perf_counter() - start, result

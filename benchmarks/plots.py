@@ -99,7 +99,7 @@ PLOTS: dict[str, Callable[[Figure], None]] = {
 
 
 def source(name: str) -> str:
-    """Return what a plot was made from, as it stands in its file."""
+    """Return the source of a plot, as it stands in its file."""
     digest = hashlib.sha256((RESULTS / f"{name}.json").read_bytes()).hexdigest()
     return f"benchmarks/results/{name}.json, SHA-256 {digest}"
 

@@ -1,17 +1,19 @@
 """Tables of the stored results, written into the pages that show them.
 
     python benchmarks/tables.py            writes the tables, and the plots whose results have changed
-    python benchmarks/tables.py --check    tells of what differs from the results, and fails (a test does the same)
+    python benchmarks/tables.py --check    names pages that differ from the results, and fails (a test does the same)
 
-In README.md, benchmarks/README.md and the pages in docs/ stand comments that say what follows them, up to
+README.md, the pages in docs/ and those in benchmarks/ hold comments that name their content, up to
 ``<!-- end -->``:
 
-    <!-- measured: machine FILE -->                          what it was measured on, and the file
+    <!-- measured: machine FILE -->                          the machine, and the file
     <!-- measured: table FILE[/PART] COLUMN COLUMN … -->     one line per row of the results
     <!-- measured: table FILE ROWS | COLUMNS | VALUE -->     values of one column in the rows and columns of others
     <!-- measured: plot NAME -->                             one of `plots.PLOTS`
 
-A column written ``nodes³`` is that of cubes, ``nodes²`` that of squares: 64³ and 512² are the same number.
+A column written ``nodes³`` is that of cubes, ``nodes²`` that of squares: 64³ and 512² are the same number. Among the
+columns ``NAME=PATTERN,PATTERN…`` chooses rows by their entry as one reads it; ``*`` and ``?`` stand for any characters,
+spaces and commas included.
 """
 
 import json
@@ -19,6 +21,7 @@ import math
 import os
 import re
 import sys
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -85,11 +88,11 @@ MARKED = re.compile(r"<!-- measured: (.*?) -->(?:\n\n(?:(?!<!-- measured).)*?<!-
 
 def pages() -> list[Path]:
     """Return the pages that may show results."""
-    return [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [ROOT / "README.md", *sorted((ROOT / "benchmarks").rglob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def filled(page: Path) -> str:
-    """Return a page with what its comments ask for."""
+    """Return a page with the content that its comments name."""
 
     def fill(found: re.Match) -> str:
         return f"<!-- measured: {found[1]} -->\n\n{section(found[1], page)}\n\n<!-- end -->"
@@ -98,7 +101,7 @@ def filled(page: Path) -> str:
 
 
 def section(request: str, page: Path) -> str:
-    """Return what a comment in a page asks for, as Markdown.
+    """Return the content that a comment names, as Markdown.
 
     Raises:
         ValueError: a request of another kind.
@@ -157,7 +160,7 @@ def flat(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def machine(name: str, page: Path) -> str:
-    """Return what a result was measured on, and a link to it."""
+    """Return the machine of a result, and a link to it."""
     content = load(name)
     on, versions = content["machine"], content["versions"]
     note = f" {content['note'][0].upper()}{content['note'][1:]}." if "note" in content else ""
@@ -203,13 +206,30 @@ def grid_of(head: list[str], body: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def table(name: str, columns: list[str]) -> str:
+def chosen(name: str, request: list[str]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the rows of a result that a request chooses, and the columns that it names.
+
+    Raises:
+        ValueError: no row matches.
+    """
+    filters = [item.split("=", 1) for item in request if "=" in item]
+    rows = [
+        row
+        for row in rows_of(name)
+        if all(any(fnmatchcase(entry(row, of), pattern) for pattern in known.split(",")) for of, known in filters)
+    ]
+    if not rows:
+        raise ValueError(f"measured: no row of {name} matches {filters}")
+    return rows, [item for item in request if "=" not in item]
+
+
+def table(name: str, request: list[str]) -> str:
     """Return a table of some columns.
 
     Raises:
         ValueError: a column that no row has.
     """
-    rows = rows_of(name)
+    rows, columns = chosen(name, request)
     for column in columns:
         if not any(column.rstrip("²³") in row for row in rows):
             raise ValueError(f"measured: no row of {name} has {column!r}; there are {', '.join(rows[0])}")
@@ -218,8 +238,8 @@ def table(name: str, columns: list[str]) -> str:
 
 def pivot(name: str, request: str) -> str:
     """Return one column's values in the rows and columns of others."""
-    left, (top,), (value,) = (part.split() for part in request.split("|"))
-    rows = rows_of(name)
+    before, (top,), (value,) = (part.split() for part in request.split("|"))
+    rows, left = chosen(name, before)
     tops = list(dict.fromkeys(row[top] for row in rows))
     cells: dict[tuple[str, ...], dict[Any, dict[str, Any]]] = {}
     for row in rows:
@@ -238,20 +258,20 @@ def named() -> set[str]:
 
 
 def differences() -> list[str]:
-    """Return what a reader would see that is not what the results say."""
+    """Return the pages and pictures that differ from the results."""
     from plots import PLOTS, is_current
 
     found = [f"{page.relative_to(ROOT)}: its tables" for page in pages() if filled(page) != page.read_text("utf-8")]
     found += [f"docs/images/measured/{name}.svg" for name in PLOTS if not is_current(name)]
     unseen = {path.stem for path in RESULTS.glob("*.json")} - named()
-    return found + [f"benchmarks/README.md: {name}.json is shown nowhere" for name in sorted(unseen)]
+    return found + [f"benchmarks/results/{name}.json is shown nowhere" for name in sorted(unseen)]
 
 
 def main() -> None:
     """Write all tables and plots, or tell which differ."""
     if sys.argv[1:] == ["--check"]:
         if found := differences():
-            sys.exit("\n".join(["error: not what benchmarks/results/ say; run `make tables`:", *found]))
+            sys.exit("\n".join(["error: these differ from benchmarks/results/; run `make tables`:", *found]))
         return
     from plots import PLOTS, is_current, write
 

@@ -24,8 +24,7 @@ HEAD = """\
 # Gallery
 
 Every picture of `hks_jax.plot`, with the function of [gallery.py](gallery.py) that draws it. The site shows its code
-below the picture. Most functions draw on given axes, so pictures compose. `hks_panels`, `volume_panels`, `time_rows`
-and `fit_panels` make a figure. `python docs/gallery.py` draws the pictures and writes this page.
+below the picture. `python docs/gallery.py` draws the pictures and writes this page.
 """
 
 IMPORTS = """\
@@ -255,8 +254,7 @@ def fit() -> Figure:
     hidden = hj.TensorField(grid, jnp.exp(0.4 * jnp.sin(3 * x) * jnp.cos(2 * y))[..., None, None] * jnp.eye(2))
     times = jnp.geomspace(0.01, 0.1, 4)
     target = hj.hks(hj.eigenpairs(hidden, k=400), times)
-    start = hj.TensorField(grid, jnp.broadcast_to(jnp.eye(2), (20, 20, 2, 2)))
-    return plot.fit_panels(hj.fit_metric(target, times, start, "conformal"), target, times, max_times=2)
+    return plot.fit_panels(hj.fit_metric(grid, target, times, "conformal"), target, times, max_times=2)
 
 
 def volume() -> Figure:

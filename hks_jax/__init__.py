@@ -20,12 +20,11 @@ from hks_jax.curvature import scalar_curvature as scalar_curvature
 from hks_jax.domain.degenerate import DegeneratePoints as DegeneratePoints
 from hks_jax.domain.degenerate import degenerate_points as degenerate_points
 from hks_jax.domain.grid import Grid as Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh as SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh as SurfaceMesh
+from hks_jax.domain.simplicial_mesh import TetMesh as TetMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
-from hks_jax.domain.tet_mesh import TetMesh as TetMesh
 from hks_jax.eigen.complement.adjoint import Adjoint as Adjoint
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint as FactorisedAdjoint
-from hks_jax.eigen.count import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.driver import eigenpairs as eigenpairs
 from hks_jax.eigen.driver import eigsh as eigsh
@@ -35,6 +34,7 @@ from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter as ChebyshevFi
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint as FilteredAdjoint
 from hks_jax.eigen.host.host_adjoint import HostAdjoint as HostAdjoint
 from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert
+from hks_jax.eigen.inertia import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos as BlockLanczos
 from hks_jax.eigen.solver import Eigensolver as Eigensolver
 from hks_jax.eigen.weyl import weyl_count as weyl_count

@@ -64,18 +64,18 @@ def require_count(name: str, value: Any, least: int = 1) -> None:
     raise ValueError(f"{name}: got {value!r}; expected an integer from {least}")
 
 
-def checked_times(name: str, times: Any, dtype: Any) -> Float[Array, " n"]:
+def checked_times(times: Any, dtype: Any) -> Float[Array, " n"]:
     """Return times as an array (n,); raise ValueError unless they are 1-D, positive and finite."""
-    require_real(name, times)
+    require_real("times", times)
     try:
         array = jnp.asarray(times, dtype)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: got {times!r}; expected a 1-D array of positive numbers") from None
+        raise ValueError(f"times: got {times!r}; expected a 1-D array of positive numbers") from None
     if array.ndim != 1 or array.size == 0:
-        raise ValueError(f"{name}: got shape {array.shape}; expected a non-empty 1-D array; wrap one time as [t]")
+        raise ValueError(f"times: got shape {array.shape}; expected a non-empty 1-D array; wrap one time as [t]")
     if not is_traced(array):
         values = np.asarray(array)
         bad = ~(np.isfinite(values) & (values > 0))
         if bad.any():
-            raise ValueError(f"{name}: got {values[bad][0]}; expected positive finite times")
+            raise ValueError(f"times: got {values[bad][0]}; expected positive finite times")
     return array

@@ -52,7 +52,7 @@ rng = np.random.default_rng(0)
 target = exact * np.exp(noise * rng.standard_normal(exact.shape))
 
 # %%
-fit = hj.fit_metric(target, times, init, noise=noise, k=k, progress=print)
+fit = hj.fit_metric(init, target, times, data=hj.inverse.Data(noise=noise), k=k, progress=print)
 print(fit)
 
 

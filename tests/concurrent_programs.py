@@ -121,7 +121,13 @@ def fit():
     times = [0.1, 0.3]
     target = hj.hks(hj.eigenpairs(truth, 30, "mean", multiplet="drop", solver="block-lanczos"), times)
     start = field(flat(12, 12), "mean")
-    return (lambda: hj.fit_metric(target, times, start, "conformal", boundary="mean", max_steps=3).loss,)
+    return (
+        lambda: (
+            hj.fit_metric(
+                start, target, times, "conformal", boundary="mean", search=hj.inverse.Search(max_steps=3)
+            ).loss
+        ),
+    )
 
 
 PROGRAMS = {

@@ -26,20 +26,24 @@ PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
-    "benchmarks/README.md": "performance.md",
+    "benchmarks/README.md": "performance/index.md",
+    **{
+        f"benchmarks/{path.parent.name}/README.md": f"performance/{path.parent.name}.md"
+        for path in sorted((ROOT / "benchmarks").glob("*/README.md"))
+    },
 }
 """Markdown outside docs/, and where it is on the site."""
 
 FOLDERS = {
     "notebooks": "notebooks/quickstart.md",
-    "benchmarks": "performance.md",
-    "benchmarks/results": "performance.md",
+    "benchmarks": "performance/index.md",
+    "benchmarks/results": "performance/index.md",
 }
 """Where a link to a folder leads."""
 
 FILES = (
     "notebooks/*.py",
-    "benchmarks/*.py",
+    "benchmarks/*/*.py",
     "benchmarks/results/*.json",
     "references.bib",
     "CITATION.cff",

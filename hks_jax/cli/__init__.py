@@ -111,8 +111,8 @@ def run_and_exit() -> NoReturn:
 
 
 def _interrupt_again(unraisable: Any) -> None:
-    # Python discards what is raised in finalisers and in callbacks of the garbage collector (JAX has one). An interrupt
-    # that lands there comes again a moment later, when the callback is over.
+    # Python discards exceptions in finalisers and in callbacks of the garbage collector (JAX has one). An interrupt
+    # there comes again a moment later, when the callback is over.
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
         threading.Timer(0.05, _thread.interrupt_main).start()
     else:

@@ -26,7 +26,7 @@ from hks_jax.io.formats import WRITTEN
 
 OPTIONS = f"""
 @file @metric {READING} @domain @dtype @output
---periodic x|y|xy  axes of which node n is node 0 (default none)
+--periodic x|y|xy  periodic axes: behind the last node comes the first again (default none)
 @view
 """
 
@@ -50,10 +50,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     with progress.stage("curvature", f"{int(inside.sum())} nodes"):
         curvature = np.asarray(gaussian_curvature(field, ["x" in periodic, "y" in periodic]))
     known = np.isfinite(curvature)
-    lacking = int((inside & ~known).sum())
     if not known.any():
         raise ValueError("tensors: no grid line inside the mask has the 8 nodes that the differences need")
-    if lacking:
+    if lacking := int((inside & ~known).sum()):
         progress.note(f"{lacking} nodes are too near the mask's rim for the differences: NaN there")
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]
     values = curvature[known].astype(np.float64)

@@ -35,7 +35,7 @@ B_MAX = 1000.0
 RIM = 2
 """Voxels taken off the mask: at the rim, tissue mixes with what surrounds it and fits fail."""
 SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
-"""How far the heat has spread, √(Dt), at the times drawn: in voxels, from what they resolve to the brain's size."""
+"""How far the heat has spread, √(Dt), at the times drawn: in voxels, from their resolution to the brain's size."""
 N_PAIRS = 600
 """Of the two problems whose mean it is: enough for the first of these times."""
 PHANTOM_SHAPE = (72, 80)
@@ -46,7 +46,14 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot import number_text, signature_panels
 
     brain = None if args.phantom else _installed_brain(progress)
-    volume = _volume(brain, progress)
+    if brain is None:
+        tensors, mask, spacing = map(np.asarray, examples.phantom(PHANTOM_SHAPE))
+        h = tuple(np.broadcast_to(spacing, (2,)).astype(float).tolist())
+        volume = TensorVolume(tensors, h, (0.0, 0.0), mask.astype(bool), source="phantom")
+    else:
+        with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
+            volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
+            volume = volume.with_mask(erode(volume.inside, RIM))
     mean = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
     lengths = min(volume.spacing) * SPREADS
     times = lengths**2 / np.median(mean[volume.mask])
@@ -74,14 +81,3 @@ def _installed_brain(progress: Progress) -> ExampleBrain | None:
         progress.note('no tensor fit: DIPY is not installed (pip install "hks-jax[dti]"); using the phantom')
         brain = None
     return brain
-
-
-def _volume(brain: ExampleBrain | None, progress: Progress) -> TensorVolume:
-    """Return a slice of the brain, or the phantom."""
-    if brain is None:
-        tensors, mask, spacing = examples.phantom(PHANTOM_SHAPE)
-        h: tuple[float, ...] = tuple(np.broadcast_to(np.asarray(spacing, float), (2,)).tolist())
-        return TensorVolume(np.asarray(tensors), h, (0.0, 0.0), np.asarray(mask, bool), source="phantom")
-    with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
-        plane = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
-        return plane.with_mask(erode(plane.inside, RIM))

@@ -22,8 +22,7 @@ from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.stats import names_of
-from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io.masks import read_labels
 from hks_jax.io.result import Result, signature_file
 from hks_jax.io.volume import TensorVolume
@@ -50,17 +49,15 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("names",), "it names labels; pass --labels too")
     with progress.stage("reading", str(source)):
         result = Result.read(source, "hks", over_times=True)
-        place, shape, affine, world = result.place, result.values.shape[1:], None, None
+        place, affine, world = result.place, None, None
         if isinstance(place, TetMesh):
-            raise ValueError(
-                f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu beside it"
-            )
+            raise ValueError(f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu there")
         if isinstance(place, TensorVolume) and place.affine is not None:
             affine, axes = place.affine, [a for a in range(4) if place.dimension == 3 or a != place.thin_axis]
             world = affine[:3, axes]
         labels, names = None, None
         if args.labels is not None:
-            labels = read_labels(args.labels, shape, affine, getattr(place, "slice_axis", None))
+            labels = read_labels(args.labels, place)
             names = names_of(args.labels, args.names)[1] or None
     with progress.stage("writing", str(page)):
         explore(

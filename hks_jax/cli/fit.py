@@ -15,7 +15,6 @@ import json
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
-from hks_jax.io.result import Result, recorded_boundary
+from hks_jax.io.result import Result, plain, recorded_boundary
 from hks_jax.io.volume import digest
 
 OPTIONS = f"""
@@ -45,7 +44,7 @@ target TARGET  the signature: .npz
     eigenvalues, or the rotation
 --boundary CONDITION
     the target's, written as for 'hks-jax hks' (default what TARGET says of itself, else neumann)
--k K  number of eigenpairs (default: so many that 1e-6 of the heat trace at the smallest time is left out)
+-k K  number of eigenpairs (default: all but 1e-6 of the heat trace at the smallest time)
 --noise SIGMA  standard deviation of the logarithm of the target (0.01 for 1 %): stop where the misfit reaches it
 --smoothness LENGTH
     length, in units of the spacing, below which steps are smooth (default a tenth of the domain, and 0 for conformal
@@ -62,8 +61,8 @@ target TARGET  the signature: .npz
 """
 
 
-_PASSED_ON = ("noise", "k", "boundary", "optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
-"""Options that `fit_metric` takes as they are, with the checkpoint."""
+_OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
+"""Options that `Search` takes as they are."""
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -72,11 +71,11 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("metric", "order"), "is about the tensors of --init; give both or none")
     elif args.metric is None and image_suffix(args.init):
         raise ValueError(
-            "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors D, which are no metric"
+            "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors, which are no metric"
         )
     from hks_jax import fit_metric
+    from hks_jax.inverse import H1, Data, Search, TotalVariation
     from hks_jax.inverse.metric_fit import RESULTS
-    from hks_jax.inverse.regulariser import H1, TotalVariation
 
     use_dtype(args.dtype)
     with progress.stage("reading", str(args.target)):
@@ -94,21 +93,23 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     weights = ((H1, args.h1), (TotalVariation, args.tv))
     with progress.stage("fitting", f"{args.parametrisation}, {int(grid.inside.sum())} nodes"):
         fit = fit_metric(
+            init,
             target.values,
             target.times,
-            init,
             args.parametrisation,
+            data=Data(noise=args.noise),
+            k=args.k,
+            boundary=args.boundary,
+            search=Search(**{name: getattr(args, name) for name in _OF_SEARCH}),
             regularisers=[kind(weight) for kind, weight in weights if weight is not None],
             progress=lambda step: progress.update(str(step)),
             checkpoint=args.checkpoint,
-            **{name: getattr(args, name) for name in _PASSED_ON},
         )
     if not math.isfinite(fit.loss):
         raise ComputationError(f"no fit: {RESULTS['not finite']}. Check --init and -k")
     if not fit.converged:
-        progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; what was best is written")
-    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", *_PASSED_ON)
-    settings = {name: getattr(args, name) for name in names if name != "k"}
+        progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; the best metric so far is written")
+    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", "noise", "boundary", *_OF_SEARCH)
     report = {
         "target": {
             "source": str(args.target),
@@ -122,7 +123,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
         "parametrisation": args.parametrisation,
-        "settings": {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()},
+        "settings": plain({name: getattr(args, name) for name in names if name != "k"}),
     }
     return _write(args, fit, target, report, progress)
 

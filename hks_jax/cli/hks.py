@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from hks_jax import SurfaceMesh, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
@@ -38,13 +38,12 @@ from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
-from hks_jax.cli.values import parse_times
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN, is_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.result import Result
-from hks_jax.io.tensor_order import unpack
+from hks_jax.io.tensor_order import matrices
 from hks_jax.optional import optional
 
 OPTIONS = f"""
@@ -69,13 +68,12 @@ _NO_NOISE = "it is for tensors on a grid; leave it out for meshes and for eigenp
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    times = parse_times(args.times)
     if is_mesh(args.file):
-        return _on_mesh(args, Settings.of(args, metric=args.metric, times=times), progress)
+        return _on_mesh(args, Settings.of(args, metric=args.metric), progress)
     refuse(args, ("clean",), "it is for meshes; leave it out for tensors on a grid, and see --repair")
     refuse(args, ("inside",), "it is for meshes; leave it out for tensors on a grid, and see --mask")
     refuse(args, ("tensors",), "it is for a mesh that lies in a volume; leave it out for the volume itself")
-    return _on_grid(args, Settings.of(args, times=times), progress)
+    return _on_grid(args, Settings.of(args), progress)
 
 
 def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
@@ -96,7 +94,7 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
         _check_voxel(args.through, volume)
     if not saved:
         solved = compute_pairs(volume, settings, progress)
-    if args.save_pairs:  # at once: what comes after may fail, or be interrupted
+    if args.save_pairs:  # at once: later steps may fail, or be interrupted
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
@@ -136,7 +134,7 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that are for grids alone, and for tensors of which the metric is open."""
+    """Raise ValueError for options that are for grids alone, and for tensors whose metric is open."""
     refuse(args, ("noise",), _NO_NOISE)
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; tensors come from a volume, or from the mesh's own vertices")
@@ -150,7 +148,7 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
         why = "a mesh has the metric of space unless --array names tensors at its vertices, or --tensors a volume"
         refuse(args, _OF_TENSORS, f"{why} of them; pass both, or neither")
     elif args.metric is None:
-        raise ValueError("--metric: choose what the tensors at the vertices stand for: inverse, tensor or adjugate")
+        raise ValueError("--metric: choose the metric of the tensors at the vertices: inverse, tensor or adjugate")
 
 
 def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:
@@ -167,7 +165,15 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | 
         tensors = np.zeros((len(vertices), 3, 3), args.dtype)
         tensors[at] = sample_tensors(volume, np.asarray(mesh.vertices)[at])
     elif args.array:
-        tensors = _tensors(args).astype(args.dtype)
+        arrays = read_mesh_arrays(args.file, clean=args.clean)
+        if args.array not in arrays:
+            there = ", ".join(arrays) or "none"
+            raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {there}")
+        values = arrays[args.array].reshape(len(vertices), -1)
+        if values.shape[1] != (9 if args.order is None else 6):
+            n = values.shape[1]
+            raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
+        tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
     else:
         return kind(vertices, cells, mask=inside)
     settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
@@ -181,19 +187,6 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
     if numbers.size == 0 or numbers.max() >= n_vertices:
         raise ValueError(f"--inside: {path} names {numbers.size} vertices, and the mesh has {n_vertices}")
     return np.isin(np.arange(n_vertices), numbers)
-
-
-def _tensors(args: argparse.Namespace) -> Float[np.ndarray, "V 3 3"]:
-    arrays = read_mesh_arrays(args.file, clean=args.clean)
-    if args.array not in arrays:
-        raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {', '.join(arrays) or 'none'}")
-    values = arrays[args.array].reshape(len(arrays[args.array]), -1)
-    if values.shape[1] == 6 and args.order is not None:
-        return unpack(values, args.order)
-    if values.shape[1] != 9 or args.order is not None:
-        n = values.shape[1]
-        raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
-    return values.reshape(-1, 3, 3)
 
 
 def _draw_mesh(result: Result, path: Path) -> None:

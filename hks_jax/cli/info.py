@@ -87,7 +87,7 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
 
 
 def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
-    """Return what there is to say of a mesh in space."""
+    """Return the facts about a mesh in space."""
     vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
     measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
     sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]

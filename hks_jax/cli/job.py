@@ -1,4 +1,4 @@
-"""The main job: from a tensor volume or a mesh to its heat kernel signature, and what is known about it."""
+"""The main job: from a tensor volume or a mesh to its heat kernel signature, and the facts that reports have."""
 
 import argparse
 from dataclasses import asdict, dataclass, fields, replace
@@ -11,7 +11,7 @@ import numpy as np
 import hks_jax as hj
 from hks_jax.cli.options import SOLVING, as_options, defaults
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.values import DEFAULT_TIMES, Times
+from hks_jax.cli.values import Times, parse_times
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
 from hks_jax.eigen.automatic import choose_solver
@@ -31,8 +31,7 @@ class ComputationError(RuntimeError):
 class Settings:
     """What to compute: the options of the same names.
 
-    Only on meshes, which have one of their own, is there no metric. Without a boundary the domain has the one that
-    suits it (`default_boundary`), and a mesh the natural one.
+    Only meshes may have no metric. Without a boundary a volume has its `default_boundary`, and a mesh the natural one.
     """
 
     metric: MetricChoice | None
@@ -48,9 +47,9 @@ class Settings:
 
     @classmethod
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
-        """Return what the arguments ask for, or what is usual, but for the settings that are given."""
+        """Return the arguments' settings, or the defaults, with those that are given in their place."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
-        given = {"metric": chosen["metric"] or "tensor", "times": DEFAULT_TIMES, **given}
+        given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
 
@@ -69,7 +68,7 @@ class Solved(NamedTuple):
 
     @property
     def described(self) -> dict[str, Any]:
-        """What a report says of the tensors."""
+        """A report's entries about the tensors."""
         return describe_input(self.volume, self.field.grid.mask)
 
 
@@ -136,7 +135,7 @@ def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Pro
 
 
 def _signature(pairs: hj.Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the signature and, where methods were chosen from, what the report says of the choice."""
+    """Return the signature and, where a method was chosen, the report's entry about the choice."""
     if settings.method != "auto":
         return np.asarray(hj.hks(pairs, times, settings.normalisation, settings.method)), {}
     result = hj.hks_auto(pairs, times, settings.normalisation)
@@ -167,14 +166,12 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
 
 
 def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, Any]:
-    """Return what a report says of the tensors."""
+    """Return a report's entries about the tensors; the mask is the domain."""
+    about = {name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit")}
     return {
         "source": volume.source,
         "sha256": volume.digest,
-        "shape": volume.shape,
-        "spacing": volume.spacing,
-        "length_unit": volume.length_unit,
-        "unit": volume.unit,
+        **about,
         "median_mean_diffusivity": median_mean_diffusivity(volume),
         "order": volume.order,
         "frame": volume.frame,
@@ -185,7 +182,7 @@ def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, A
 
 
 def describe_pairs(pairs: hj.Eigenpairs) -> dict[str, Any]:
-    """Return what a report says of eigenpairs."""
+    """Return a report's entries about eigenpairs."""
     values = np.asarray(pairs.eigenvalues)
     return {
         "k": pairs.k,

@@ -1,7 +1,7 @@
 """The options of all commands in one table, from which parsers, settings, the columns of studies and pages follow.
 
-A line of the table is an option: how it is written, what it takes, its default, and after two spaces its help, which
-goes on in indented lines. ``N...`` is one or more, ``N!`` must be given, ``a|b`` is one of these, and an option that
+A line of the table is an option: its flags, its value, its default, and after two spaces its help, which goes on in
+indented lines. ``N...`` is one or more, ``N!`` must be given, ``a|b`` is one of these, and an option that
 takes nothing is a switch. A line ``[name] title: text`` begins a section, and ``@name`` stands for a whole section in
 the options of a command (`OPTIONS` in its module, whose docstring is the help).
 """
@@ -79,7 +79,7 @@ file FILE...
     neumann; mean, of Neumann and Dirichlet, under which the rim of a mask hardly shows; dirichlet, dirichlet-rim (the
     rim of a mask, too), periodic or mirror; one for all axes, or one per axis as in neumann,periodic, and then one for
     the rim of a mask; low:high for the two sides, as in neumann:dirichlet,neumann (default: mean where the domain has a
-    mask, else neumann; of a mesh, and for a spectrum, neumann; of a study what it began with, else mean)
+    mask, else neumann; of a mesh, and for a spectrum, neumann; of a study its first one, else mean)
 -k K
     number of eigenpairs, under the mean of both problems together (default 200, for a volume 100, or a quarter of the
     unknowns if that is less)
@@ -94,8 +94,8 @@ file FILE...
     from where and how the two agree
 [noise] error bars
 --noise NOISE
-    of the tensors, for error bars: a number, relative to the mean diffusivity, such as 0.1; residuals, what the fit to
-    diffusion-weighted images leaves; a second FILE of tensors, from another scan of the subject; or roughness, what
+    of the tensors, for error bars: a number, relative to the mean diffusivity, such as 0.1; residuals, those of the fit
+    to diffusion-weighted images; a second FILE of tensors, from another scan of the subject; or roughness, what
     neighbours differ by. Adds deviation and bias to the .npz, signal to noise at each t to the report, the column error
     to tables of regions, and fades in the picture what noise could make; automatic times of one subject begin where
     signal is
@@ -108,8 +108,8 @@ file FILE...
     (default: the .tsv of the same name beside the labels, if it is there)
 [clean]
 --clean
-    of a mesh: merge vertices at the same place, and drop what is NaN, without area, there twice, or unused; says what
-    was done
+    of a mesh: merge vertices at the same place, and drop whatever is NaN, without area, there twice, or unused; lists
+    the changes
 [view]
 --view neurological|radiological = neurological
     of pictures of a volume that lies in space: neurological, left on the left (default), or radiological, left on the
@@ -219,7 +219,7 @@ def add_options(parser: argparse.ArgumentParser, text: str) -> None:
 
 
 def defaults(text: str) -> argparse.Namespace:
-    """Return what the options of a text are unless they are given."""
+    """Return the defaults of the options of a text."""
     parser = argparse.ArgumentParser(add_help=False)
     add_options(parser, text)
     return parser.parse_args([])

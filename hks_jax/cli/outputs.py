@@ -1,4 +1,4 @@
-"""What a job leaves in its folder: all of it or nothing; and what it prints."""
+"""The files of a job, which appear all or not at all, and the printed summary."""
 
 import argparse
 import importlib.metadata
@@ -17,6 +17,7 @@ import numpy as np
 from hks_jax.atomic import atomic_folder
 from hks_jax.cli.progress import Progress
 from hks_jax.io.result import Result, plain, signature_file
+from hks_jax.io.tables import write_json
 
 REPORT = "report.json"
 PAIRS = "pairs.npz"
@@ -33,7 +34,7 @@ class Done(NamedTuple):
 
 
 def show(args: argparse.Namespace, done: Done) -> None:
-    """Print what was done, as the arguments ask."""
+    """Print the result of a command, as the arguments ask."""
     names = list(map(str, done.files))
     if args.json:
         print(json.dumps(plain({**done.summary, "files": names}), ensure_ascii=False))
@@ -45,10 +46,9 @@ def show(args: argparse.Namespace, done: Done) -> None:
 def writing(
     folder: Path, report: Mapping[str, Any], progress: Progress, stale: Callable[[], Iterable[Path]] = tuple
 ) -> Iterator[tuple[Path, Done]]:
-    """Yield a temporary folder, and what is filled at the end with the report and the paths of the results.
+    """Yield a temporary folder, and a `Done` that has the report and the paths of the results at the end.
 
-    At the end report.json is written beside the other files, and all of them move to `folder`, or none of them does;
-    then the files of earlier results that `stale` returns are gone.
+    Then report.json is written, too, and all files move to `folder`, or none; files that `stale` returns are gone.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
@@ -56,8 +56,7 @@ def writing(
         seconds = {stage: round(spent, 3) for stage, spent in progress.timings.items()}
         known = {"warnings": progress.warnings, "versions": versions(), "seconds": seconds}
         done.summary.update(plain({"command": sys.argv, **report, **known}))
-        text = json.dumps(done.summary, indent=2, ensure_ascii=False)
-        (temporary / REPORT).write_text(text + "\n", encoding="utf-8")
+        write_json(temporary / REPORT, done.summary)
         done.files.extend(sorted(folder / file.name for file in temporary.iterdir()))
 
 
@@ -71,28 +70,19 @@ def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callab
 
 
 def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> list[Path]:
-    """Return the files of an earlier signature in a folder and all that was made of it, which a new one takes away.
-
-    Eigenpairs stay where they are those of the new signature, whose eigenvalues are given.
-    """
-    found, own = [], []
-    if signature_file(folder).is_file():  # else what has these names is not ours
+    """Return an earlier signature's files in a folder, and all made of it but eigenpairs with these eigenvalues."""
+    found, own, pairs = [], [], folder / PAIRS
+    if signature_file(folder).is_file():  # else files of these names are not ours
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
         own = [*folder.glob("hks.*"), folder / REPORT]
         found = [*own, *(folder / name for name in ("explore.html", *regions) if (folder / name).is_file())]
-    if not _are_pairs(folder / PAIRS, eigenvalues):
-        found.append(folder / PAIRS)
+    if zipfile.is_zipfile(pairs):
+        with np.load(pairs) as arrays:  # reads this one array only
+            if "eigenvalues" in arrays and not np.array_equal(arrays["eigenvalues"], eigenvalues):
+                found.append(pairs)
     if derived := [file.name for file in found if file not in own]:
         progress.note(f"removed {', '.join(derived)} of an earlier signature in {folder}")
     return found
-
-
-def _are_pairs(path: Path, eigenvalues: np.ndarray) -> bool:
-    """Tell whether a file holds eigenpairs with just these eigenvalues, or is none of ours."""
-    if not zipfile.is_zipfile(path):
-        return True
-    with np.load(path) as arrays:  # of which only the one is read
-        return "eigenvalues" not in arrays or np.array_equal(arrays["eigenvalues"], eigenvalues)
 
 
 def versions() -> dict[str, str]:

@@ -14,10 +14,9 @@ from hks_jax import assemble
 from hks_jax.cli.job import Settings, Solved, field_of
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.io.arrays import place_of
+from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.io.result import plain, recorded_boundary
-from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npz
 
 _RECORD = "field_record"
@@ -40,15 +39,14 @@ def check_options(args: argparse.Namespace) -> None:
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one of eigenpairs")
     settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
-    why = f"{args.file} holds eigenpairs, of which all but the signature is settled; leave it out"
+    why = f"{args.file} holds eigenpairs: all but the signature is settled; leave it out"
     refuse(args, (*settled, "save_pairs"), why)
 
 
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
-    """Write eigenpairs with the volume, whose mask is the domain, and with what was settled in computing them.
+    """Write eigenpairs with the volume, whose mask is the domain, and with the settings of their computation.
 
-    The suffix of images and the warnings are read back, too. The fingerprint identifies the files and settings of a
-    study's subject.
+    The suffix of images and the warnings are read back, too. The fingerprint is that of a study's subject.
     """
     volume, settings = solved.domain, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}
@@ -61,7 +59,7 @@ def are_of(path: Path, fingerprint: str) -> bool:
     """Tell whether a file holds the eigenpairs of a study's subject, computed from the same files and settings."""
     if not is_saved_pairs(path):
         return False
-    with np.load(path) as arrays:  # of which only the one is read
+    with np.load(path) as arrays:  # reads this one array only
         return bool(json.loads(str(arrays[_RECORD]))["fingerprint"] == fingerprint)
 
 
@@ -69,9 +67,8 @@ def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solv
     """Return the eigenpairs, where the settings that are settled are theirs, and the suffix of images."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
-    spacing, origin = (tuple(arrays[name].tolist()) for name in ("spacing", "origin"))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}
-    volume = TensorVolume(arrays["tensors"], spacing, origin, arrays.get("mask"), arrays.get("affine"), **about)
+    volume = volume_of(str(path), arrays, arrays["tensors"], **about)
     boundary = recorded_boundary(record["settings"])
     assert boundary is not None
     settings = replace(settings, **{**record["settings"], "boundary": boundary})

@@ -1,4 +1,4 @@
-"""What goes to stderr: what is being done, since when, how long it will take, and messages of the library."""
+"""Progress on stderr: the stage, its time so far and the time left, and the library's warnings."""
 
 import io
 import shutil
@@ -20,7 +20,7 @@ TICK = 0.5
 
 
 def bar(done: float) -> str:
-    """Return a bar of which the part `done`, 0 … 1, is filled."""
+    """Return a bar that is filled up to the part `done`, 0 … 1."""
     filled = round(WIDTH * min(max(done, 0.0), 1.0))
     return "[" + "#" * filled + "." * (WIDTH - filled) + "]"
 
@@ -75,7 +75,7 @@ class Progress:
     def update(self, text: str) -> None:
         """Show how far the present stage is: in place on a terminal, else every few seconds.
 
-        A text that comes with an estimate of what is left (`hks_jax.eigen.solver.Status`) is shown with it, and with a
+        A text that comes with an estimate of the time left (`hks_jax.eigen.solver.Status`) is shown with it, and with a
         bar of the time that has passed in all.
         """
         now, left = time.perf_counter(), getattr(text, "seconds_left", None)
@@ -131,7 +131,7 @@ class Progress:
             self._open_line = True
 
     def _line(self) -> str:
-        """Return the time, the stage, a bar, what is left, and the text."""
+        """Return the time, the stage, a bar, the time left, and the text."""
         now, shown = time.perf_counter(), ", ".join(filter(None, (self._stage, self._text)))
         if self._end is not None:
             left = max(self._end - now, 0.0)
@@ -186,7 +186,7 @@ class StudyProgress(Progress):
         return f"{text}, about {duration(max(left, 0.0))} left"
 
     def note(self, text: str) -> None:
-        """Say nothing: what was decided in reading a subject's files is in its sidecar."""
+        """Say nothing: the decisions of reading a subject's files are in its sidecar."""
 
     def end(self, text: str) -> None:
         """Say how a subject, or the study, ended."""

@@ -44,14 +44,13 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
     """Read or fit the tensors, cut the slice, settle the mask, and repair if asked to.
 
-    What is to be doubted is a warning, unless `ask` says it. With ``args.strict_unit``, tensors of an implausible unit
-    are refused unless ``--unit`` says that they have it.
+    Questions are warnings, unless `ask` takes them. With ``args.strict_unit``, an implausible unit needs ``--unit``.
     """
     with progress.stage("reading", str(args.file)):
         volume, mask = _load(args)
         if mask is not None and mask.shape == volume.shape:
             volume, mask = volume.with_mask(mask), None
-        if mask is None:  # what a program filled in says nothing of units and axes
+        if mask is None:  # background says nothing of units and axes
             volume = _without_filling(without_background(volume), args.background, progress)
         volume = _reviewed(volume, args, progress.warn if ask is None else ask)
         if args.slice is not None:
@@ -106,7 +105,7 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
 
 
 def _without_filling(volume: TensorVolume, background: str | None, progress: Progress) -> TensorVolume:
-    """Return the volume without what looks like background, if that is to be outside; warn if nothing is said of it."""
+    """Return the volume without background, if ``--background`` puts it outside; warn if nothing is said of it."""
     found = None if background == "inside" else find_background(volume)
     if found is None:
         return volume

@@ -73,7 +73,7 @@ def region_table(
         raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
     if volume.affine is None:
         progress.warn(f"{source.name} has no place in space: the labels are taken voxel by voxel, and not checked")
-    labels = read_labels(atlas, volume.shape, volume.affine, volume.slice_axis)
+    labels = read_labels(atlas, volume)
     names, called = names_of(atlas, names)
     # A slice of a volume is one voxel thick.
     of_one = math.prod(volume.spacing) if volume.affine is None else abs(np.linalg.det(volume.affine[:3, :3]))
@@ -102,7 +102,7 @@ def region_table(
 
 
 def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
-    """Return the sidecar: what the columns are, in their order, and where they came from."""
+    """Return the sidecar: a description of each column, in their order, and where they came from."""
     settings = result.settings
     flat = result.volume.dimension == 2 and result.volume.affine is None
     values = _SCALES.get(settings.get("normalisation", "raw"), "the heat kernel signature")

@@ -16,7 +16,7 @@ from hks_jax.io.repair import REPAIRS
 
 
 def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return a reader of texts whose error says what was expected where `read` returns None."""
+    """Return a reader of texts that raises an error, naming the expected form, where `read` returns None."""
 
     def parse(text: str) -> Any:
         if (value := read(text)) is None:
@@ -60,14 +60,11 @@ class Times(NamedTuple):
     automatic: int
 
 
-DEFAULT_TIMES = Times((), 6)
-
-
 def parse_times(words: list[str] | None) -> Times:
     """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``."""
     text = ",".join(piece for word in words or ["auto"] for piece in word.split(",") if piece)
     if auto := re.fullmatch(r"auto(?::0*([1-9]\d*))?", text):
-        return Times((), int(auto[1])) if auto[1] else DEFAULT_TIMES
+        return Times((), int(auto[1] or 6))
     times = _numbers(text)
     if not times or min(times) <= 0:
         raise ValueError(f"--times: got {' '.join(words or ())!r}; expected positive numbers, or auto, or auto:N")

@@ -1,6 +1,6 @@
 """Curvature of a metric, the Laplace–Beltrami operator of a function, and the short-time expansion they give."""
 
 from hks_jax.curvature.expansion import hks_expansion as hks_expansion
-from hks_jax.curvature.gaussian import gaussian_curvature as gaussian_curvature
-from hks_jax.curvature.gaussian import scalar_curvature as scalar_curvature
-from hks_jax.curvature.laplace_beltrami import laplace_beltrami as laplace_beltrami
+from hks_jax.curvature.geometry import gaussian_curvature as gaussian_curvature
+from hks_jax.curvature.geometry import laplace_beltrami as laplace_beltrami
+from hks_jax.curvature.geometry import scalar_curvature as scalar_curvature

@@ -9,28 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.checks import checked_times
 from hks_jax.curvature import taylor
-from hks_jax.curvature.gaussian import brioschi
+from hks_jax.curvature.geometry import gaussian, laplacian, scalar, scalar_and_ricci_squared
 from hks_jax.curvature.jet import (
+    Jet,
     at_nodes,
     domain_nodes,
+    function_jet,
     inner,
     metric_function,
     metric_jet,
     nodal_jet,
     wraps_per_axis,
 )
-from hks_jax.curvature.laplace_beltrami import laplacian
-from hks_jax.curvature.volume_coefficients import volume_coefficients
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 
-Invariants: TypeAlias = tuple[Array, ...]
+Coefficients: TypeAlias = list[Array]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
-
-
 HIGHEST_ORDER = {2: 3, 3: 2}
 """The last coefficient that is known here, by dimension."""
 
@@ -56,9 +54,8 @@ def hks_expansion(
 
     Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order, h the spacing
     of the nodes in length: beside the sides of a grid and the rim of a mask, where they are one-sided, u₂ is of fourth
-    order and u₃ of second. Their rounding errors grow with the sixth derivative in u₃: relative to the result, some
-    ε(t/h²)³/5 with the floating-point ε, and some hundred times more within eight nodes of a side or rim. In float32
-    keep t below some 30 h², or the order below 3.
+    order and u₃ of second. The relative rounding error of u₃ is some ε(t/h²)³/5, a hundred times more within eight
+    nodes of a side or rim: in float32 keep t below some 30 h², or the order below 3.
 
     Args:
         field: the metric, d = 2 or 3.
@@ -82,7 +79,7 @@ def hks_expansion(
             f"expansion is known here in {dimension} dimensions"
         )
     return _hks_expansion(
-        field, checked_times("times", times, field.tensors.dtype), int(order), wraps_per_axis(periodic, dimension)
+        field, checked_times(times, field.tensors.dtype), int(order), wraps_per_axis(periodic, dimension)
     )
 
 
@@ -90,12 +87,8 @@ def hks_expansion(
 def _hks_expansion(
     field: TensorField, times: Float[Array, " n_times"], order: int, wraps: tuple[bool, ...]
 ) -> Float[Array, "n_times *shape"]:
+    coefficients, known = (_nodal if field.function is None else _exact)(field, order, wraps)
     d = field.grid.dimension
-    if d == 3:
-        coefficients, known = volume_coefficients(field, order, wraps)
-    else:
-        invariants, known = (_nodal if field.function is None else _exact)(field, order, wraps)
-        coefficients = _coefficients(*invariants)[: order + 1]
     t = jnp.expand_dims(times, tuple(range(1, d + 1))).astype(coefficients[0].dtype)
     series = jnp.zeros_like(t)
     for u in reversed(coefficients):
@@ -103,7 +96,7 @@ def _hks_expansion(
     return nan_outside(series / (4 * jnp.pi * t) ** (d / 2), known)
 
 
-def _coefficients(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0) -> list[Array]:
+def _of_surface(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0) -> Coefficients:
     """Return 1, u₁, u₂, u₃; right as far as their ingredients are given."""
     return [
         jnp.ones_like(K),
@@ -113,20 +106,33 @@ def _coefficients(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bil
     ]
 
 
-def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
-    """Return K, then as far as the order needs ∇²K, |∇K|² and ∇⁴K, from the Taylor series of the metric's function."""
-    metric = metric_function(field)
+def _of_volume(metric: Jet, curvature: Jet | None) -> Coefficients:
+    """Return 1 and u₁, and with the jet of R also u₂."""
+    R, ricci_squared = scalar_and_ricci_squared(metric)
+    coefficients = [jnp.ones_like(R), R / 6]
+    if curvature is not None:
+        coefficients.append((R**2 + 2 * ricci_squared + 4 * laplacian(metric, curvature)) / 120)
+    return coefficients
 
-    def invariants(x: Array) -> Invariants:
+
+def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
+    """Return the coefficients up to the order from the metric's function, and the nodes of the domain."""
+    metric, inside = metric_function(field), domain_nodes(field.grid, wraps)
+
+    def of_surface(x: Array) -> Coefficients:
         g = taylor.expand(metric, x, degree=2 * max(order, 1))
-        return tuple(series[0] for series in _invariant_series(g[0, 0], g[0, 1], g[1, 1], order))
+        return _of_surface(*(series[0] for series in _invariant_series(g[0, 0], g[0, 1], g[1, 1], order)))
 
-    inside = domain_nodes(field.grid, wraps)
-    return at_nodes(invariants, field.grid, inside), inside
+    def of_volume(x: Array) -> Coefficients:
+        R = function_jet(lambda y: scalar(function_jet(metric, y)), x) if order == 2 else None
+        return _of_volume(function_jet(metric, x), R)
+
+    at = of_surface if field.grid.dimension == 2 else of_volume
+    return at_nodes(lambda x: at(x)[: order + 1], field.grid, inside), inside
 
 
 def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, order: int) -> tuple[taylor.Series, ...]:
-    """Return what `brioschi` and `laplacian` say, of the metric ((E, F), (F, G)), in Taylor arithmetic."""
+    """Return K and, as far as the order needs, ∇²K, |∇K|² and ∇⁴K of the metric ((E, F), (F, G)) as Taylor series."""
     add, times, d = taylor.add, taylor.product, taylor.derivative
     determinant = add(times(E, G), -times(F, F))
     over = taylor.reciprocal(determinant)
@@ -157,14 +163,19 @@ def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, orde
     return invariants if order < 3 else (*invariants, laplacian(invariants[1]))
 
 
-def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Invariants, Bool[np.ndarray, "*shape"]]:
+def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
     """Return the same by differences of differences, and the nodes where all are known."""
     g, known = metric_jet(field, wraps)
-    invariants: Invariants = (brioschi(g),)
+    if field.grid.dimension == 3:
+        R = None
+        if order == 2:
+            R, known = nodal_jet(scalar(g), field.grid, known, wraps)
+        return _of_volume(g, R)[: order + 1], known
+    invariants: tuple[Array, ...] = (gaussian(g),)
     if order >= 2:
         K, known = nodal_jet(invariants[0], field.grid, known, wraps)
         invariants += laplacian(g, K), inner(spd.inverse(g.value), K.gradient, K.gradient)
     if order >= 3:
         laplacian_K, known = nodal_jet(invariants[1], field.grid, known, wraps)
         invariants += (laplacian(g, laplacian_K),)
-    return invariants, known
+    return _of_surface(*invariants)[: order + 1], known

@@ -23,12 +23,8 @@ MINIMUM_NODES = 8
 def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the stencils of sixth order for the derivative of the given order, 1 or 2, in order of preference.
 
-    A centred stencil of 7 nodes gains an order from its symmetry when the derivative is the second; shifted ones
-    need 8 there.
-
-    Returns:
-        offsets, int (n, 8), and weights, float64 (n, 8), for unit spacing; shorter stencils are padded with offset 0
-        and weight 0.
+    Offsets (n, 8) and weights (n, 8) for unit spacing; shorter stencils are padded with offset 0 and weight 0. For the
+    second derivative a centred stencil of 7 nodes gains an order from its symmetry; shifted ones need 8.
     """
     width = 6 + order
     centred = np.arange(-3, 4)
@@ -53,18 +49,9 @@ def differentiate(
     spacing: float,
     wraps: bool,
 ) -> tuple[Float[Array, "*shape_and_components"], Bool[np.ndarray, "*shape"]]:
-    """Differentiate nodal values along one grid axis.
+    """Return the first or second derivative of nodal values along a grid axis, and where it is known.
 
-    Args:
-        values: (*shape, …) nodal values, possibly tensors.
-        inside: the nodes that may be read.
-        axis: the grid axis.
-        order: 1 or 2.
-        spacing: the distance between nodes along the axis.
-        wraps: whether the axis is periodic, with node n equal to node 0.
-
-    Returns:
-        the derivative, 0 where no stencil fits, and the nodes where one does, bool (*shape).
+    Only values at nodes inside are read. The derivative is 0 where no stencil fits between them.
     """
     offsets, weights = stencils(order)
     n, d = inside.shape[axis], inside.ndim
@@ -203,11 +190,7 @@ def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*
 
 
 def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[bool, ...]:
-    """Return which axes are periodic.
-
-    Raises:
-        ValueError: anything but a bool, or one bool per axis.
-    """
+    """Return which axes are periodic; raise ValueError for anything but a bool, or one bool per axis."""
     wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(periodic)
     if len(wraps) != dimension or not all(isinstance(wrap, bool | np.bool_) for wrap in wraps):
         raise ValueError(f"periodic: got {periodic!r}; expected True, False, or {dimension} of them, one per axis")

@@ -14,23 +14,27 @@ def wrap_nodes(nodes: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
     return np.pad(nodes, [(0, int(wraps)) for wraps in periodic], mode="wrap")
 
 
+def _corners(dimension: int) -> list[tuple[slice, ...]]:
+    """Return for each corner of elements the slices of the nodes there, of nodes one more than elements."""
+    return list(product(*[(slice(None, -1), slice(1, None))] * dimension))
+
+
 def active_elements(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> np.ndarray:
     """Mark the elements all of whose 2^d nodes are inside the mask, shape n (periodic axes) or n − 1."""
     nodes = wrap_nodes(mask, periodic)
-    corners = product(*[(slice(None, -1), slice(1, None))] * mask.ndim)
-    return np.logical_and.reduce([nodes[corner] for corner in corners])
+    return np.logical_and.reduce([nodes[corner] for corner in _corners(mask.ndim)])
 
 
-def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes of the given elements."""
-    nodes = np.zeros([n + 1 for n in elements.shape], dtype=bool)
-    for corner in product(*[(slice(None, -1), slice(1, None))] * elements.ndim):
-        nodes[corner] |= elements
+def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
+    """Mark the nodes of the given elements; of numbers at elements, return the greatest around each node."""
+    nodes = np.zeros([n + 1 for n in elements.shape], elements.dtype)
+    for corner in _corners(elements.ndim):
+        np.maximum(nodes[corner], elements, out=nodes[corner])
     for axis, wraps in enumerate(periodic):
         if wraps:
-            first, last = _face(nodes.ndim, axis, 0), _face(nodes.ndim, axis, -1)
-            nodes[first] |= nodes[last]
-            nodes = np.delete(nodes, -1, axis=axis)
+            ends = nodes.take([0, -1], axis=axis).max(axis=axis, keepdims=True)
+            inner = nodes.take(range(1, nodes.shape[axis] - 1), axis=axis)
+            nodes = np.concatenate([ends, inner], axis=axis)
     return nodes
 
 
@@ -52,30 +56,14 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
     Returns the labels (0 outside, 1 … n inside) and their number n.
     """
     elements = active_elements(mask, periodic)
-    everything = np.ones((3,) * mask.ndim, dtype=bool)
-    nodes = element_nodes(elements, periodic)
-    # Elements that share a node hang together; on the nodes this is the labelling of the elements' union,
-    # except that two nodes may be neighbours without sharing an element. So label elements, then hand down.
-    labels, count = scipy.ndimage.label(elements, structure=everything)
-    padded = np.zeros([n + 1 for n in elements.shape], dtype=labels.dtype)
-    for corner in product(*[(slice(None, -1), slice(1, None))] * mask.ndim):
-        np.maximum(padded[corner], labels, out=padded[corner])
-    edges = []
-    for axis, wraps in enumerate(periodic):
-        if wraps:
-            first, last = padded[_face(mask.ndim, axis, 0)], padded[_face(mask.ndim, axis, -1)]
-            both = (first > 0) & (last > 0)
-            edges.append(np.stack([first[both], last[both]]))
-            padded[_face(mask.ndim, axis, 0)] = np.maximum(first, last)
-            padded = np.delete(padded, -1, axis=axis)
-    if edges and count > 1:
-        rows, cols = np.concatenate(edges, axis=1) - 1
-        count, merged = connected_components(
-            coo_matrix((np.ones(rows.size), (rows, cols)), shape=(count, count)), directed=False
-        )
-        padded = np.where(padded > 0, merged[padded - 1] + 1, 0)
-    return np.where(nodes, padded, 0), int(count)
-
-
-def _face(ndim: int, axis: int, index: int) -> tuple[slice | int, ...]:
-    return tuple(index if a == axis else slice(None) for a in range(ndim))
+    # Elements that share a node hang together; two nodes may be neighbours without sharing an element. So label
+    # elements, then hand down. Across periodic sides, what meets in a node hangs together, too.
+    labels, count = scipy.ndimage.label(elements, structure=np.ones((3,) * mask.ndim, dtype=bool))
+    nodes = element_nodes(labels, periodic)
+    if any(periodic) and count > 1:
+        around = wrap_nodes(nodes, periodic)
+        rows, cols = np.concatenate([[labels[elements], around[c][elements]] for c in _corners(mask.ndim)], axis=1) - 1
+        graph = coo_matrix((np.ones(rows.size), (rows, cols)), shape=(count, count))
+        count, merged = connected_components(graph, directed=False)
+        nodes = np.where(nodes > 0, merged[nodes - 1] + 1, 0)
+    return nodes, int(count)

@@ -29,12 +29,10 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 
     The vector (T₁₁ − T₂₂, 2T₁₂) vanishes there, and it turns twice as fast as the eigenvectors. Interpolated
     bilinearly from the nodes, it has at most one zero in a cell that it winds around: index ±½, a wedge or a
-    trisector. A point of higher index shows as several of these, or as zeros at nodes and on edges, side by side: what
-    is near is one point, whose index is the sum (Tricoche, Scheuermann and Hagen 2001).
+    trisector. Zeros that are near are one point, whose index is the sum (Tricoche, Scheuermann and Hagen 2001).
 
-    Only what has an index is found: points of index 0, a pair of opposite index closer than `merge`, and points on the
-    rim of the domain, around which one cannot go, are not. Of a curve or a patch of equal eigenvalues that does not
-    reach the rim the middle is returned, if its index is not 0.
+    Points of index 0, a pair of opposite index closer than `merge`, and points on the rim of the domain are not found.
+    Of a curve or a patch of equal eigenvalues off the rim the middle is returned, unless its index is 0.
 
     Args:
         field: a 2D field. Cells with a node outside the mask are no part of the domain.

@@ -15,9 +15,8 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.checks import require_count
 from hks_jax.domain.geodesic import geodesic_ball, geodesic_sphere
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.domain.tet_mesh import TetMesh
 
 Point = Float[Array, " d"]
 Metric = Callable[[Point], Float[Array, "d d"]]

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.arrays import ByKey, StaticArray
 from hks_jax.checks import require_real
 from hks_jax.domain.components import active_elements, label_nodes
-from hks_jax.static_array import StaticArray
 
 
 @jax.tree_util.register_static
-class Grid:
+class Grid(ByKey):
     """A regular grid of nodes; array axis a is coordinate a.
 
     Static and hashable: it passes through `jax.jit`, `jax.grad` and `jax.vmap` as structure, with no arrays in it.
@@ -118,12 +118,6 @@ class Grid:
     @cached_property
     def _key(self) -> tuple:
         return (self.shape, self.spacing, self.origin, self._mask)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Grid) and self._key == other._key)
-
-    def __hash__(self) -> int:
-        return hash(self._key)
 
     def __repr__(self) -> str:
         masked = "" if self.mask is None else f", mask={int(self.mask.sum())} of {self.size} nodes"

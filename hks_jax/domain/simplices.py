@@ -123,7 +123,13 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
         )
     if triangulation.dimension == 2:
         _check_once(cells)
-        _warn_of_crowds(triangulation)
+        crowded = triangulation.crowded_facets
+        if crowded.size:
+            edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
+            warn_of_accuracy(
+                f"faces: {crowded.size} edges belong to three triangles or more (the first is of vertices {edge}): "
+                "the surface branches there, and heat goes into all branches. If it should not, remove inner sheets"
+            )
         _warn_of_hanging(vertices, triangulation)
         return
     inverted = measure < 0
@@ -169,16 +175,6 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
         raise ValueError(
             f"faces: {again.size} of {len(faces)} triangles are there twice (the first are faces {a} and {b}, with the "
             f"vertices {faces[a].tolist()}), and would count twice; remove the copies"
-        )
-
-
-def _warn_of_crowds(triangulation: Triangulation) -> None:
-    crowded = triangulation.crowded_facets
-    if crowded.size:
-        edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
-        warn_of_accuracy(
-            f"faces: {crowded.size} edges belong to three triangles or more (the first is that of vertices {edge}): "
-            "the surface branches there, and heat goes into all branches. If it should not, remove the inner sheets"
         )
 
 

@@ -1,21 +1,22 @@
-"""What surfaces and solid meshes have in common: vertices in space, simplices, and a metric on each of them."""
+"""Meshes in space with a metric on each simplex: surfaces of triangles, and solids cut into tetrahedra."""
 
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import StaticArray, describe_array
 from hks_jax.checks import real_array
-from hks_jax.describe import describe_array
 from hks_jax.domain import spd
 from hks_jax.domain.mesh_tensors import metric_of_tensors
 from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_cells, checked_mask
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, checked_tensors
 from hks_jax.domain.triangulation import Triangulation
-from hks_jax.static_array import StaticArray
 from hks_jax.traced import is_traced
+
+Mesh = TypeVar("Mesh", bound="SimplicialMesh")
 
 
 class SimplicialMesh(eqx.Module):
@@ -25,24 +26,68 @@ class SimplicialMesh(eqx.Module):
     triangulation: Triangulation = eqx.field(static=True)
     _mask: StaticArray | None = eqx.field(static=True)
     _metric: Float[Array, "n d d"] | None
+    _dimension: ClassVar[int]
 
-    def __init__(self, vertices: Any, cells: Any, metric: Any, dimension: int, mask: Any) -> None:
+    def __init__(self, vertices: Any, cells: Any, metric: Any = None, mask: Any = None) -> None:
         positions = real_array("vertices", vertices)
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise ValueError(f"vertices: got shape {positions.shape}; expected (V, 3)")
-        cells = checked_cells(cells, len(positions), dimension, mask is not None)
-        self._mask = None if mask is None else StaticArray(checked_mask(mask, cells, len(positions), dimension))
-        triangulation = Triangulation(self.restrict(cells), len(positions))
-        if not is_traced(positions):
-            check_places(np.asarray(positions, dtype=np.float64), triangulation)
+        cells = checked_cells(cells, len(positions), self._dimension, mask is not None)
+        inside = None if mask is None else checked_mask(mask, cells, len(positions), self._dimension)
+        self._mask = None if inside is None else StaticArray(inside)
         self.vertices = positions
-        self.triangulation = triangulation
+        self.triangulation = triangulation = Triangulation(self.restrict(cells), len(positions))
+        if not is_traced(positions):
+            check_places(np.asarray(positions, np.float64), triangulation)
         self._metric = None if metric is None else _checked_metric(self.restrict(metric), triangulation)
         if metric is None and not is_traced(positions):
             check_metric(np.asarray(self.metric), np.asarray(positions, np.float64), triangulation.cells)
 
+    @classmethod
+    def from_tensors(
+        cls: type[Mesh],
+        vertices: Any,
+        cells: Any,
+        tensors: Any,
+        metric: MetricChoice | None = None,
+        *,
+        at: Literal["faces", "cells", "vertices"] | None = None,
+        interpolation: Interpolation = "linear",
+        mask: Any = None,
+    ) -> Mesh:
+        """Return the mesh with the metric of tensors D in the axes of space; on a surface, of their tangential part.
+
+        The tangential part of D is D as a quadratic form on the vectors of a triangle's plane: for diffusion tensors,
+        diffusion that stays in the surface, with the diffusivities that were measured in it. What metric g it, or D,
+        stands for has no default (see `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹;
+        ``"adjugate"``, g = |D| D⁻¹, on a surface with inverse and determinant in the plane. With D the identity all
+        three are the metric of space.
+
+        Of tensors at the vertices a cell takes the mean of those of its own, or with ``"log-euclidean"`` that of their
+        logarithms, as either interpolation does at its centre: an error of second order, as that of the elements.
+        Differentiable with respect to tensors and vertices.
+
+        Args:
+            vertices: positions (V, 3).
+            cells: vertex indices of the triangles (F, 3) or tetrahedra (C, 4).
+            tensors: one for each cell, (F, 3, 3) or (C, 3, 3), or for each vertex, (V, 3, 3); symmetric, and positive
+                definite on the planes of the triangles that they act on, or in space.
+            metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
+            at: whether the tensors belong to ``"faces"`` (of a surface), ``"cells"`` (of a solid) or ``"vertices"``;
+                None: their number tells, unless there are as many of one as of the other.
+            interpolation: ``"linear"`` or ``"log-euclidean"``, see `TensorField`; for tensors at vertices.
+            mask: the domain, see the class; tensors outside are ignored.
+
+        Raises:
+            ValueError: a metric or interpolation that is none of these; wrong shapes; tensors that are NaN or infinite,
+                unsymmetric or not positive definite (with how many, and where the first is); what the class raises.
+        """
+        mesh = cls(vertices, cells, mask=mask)
+        of_cells = metric_of_tensors(mesh._edges, mesh.triangulation, mesh.restrict(tensors), metric, at, interpolation)
+        given = _checked_metric(of_cells, mesh.triangulation)  # such as an inverse that overflows
+        return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
+
     def __repr__(self) -> str:
-        """Return one line: the sizes, and where the metric comes from."""
         metric = "that of space" if self._metric is None else describe_array(self._metric)
         cells = f"{len(self.triangulation.cells)} {WORDS[self.triangulation.dimension].simplices}"
         return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"
@@ -74,18 +119,79 @@ class SimplicialMesh(eqx.Module):
         return frames * jnp.where(positive, 1, jnp.nan).astype(frames.dtype)[..., None, None]
 
 
-Mesh = TypeVar("Mesh", bound=SimplicialMesh)
+class SurfaceMesh(SimplicialMesh):
+    """A triangle mesh in space, with the metric that space induces on it, or another.
+
+    A pytree: the vertex positions and the given metric, if any, are its leaves, the connectivity is structure.
+
+    Args:
+        vertices: positions (V, 3).
+        faces: vertex indices (F, 3).
+        metric: (F, 2, 2), the metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀, in place of the
+            induced one.
+        mask: the domain, bool, True inside: of the triangles (F,), or of the vertices (V,), where it consists of
+            the triangles all of whose vertices are inside. What lies outside may be degenerate or NaN. The rim of the
+            mask belongs to the boundary, results are NaN at vertices outside, and ``faces`` are those inside.
+
+    Raises:
+        ValueError: wrong shapes, a mask that leaves nothing, indices out of range, vertices without a face, triangles
+            without area, NaN, a metric that is not positive definite.
+    """
+
+    _dimension = 2
+
+    def __init__(self, vertices: Any, faces: Any, metric: Any = None, mask: Any = None) -> None:
+        super().__init__(vertices, faces, metric, mask)
+
+    @property
+    def faces(self) -> Int[np.ndarray, "F 3"]:
+        """Vertex indices, one row per triangle."""
+        return self.triangulation.cells
 
 
-def with_tensors(
-    mesh: Mesh, tensors: Any, metric: MetricChoice | None, at: str | None, interpolation: Interpolation
-) -> Mesh:
-    """Return a mesh with the metric of tensors in space; see `SurfaceMesh.from_tensors`, `TetMesh.from_tensors`."""
-    metric_tensors = metric_of_tensors(
-        mesh._edges, mesh.triangulation, mesh.restrict(tensors), metric, at, interpolation
-    )
-    given = _checked_metric(metric_tensors, mesh.triangulation)  # such as an inverse that overflows
-    return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
+class TetMesh(SimplicialMesh):
+    """A mesh of tetrahedra, with the metric of space, or another that is constant on each of them.
+
+    A pytree: the vertex positions and the given metric, if any, are its leaves, the connectivity is structure.
+
+    Tetrahedra are positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as VTK and Gmsh have them: so one that a
+    moved vertex has turned inside out is noticed. Under `jit`, where it cannot be refused, it gives NaN.
+
+    Args:
+        vertices: positions (V, 3).
+        cells: vertex indices (C, 4).
+        metric: (C, 3, 3), the metric of each tetrahedron in the basis of its edges v₁ − v₀, v₂ − v₀ and v₃ − v₀, in
+            place of that of space. For tensors in the axes of space see `from_tensors`.
+        mask: the domain, bool, True inside: of the tetrahedra (C,), or of the vertices (V,), where it consists of
+            the tetrahedra all of whose vertices are inside. What lies outside may be degenerate or NaN. The rim of the
+            mask belongs to the boundary, results are NaN at vertices outside, and ``cells`` are those inside.
+
+    Raises:
+        ValueError: wrong shapes, a mask that leaves nothing, indices out of range, vertices without a cell, NaN, a
+            metric that is not positive definite; tetrahedra that have no volume, are inverted, or overlap across a
+            common triangle (with how many, and which is the first).
+    """
+
+    _dimension = 3
+
+    def __init__(self, vertices: Any, cells: Any, metric: Any = None, mask: Any = None) -> None:
+        super().__init__(vertices, cells, metric, mask)
+
+    @property
+    def cells(self) -> Int[np.ndarray, "C 4"]:
+        """Vertex indices, one row per tetrahedron."""
+        return self.triangulation.cells
+
+    def boundary(self) -> tuple[SurfaceMesh, Int[np.ndarray, " B"]]:
+        """Return the triangles that belong to one tetrahedron only, with the metric of space, oriented outward.
+
+        Returns:
+            The surface, and for each of its B vertices the number that it has in this mesh: values (…, V) on the
+            boundary are ``values[..., numbers]``.
+        """
+        triangulation = self.triangulation
+        numbers, faces = np.unique(triangulation.facet_vertices(triangulation.boundary_facets), return_inverse=True)
+        return SurfaceMesh(self.vertices[numbers], faces.reshape(-1, 3)), numbers
 
 
 def _checked_metric(metric: Any, triangulation: Triangulation) -> Float[Array, "n d d"]:

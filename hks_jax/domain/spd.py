@@ -19,17 +19,16 @@ def symmetrise(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 
 
 def identity_outside(
-    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray, "*shape"]
+    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
     """Return the tensors, and the identity at nodes that are not inside."""
-    return tensors if inside.all() else identity_unless(inside, tensors)
+    return tensors if isinstance(inside, np.ndarray) and inside.all() else _identity_outside(tensors, inside)
 
 
 @jax.jit
-def identity_unless(
-    inside: Bool[np.ndarray | Array, "*shape"], tensors: Float[Array, "*shape d d"]
+def _identity_outside(
+    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
-    """Return the tensors, and the identity at nodes that are not inside, where these may be traced."""
     return jnp.where(inside[..., None, None], tensors, jnp.eye(tensors.shape[-1], dtype=tensors.dtype))
 
 
@@ -75,19 +74,18 @@ def is_spd(tensors: np.ndarray) -> np.ndarray:
     """Tell, by Sylvester's criterion, which matrices (..., d, d) are finite and positive definite (on the host)."""
     t = np.asarray(tensors, dtype=np.float64)
     finite = np.isfinite(t).all(axis=(-2, -1), keepdims=True)
-    t = np.where(finite, t, 0.0)
-    minors = [np.linalg.det(t[..., :m, :m]) > 0 for m in range(1, t.shape[-1] + 1)]
-    return np.logical_and.reduce(minors)
+    return _positive(np.where(finite, t, 0.0))
+
+
+def _positive(t: Any) -> Any:
+    return (t[..., 0, 0] > 0) & (determinant(t[..., :2, :2]) > 0) & (determinant(t) > 0)
 
 
 # A product and not a choice: the derivative at the tensor itself is NaN too.
 @jax.jit
 def positive_or_nan(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the matrices, d = 2 or 3, NaN in place of those that are not positive definite (Sylvester's criterion)."""
-    t = tensors
-    minors = t[..., 0, 0], t[..., 0, 0] * t[..., 1, 1] - t[..., 0, 1] * t[..., 1, 0], determinant(t)
-    positive = (minors[0] > 0) & (minors[1] > 0) & (minors[2] > 0)
-    return t * jnp.where(positive, 1, jnp.nan).astype(t.dtype)[..., None, None]
+    return tensors * jnp.where(_positive(tensors), 1, jnp.nan).astype(tensors.dtype)[..., None, None]
 
 
 @jax.jit

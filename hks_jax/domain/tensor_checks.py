@@ -52,11 +52,7 @@ def require_spd(
 ) -> None:
     """Raise ValueError unless the tensors are finite, symmetric and positive definite inside.
 
-    Args:
-        name: of the argument.
-        tensors: the tensors.
-        inside: where they count.
-        place: what they belong to: ``"node"`` (of a grid, which may have a mask), ``"vertex"``, …
+    The place is what they belong to: ``"node"`` (of a grid, which may have a mask), ``"vertex"``, …
     """
     require_finite_symmetric(name, tensors, inside, place)
     bad = inside & ~spd.is_spd(tensors)
@@ -125,23 +121,20 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
             "or more rows than columns for a map into a space of more dimensions"
         )
     if m == d and not is_traced(gradients):
-        _require_positive_determinant(name, np.asarray(gradients, np.float64), grid)
+        known = np.asarray(gradients, np.float64)
+        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # others are refused with the metric
+        determinants = np.linalg.det(np.where(finite[..., None, None], known, np.eye(d)))
+        bad = finite & (determinants <= 0)
+        if bad.any():
+            first = tuple(int(i) for i in np.argwhere(bad)[0])
+            raise ValueError(
+                f"{name}: {int(bad.sum())} of {int(grid.inside.sum())} gradients have a determinant that is not "
+                f"positive (the first at node {first}, {determinants[first]:.3g}); expected deformations that turn "
+                f"nothing inside out. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
+            )
     inside = grid.inside[..., None, None]
     safe = jnp.where(inside, gradients, jnp.eye(m, d, dtype=gradients.dtype))
     return jnp.einsum("...ki,...kj->...ij", safe, safe, precision="highest")
-
-
-def _require_positive_determinant(name: str, gradients: Float[np.ndarray, "*shape d d"], grid: Grid) -> None:
-    finite = grid.inside & np.isfinite(gradients).all(axis=(-2, -1))  # others are refused with the metric
-    determinants = np.linalg.det(np.where(finite[..., None, None], gradients, np.eye(grid.dimension)))
-    bad = finite & (determinants <= 0)
-    if bad.any():
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"{name}: {int(bad.sum())} of {int(grid.inside.sum())} gradients have a determinant that is not positive "
-            f"(the first at node {first}, {determinants[first]:.3g}); expected deformations that turn nothing inside "
-            f"out. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the grid's mask"
-        )
 
 
 PositiveMap = Literal["exp", "shift"]
@@ -208,11 +201,8 @@ def positive_map(
         check_shift(name, np.asarray(tensors)[inside], how, number)
     symmetric = spd.symmetrise(spd.identity_outside(tensors, inside))
     number = jnp.asarray(number, tensors.dtype)
-    mapped = (
-        spd.exp(symmetric / number)
-        if how == "exp"
-        else symmetric + number * jnp.eye(tensors.shape[-1], dtype=tensors.dtype)
-    )
+    eye = jnp.eye(tensors.shape[-1], dtype=tensors.dtype)
+    mapped = spd.exp(symmetric / number) if how == "exp" else symmetric + number * eye
     if known:
         check_mapped(np.asarray(tensors)[inside], np.asarray(mapped)[inside], how, number)
     return mapped

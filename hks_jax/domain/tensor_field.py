@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import describe_array
 from hks_jax.checks import real_array
-from hks_jax.describe import describe_array
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import (
@@ -96,16 +96,15 @@ class TensorField(eqx.Module):
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
         - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
 
-        What is interpolated between the nodes is g. ``interpolation`` is ``"linear"`` by default, which on brain slices
-        came a little nearer to the signature of a finer grid. With ``"log-euclidean"`` it makes no difference whether D
-        or its inverse is interpolated.
+        What is interpolated between the nodes is g. With ``"log-euclidean"`` it makes no difference whether D or its
+        inverse is interpolated.
         """
         check_metric_choice(metric)
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
         if metric == "tensor":
             return cls(grid, tensors, interpolation)
         # In three dimensions the adjugate of −D is that of D.
-        tensors = spd.positive_or_nan(_identity_outside(grid, tensors))
+        tensors = spd.positive_or_nan(spd.identity_outside(tensors, grid.inside))
         return cls(grid, spd.inverse(tensors) if metric == "inverse" else spd.adjugate(tensors), interpolation)
 
     @classmethod
@@ -117,9 +116,8 @@ class TensorField(eqx.Module):
         ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, y the place to which what is at x goes, or wants to go. Lengths are those after the
         deformation. F enters by C alone: rotations, also such as vary from node to node, change nothing.
 
-        Where F is the gradient of a map, it is compatible: the metric is flat, and the signature that of the deformed
-        body. Growth, plastic and elastic strain need not be. The curvature of C is then the incompatibility, which no
-        shape in the plane (of a volume, in space) undoes: residual strain. See docs/strain.md.
+        Where F is the gradient of a map, the metric is flat, and the signature that of the deformed body. Of growth,
+        plastic and elastic strain the curvature of C is the incompatibility: residual strain. See docs/strain.md.
 
         Args:
             grid: of the undeformed coordinates x.
@@ -151,14 +149,12 @@ class TensorField(eqx.Module):
         They are no metric themselves, and there are several ways to one: there is no default. Both keep the
         eigenvectors and the order of the eigenvalues (Hotz and others 2004):
 
-        - ``"exp"``: g = exp(S/s); `number` is the scale s > 0, in the units of S. An eigenvalue σ becomes exp(σ/s):
-          squared lengths grow by a factor under tension and shrink by the same under as much compression, and where
-          S = 0 they are those of the coordinates. A scale near the largest |σ| shows S well.
-        - ``"shift"``: g = S + c·I; `number` is the shift c, larger than minus the least eigenvalue. Linear in S; where
-          S = 0 it is c·I. The signature depends on c: it flattens as c grows, and near its limit the direction
-          of the strongest compression has almost no length.
+        - ``"exp"``: g = exp(S/s); `number` is the scale s > 0, in the units of S. An eigenvalue σ becomes exp(σ/s). A
+          scale near the largest |σ| shows S well.
+        - ``"shift"``: g = S + c·I; `number` is the shift c, larger than minus the least eigenvalue. The signature
+          flattens as c grows; near its limit the direction of the strongest compression has almost no length.
 
-        See docs/strain.md for what their signatures show.
+        docs/strain.md says what their signatures show.
 
         Args:
             grid: the grid.
@@ -181,7 +177,6 @@ class TensorField(eqx.Module):
         return cls(grid, positive_map(name, tensors, chosen, number, grid.inside), interpolation)
 
     def __repr__(self) -> str:
-        """Return one line: the grid, and where the metric comes from."""
         values = "a function" if self.function is not None else describe_array(self._tensors)
         return f"TensorField({values} on {self.grid!r}, interpolation={self.interpolation!r})"
 
@@ -196,7 +191,7 @@ class TensorField(eqx.Module):
     @property
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
         """The tensors, with the identity outside the mask: what computations read; NaN where not positive definite."""
-        return spd.positive_or_nan(_identity_outside(self.grid, self.tensors))
+        return spd.positive_or_nan(spd.identity_outside(self.tensors, self.grid.inside))
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
@@ -206,12 +201,6 @@ def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_com
     nodes = jnp.asarray(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]))
     flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes.reshape(-1, grid.dimension)).astype(nodes.dtype)
     return flat.reshape(*grid.shape, *flat.shape[1:])
-
-
-def _identity_outside(grid: Grid, tensors: Float[Array, "*shape d d"]) -> Float[Array, "*shape d d"]:
-    if grid.mask is None:
-        return tensors
-    return spd.identity_outside(tensors, grid.mask)
 
 
 def _require_grid(grid: Any) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hks_jax.static_array import StaticArray
+from hks_jax.arrays import ByKey, StaticArray
 
 FACETS = {
     2: np.array([[1, 2], [2, 0], [0, 1]]),
@@ -20,7 +20,7 @@ oriented, its facets are oriented outward."""
 
 
 @jax.tree_util.register_static
-class Triangulation:
+class Triangulation(ByKey):
     """The connectivity of a mesh of triangles or tetrahedra: static, hashable.
 
     Facets, which are the edges of triangles and the triangles of tetrahedra, are numbered cell by cell: facet
@@ -30,6 +30,7 @@ class Triangulation:
     def __init__(self, cells: Int[np.ndarray, "n corners"], n_vertices: int) -> None:
         self._cells = StaticArray(cells, dtype=np.int64)
         self.n_vertices = n_vertices
+        self._key = n_vertices, self._cells
 
     @property
     def cells(self) -> Int[np.ndarray, "n corners"]:
@@ -134,13 +135,4 @@ class Triangulation:
         return every, known.size
 
     def __repr__(self) -> str:
-        """Return one line."""
         return f"Triangulation({len(self.cells)} cells of dimension {self.dimension}, {self.n_vertices} vertices)"
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (
-            isinstance(other, Triangulation) and self.n_vertices == other.n_vertices and self._cells == other._cells
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.n_vertices, self._cells))

@@ -23,7 +23,7 @@ _SMALL = 1500
 """Unknowns up to which all pairs at once are affordable: n³ whatever k is, and nothing can be missed."""
 
 # Seconds of the first call in a process, compilation included, and of those that follow, on two cores
-# (benchmarks/automatic.py); ours is block Lanczos, in 3D and in single precision on grids the Chebyshev filter:
+# (benchmarks/first_answer/automatic.py); ours is block Lanczos, in 3D and in float32 on grids the Chebyshev filter:
 #
 #                            float64                         float32
 #   nodes/pairs   n·k        shift-invert   ours             shift-invert   ours

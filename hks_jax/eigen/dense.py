@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import cholesky, eigh, solve_triangular
 
-from hks_jax.checks import require_number
 from hks_jax.compilation import known_here
 from hks_jax.eigen.host.matrices import host_matrices
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
+from hks_jax.linear.dense_eigh import pencil_eigh
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.standard_form import pencil_eigh
 
 
 class Dense(Eigensolver[SymmetricPencil]):
@@ -23,10 +22,6 @@ class Dense(Eigensolver[SymmetricPencil]):
 
     name: ClassVar[str] = "dense"
     tolerance: float = eqx.field(default=1e-8, static=True)
-
-    def __check_init__(self) -> None:
-        """Check the settings."""
-        require_number("tolerance", self.tolerance, 1)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs: where values are concrete by SciPy, for which nothing is compiled."""

@@ -14,17 +14,16 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import by_numpy, jit_quickly, known_and_few, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
 from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
-from hks_jax.eigen.interior import first_from_origin
+from hks_jax.eigen.lanczos.block_lanczos import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear import lapack
-from hks_jax.linear.batches import one_by_one
-from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.not_differentiable import first_order_only
+from hks_jax.linear.linear_map import first_order_only, with_transpose
+from hks_jax.linear.loops import one_by_one
 from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, inner_products
+from hks_jax.linear.products import inner_products, matmul
 from hks_jax.traced import is_traced
 
 Telling = Literal["nothing", "warning", "error"]
@@ -236,7 +235,7 @@ def tangents_of(
     frame = _onto(guards, inverse[:, k:], force)
     if _solves(pencil, k, len(values)):
         frame = frame + _outside(adjoint, telling, prepared, pencil, values, vectors, -force)
-    d_vectors = combine(within, functions) + frame
+    d_vectors = matmul(within, functions) + frame
     return jnp.diagonal(into), d_vectors, frame
 
 
@@ -247,7 +246,7 @@ def _onto(
     """Return Σⱼ cᵢⱼ (gⱼ·fᵢ) gⱼ."""
 
     def onto(force: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return combine(factors * inner_products(guards, force), guards)
+        return matmul(factors * inner_products(guards, force), guards)
 
     return with_transpose(onto, onto, force)
 
@@ -369,13 +368,13 @@ def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]
     vectors, mass, chosen = first_order_only(primals)
     change = tangents[0]
     inside = jnp.where(chosen, products_with_constants(mass.apply(change), vectors), 0)
-    return vectors, change - combine(inside, vectors)
+    return vectors, change - matmul(inside, vectors)
 
 
 # The transpose that JAX makes of these products is one with the transposed vectors, which takes twice as long.
 def products_with_constants(images: Float[Array, "b n_dof"], vectors: Float[Array, "k n_dof"]) -> Float[Array, "b k"]:
     """Return the inner products, linear in the images: the vectors are constants to derivatives."""
-    return with_transpose(partial(inner_products, vectors), lambda mix: combine(mix, vectors), images)
+    return with_transpose(partial(inner_products, vectors), lambda mix: matmul(mix, vectors), images)
 
 
 @jax.custom_jvp

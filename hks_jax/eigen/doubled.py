@@ -12,16 +12,15 @@ from jaxtyping import Array, Float
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.one_pencil import solve_lowest
+from hks_jax.eigen.one_pencil import solve_lowest, widened
 from hks_jax.eigen.solver import Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
-from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
 
 def solve_doubled(
-    pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, name: str, throw: bool, report: Report
+    pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, throw: bool, report: Report
 ) -> Eigenpairs:
     """Solve the mixed problems and return the k lowest pairs of all, and with one ``extra`` the next eigenvalue.
 
@@ -29,8 +28,7 @@ def solve_doubled(
     a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask for all that there can be.
     """
     parts, total = pencil.parts, k + extra
-    whole = pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, total)
-    limits = _limits(pencil, total)
+    whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
     traced = is_traced(jax.lax.stop_gradient(pencil))
     wanted = limits if traced else [*map(min, limits, _shares(pencil, total))]
     # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
@@ -40,7 +38,7 @@ def solve_doubled(
     ]
 
     def solve(number: int, report: Report) -> Eigenpairs:
-        return solve_lowest(whole.parts[number], solvers[number], wanted[number], 0, name, throw, report)
+        return solve_lowest(whole.parts[number], solvers[number], wanted[number], 0, throw, report)
 
     solved = [solve(i, _of_problem(report, i, len(parts))) for i in range(len(parts))]
     while not traced:
@@ -53,7 +51,8 @@ def solve_doubled(
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve(i, report)
-    return merge(whole, tuple(solved), k, extra, name)
+    assert isinstance(whole, MirrorPencil)
+    return merge(whole, tuple(solved), k, extra)
 
 
 def _limits(pencil: MirrorPencil, total: int) -> list[int]:
@@ -86,8 +85,8 @@ def _shares(pencil: MirrorPencil, total: int) -> list[int]:
     return [max(math.ceil(share + weyl_number(value, 0.0, d, 2 * (size - mean))), 0) + margin for size in sizes]
 
 
-@partial(jax.jit, static_argnames=("k", "extra", "name"))
-def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int, name: str) -> Eigenpairs:
+@partial(jax.jit, static_argnames=("k", "extra"))
+def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int) -> Eigenpairs:
     """Return the k lowest pairs of all parts, and with one ``extra`` the next eigenvalue."""
     values, sizes = jnp.concatenate([pairs.eigenvalues for pairs in solved]), [pairs.k for pairs in solved]
     order = jnp.argsort(jnp.concatenate(_sorted_by(pencil, solved)))
@@ -113,7 +112,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         spectral_origin=solved[0].spectral_origin,
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         pencil=pencil,
-        solver_name=name,
+        solver_name=" + ".join(dict.fromkeys(pairs.solver_name for pairs in solved)),
         lowest=solved[0].lowest,
     )
 

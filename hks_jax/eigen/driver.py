@@ -1,6 +1,6 @@
 """The driver: assemble, choose a solver, truncate, report."""
 
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -8,19 +8,18 @@ import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.automatic import choose_solver
-from hks_jax.eigen.count import checked_pencil
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
-from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, check_choice, truncate
+from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
+from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest
+from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest, widened
 from hks_jax.eigen.solver import Eigensolver, Report, silent
-from hks_jax.fem.all_nodes import on_all_nodes
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.quadrature import Quadrature
 from hks_jax.traced import is_traced
 
 
@@ -83,7 +82,8 @@ def eigenpairs(
             values are concrete).
     """
     pencil = checked_pencil(domain, boundary, mass, quadrature)
-    check_choice(multiplet)
+    if multiplet not in get_args(MultipletChoice):
+        raise ValueError(f'multiplet: got {multiplet!r}; expected "report", "drop" or "complete"')
     report = progress or silent
     if interval is not None:
         pairs = _in_interval(pencil, interval, k, solver, throw, report)
@@ -139,9 +139,8 @@ def eigsh(
         k: how many, 1 … n. See `eigenpairs` for k with an interval.
         interval: (a, b): all a ≤ λ < b.
         solver: see `eigenpairs`; None is ``"auto"``.
-        throw: whether a failure is an error, also under `jit`; else the pairs carry a code, ``.result``, and it is
-            warned of where values are concrete.
-        progress: called with short texts, where values are concrete; ``print`` will do.
+        throw: see `eigenpairs`.
+        progress: likewise.
 
     Returns:
         The pairs with residuals, convergence flags and the certificate. All signatures take them.
@@ -159,24 +158,16 @@ def eigsh(
 
 
 def _lowest(
-    pencil: AnyPencil,
-    k: int,
-    solver: str | Eigensolver,
-    multiplet: MultipletChoice,
-    throw: bool,
-    report: Report,
+    pencil: AnyPencil, k: int, solver: str | Eigensolver, multiplet: MultipletChoice, throw: bool, report: Report
 ) -> Eigenpairs:
     total = sum(part.size for part in pencil.parts)
     size = min(k + SPARE, total) if multiplet == "complete" else k
-    choices = [choose_solver(solver, part, size) for part in pencil.parts]
-    name = " + ".join(dict.fromkeys(choice.name for choice in choices))
+    solvers = [choose_solver(solver, part, size) for part in pencil.parts]
     extra = min(1, total - size)  # to see where the spectrum is cut
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_doubled(pencil, choices, size, extra, name, throw, report)
+        pairs = solve_doubled(pencil, solvers, size, extra, throw, report)
     else:
-        whole = pencil if isinstance(choices[0], Dense) else on_all_nodes(pencil, size + extra)
-        assert isinstance(whole, Pencil)
-        pairs = solve_lowest(whole, choices[0], size, extra, name, throw, report)
+        pairs = solve_lowest(widened(pencil, solvers, size + extra).parts[0], solvers[0], size, extra, throw, report)
     return truncate(pairs, k, multiplet)
 
 
@@ -192,15 +183,11 @@ def _in_interval(
         raise ValueError("k: the problems of a doubled domain are counted one by one; leave k out")
     checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
-    whole = pencil
-    if not (is_traced([each.below for each in checked]) or any(isinstance(method, Dense) for method in solvers)):
-        whole = on_all_nodes(pencil, max(int(each.below) + each.k for each in checked))
+    traced = is_traced([each.below for each in checked])
+    whole = pencil if traced else widened(pencil, solvers, max(int(each.below) + each.k for each in checked))
     problems = zip(whole.parts, checked, solvers, strict=True)
     solved = tuple(solve_interval(part, each, method, throw, report) for part, each, method in problems)
-    if not isinstance(whole, MirrorPencil):
-        return solved[0]
-    name = " + ".join(dict.fromkeys(pairs.solver_name for pairs in solved))
-    return merge(whole, solved, sum(pairs.k for pairs in solved), 0, name)
+    return merge(whole, solved, sum(pairs.k for pairs in solved), 0) if isinstance(whole, MirrorPencil) else solved[0]
 
 
 def _for_interval(solver: str | Eigensolver, pencil: Pencil, interval: Interval) -> BlockLanczos | Dense:

@@ -1,6 +1,6 @@
 """Eigenpairs, what is known of their quality, and where a spectrum is truncated."""
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.arrays import describe_array
 from hks_jax.compilation import numpy_where_known
-from hks_jax.describe import describe_array
 from hks_jax.domain.tensor_checks import MANY
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _ROUNDED = 1e-3
@@ -35,17 +34,6 @@ class RESULTS(eqx.Enumeration):
         "The solver could not confirm that it missed no eigenvalue from `.complete_below` on. Use another solver, or a "
         "slightly different k."
     )
-
-
-def result_of(
-    pencil: SymmetricPencil | MirrorPencil, converged: Bool[Array, " k"], unconfirmed: Bool[Array, ""]
-) -> RESULTS:
-    """Return the outcome of a computation of eigenpairs: the gravest failure."""
-    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(pencil) if eqx.is_inexact_array(leaf)]
-    code: Any = RESULTS  # whose members are strings until the class is made
-    result = code.where(unconfirmed, code.unconfirmed, code.successful)
-    result = code.where(jnp.all(converged), result, code.unconverged)
-    return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
 
 class Eigenpairs(eqx.Module):
@@ -99,7 +87,6 @@ class Eigenpairs(eqx.Module):
     lowest: bool = eqx.field(static=True, default=True)
 
     def __repr__(self) -> str:
-        """Return one line; `summary` says more."""
         unknowns = sum(part.space.n_dof for part in self.pencil.parts)
         return (
             f"Eigenpairs(k={self.k} of {unknowns}, eigenvalues {describe_array(self.eigenvalues)}, "
@@ -190,8 +177,12 @@ class Eigenpairs(eqx.Module):
 
     @property
     def result(self) -> RESULTS:
-        """What came of it, as a traced code: compare with ``RESULTS.successful``, or call its ``error_if``."""
-        return result_of(self.pencil, self.converged, self.unconfirmed)
+        """The gravest failure, as a traced code: compare with ``RESULTS.successful``, or call its ``error_if``."""
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
+        code: Any = RESULTS  # whose members are strings until the class is made
+        result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
+        result = code.where(jnp.all(self.converged), result, code.unconverged)
+        return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
     def messages(self) -> list[str]:
         """Say in sentences what limits these pairs; empty if nothing does. Needs concrete values."""
@@ -295,21 +286,11 @@ SPARE = 8
 """How many pairs beyond k are computed to complete a multiple eigenvalue."""
 
 
-def check_choice(multiplet: str) -> None:
-    """Raise ValueError for an unknown choice."""
-    if multiplet not in get_args(MultipletChoice):
-        raise ValueError(f'multiplet: got {multiplet!r}; expected "report", "drop" or "complete"')
-
-
 def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpairs:
     """Keep k pairs, or as many fewer or more as make the last eigenvalue's multiplicity complete.
 
-    Args:
-        pairs: k pairs with the eigenvalue that follows them; to complete, up to `SPARE` more.
-        k: how many to keep.
-        multiplet: ``"report"`` keeps exactly k; ``"drop"`` leaves out the copies of a multiple eigenvalue that k cuts
-            (unless nothing would be left); ``"complete"`` takes its missing copies in if there are at most `SPARE`,
-            and else drops it.
+    ``"report"`` keeps exactly k; ``"drop"`` leaves out the copies of a multiple eigenvalue that k cuts, unless nothing
+    would be left; ``"complete"`` takes its missing copies in if they are among the pairs beyond k, and else drops it.
     """
     known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.spectral_origin, pairs.multiplet_tolerance
     chosen = _choose(*jax.lax.stop_gradient(known), k, multiplet)

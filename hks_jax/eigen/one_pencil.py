@@ -1,24 +1,26 @@
 """Eigenpairs of one pencil, the lowest or those in an interval, with what is known of their quality."""
 
 import os
-from typing import Any, NamedTuple, cast
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import by_numpy, jit_quickly, known_and_few
-from hks_jax.eigen.count import certain_count, count_below
+from hks_jax.eigen.complement.adjoint import Scalar, Values, Vectors
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
-from hks_jax.eigen.origin import locate, translated
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Eigensolver, Report
-from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.nodal import on_all_nodes
+from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
@@ -26,13 +28,13 @@ _FAR = 30
 """How many times the spread of the wanted eigenvalues the origin may lie below them."""
 
 
-def solve_lowest(
-    pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool, report: Report
-) -> Eigenpairs:
-    """Return the k lowest pairs of one pencil and, where one ``extra`` is asked for, the next eigenvalue.
+def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
+    """Return the pencil `on_all_nodes`, which serves every mask; as it is where all pairs are computed."""
+    return pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, k)
 
-    With ``throw``, a derivative that does not converge is an error.
-    """
+
+def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
+    """Return the k lowest pairs, and with one ``extra`` the next eigenvalue; see `solved` for ``throw``."""
     n_dof = pencil.size
     if not (pencil.bounded or solver.indefinite):
         raise ValueError(
@@ -41,83 +43,65 @@ def solve_lowest(
         )
     if k + extra > solver.max_pairs(n_dof) and pencil.null_space is None:
         solver = Dense(solver.tolerance)
-        name = solver.name
     elif k + extra > solver.max_pairs(n_dof):
         raise ValueError(
             f"k: the {solver.name} solver gives at most {solver.max_pairs(n_dof)} of {n_dof} pairs, and {k + extra} "
             "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
             "Use a smaller k or the dense solver"
         )
-    if pencil.null_space is None and not solver.indefinite:
-        return _from_bound(pencil, solver, k, extra, name, throw, report)
-    if not isinstance(solver, BlockLanczos) or known_by_weyl(pencil):
+    from_bound = pencil.null_space is None and not solver.indefinite
+    if not from_bound and (not isinstance(solver, BlockLanczos) or known_by_weyl(pencil)):
         found = solved(solver, pencil, k, extra, False, throw, report)
-        return _pairs(pencil, pencil, jnp.zeros((), found[0].dtype), found, solver, name)
-    half = max(solver.plan(k).slice_size // 2, 1)
-    origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
-    number, method = k, cast(Eigensolver, solver)
-    if not is_traced(below) and below > 2 * half:
-        # Of a lowest eigenvalue with more copies than are asked for, all are computed: the count is of all.
-        number = max(k, int(below))
-        method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
-    spacing = (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
-    moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spacing)
-    found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+        return _pairs(pencil, pencil, jnp.zeros((), found[0].dtype), found, solver)
+    number, method = k, solver
+    if from_bound:
+        assert pencil.lower_bound is not None
+        origin = reach = spacing = jax.lax.stop_gradient(pencil.lower_bound)
+    else:
+        assert isinstance(solver, BlockLanczos)
+        half = max(solver.plan(k).slice_size // 2, 1)
+        origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
+        reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
+        if not is_traced(below) and below > 2 * half:
+            # Of a lowest eigenvalue with more copies than are asked for, all are computed: the count is of all.
+            number = max(k, int(below))
+            method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
+
+    def solve(origin: Scalar, reach: Scalar, spacing: Scalar) -> tuple[SymmetricPencil, tuple[Any, ...]]:
+        if from_bound:  # a solver for K ⪰ 0 finds the pairs of K − σM, σ a lower bound of the spectrum
+            moved: SymmetricPencil = pencil.counted_from(origin)
+        else:
+            moved = translated(pencil, origin, jnp.zeros((), int), reach, spacing)
+        return moved, solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+
+    moved, found = solve(origin, reach, spacing)
     values = jax.lax.stop_gradient(found[0])
     if not is_traced(values) and _is_far(moved, values):
-        spread = values[-1] - values[0]
         # Once more, from an origin nearer to the spectrum: distances from one so far below would lose their digits.
-        origin, first = origin + values[0] - spread, origin + values[-1]
-        moved = translated(pencil, origin, jnp.zeros((), int), first - origin, spread / number)
-        found = solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+        spread = values[-1] - values[0]
+        origin = origin + values[0] - spread
+        moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
         values, vectors, _, _, bound = found
         frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
         found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
-    return _pairs(pencil, moved, origin, found, method, name if method is solver else method.name)
+    return _pairs(pencil, moved, origin, found, method)
 
 
-def _from_bound(
-    pencil: Pencil, solver: Eigensolver, k: int, extra: int, name: str, throw: bool, report: Report
-) -> Eigenpairs:
-    """Return the lowest pairs by a solver for K ⪰ 0: those of K − σM, σ a lower bound of the spectrum."""
-
-    def solve(origin: Float[Array, ""]) -> tuple[Pencil, tuple[Any, ...]]:
-        moved = pencil.counted_from(origin)
-        return moved, solved(solver, moved, k, extra, False, throw, report)
-
-    assert pencil.lower_bound is not None
-    origin = jax.lax.stop_gradient(pencil.lower_bound)
-    moved, found = solve(origin)
-    values = jax.lax.stop_gradient(found[0])
-    if not is_traced(values) and _is_far(moved, values):  # as after a spike, to which tolerances are relative
-        origin = origin + 2 * values[0] - values[-1]
-        moved, found = solve(origin)
-    return _pairs(pencil, moved, origin, found, solver, name)
-
-
-def _is_far(pencil: SymmetricPencil, values: Float[Array, " k"]) -> bool:
+def _is_far(pencil: SymmetricPencil, values: Values) -> bool:
     """Return whether eigenvalues, distances from an origin, lose digits by that; copies of one have none to lose."""
     spread = values[-1] - values[0]
     return bool((spread > indistinct(pencil, values.dtype)) & (values[0] > _FAR * spread))
 
 
 class Interval(NamedTuple):
-    """An interval of the spectrum of one pencil.
+    """An interval of the spectrum of one pencil."""
 
-    Attributes:
-        low: its lower end, which belongs to it.
-        high: its upper end, which does not.
-        below: how many eigenvalues lie under ``low``.
-        held: how many lie in it.
-        k: how many to compute; the same where values are concrete.
-    """
-
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-    below: Int[Array, ""]
-    held: Int[Array, ""]
-    k: int
+    low: Scalar  # its lower end, which belongs to it
+    high: Scalar  # its upper end, which does not
+    below: Int[Array, ""]  # how many eigenvalues lie under ``low``
+    held: Int[Array, ""]  # how many lie in it
+    k: int  # how many to compute; the same where values are concrete
 
 
 def solve_interval(
@@ -132,15 +116,11 @@ def solve_interval(
     if k:
         found = solved(solver, moved, k, 0, True, throw, report)
     found = *found[:4], jnp.where(held == k, jnp.minimum(found[4], length), jnp.nan)
-    return _pairs(pencil, moved, low, found, solver, solver.name, lowest=False)
+    return _pairs(pencil, moved, low, found, solver, lowest=False)
 
 
 def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | None) -> Interval:
-    """Return an interval as a user gives it, with what inertia counts; pencil and ends may be traced.
-
-    Raises:
-        ValueError: see `hks_jax.eigenpairs`.
-    """
+    """Return an interval that a user gives, checked as `eigenpairs` says, with what inertia counts; also traced."""
     low, high = (jnp.asarray(end, pencil.stiffness.dtype) for end in interval)
     if is_traced((pencil, low, high)):
         if k is None:
@@ -174,10 +154,9 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
 def _pairs(
     pencil: Pencil,
     solved_pencil: SymmetricPencil,
-    origin: Float[Array, ""],
+    origin: Scalar,
     found: tuple[Any, ...],
     solver: Eigensolver,
-    name: str,
     lowest: bool = True,
 ) -> Eigenpairs:
     """Return eigenpairs, found as those of a pencil whose eigenvalues count from the origin."""
@@ -204,18 +183,13 @@ def _pairs(
         spectral_origin=origin if known or not lowest else jax.lax.stop_gradient(values[0]),
         multiplet_tolerance=tolerance,
         pencil=pencil,
-        solver_name=name,
+        solver_name=solver.name,
         lowest=lowest,
     )
 
 
 def _quality(
-    pencil: SymmetricPencil,
-    values: Float[Array, " k"],
-    vectors: Float[Array, "k n_dof"],
-    origin: Float[Array, ""],
-    tolerance: float,
-    known: bool,
+    pencil: SymmetricPencil, values: Values, vectors: Vectors, origin: Scalar, tolerance: float, known: bool
 ) -> tuple[Array, ...]:
     """Return residuals, what converged, which eigenvalues are zero within rounding, and the multiplet tolerance."""
     k = values.size
@@ -233,12 +207,7 @@ def _quality(
 
 @jit_quickly(static_argnames=("tolerance", "known"))
 def _judged_by_jax(
-    pencil: SymmetricPencil,
-    values: Float[Array, " k"],
-    vectors: Float[Array, "k n_dof"],
-    origin: Float[Array, ""],
-    tolerance: float,
-    known: bool,
+    pencil: SymmetricPencil, values: Values, vectors: Vectors, origin: Scalar, tolerance: float, known: bool
 ) -> tuple[Array, ...]:
     measured = *measure_pairs(pencil, vectors, values)[1:], largest(pencil)
     return _judged(jnp, measured, values, origin, pencil.n_null, tolerance, known)

@@ -68,12 +68,8 @@ def measured_on_host(
 def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp) -> Any:
     """Return the residuals ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
 
-    Args:
-        scale: (*m) what their residuals are relative to: the size of λ, or of a typical eigenvalue if that is larger.
-        rounding: the residuals that rounding alone may make; it excuses a relative one of a per cent at most, beyond
-            which the pair is not known, whatever the reason.
-        tolerance: the relative residual asked for.
-        xp: the module of arrays.
+    The tolerance is relative to ``scale``: the size of λ, or of a typical eigenvalue if that is larger. The residuals
+    that rounding alone may make excuse a relative one of a per cent at most, beyond which the pair is not known.
     """
     return xp.maximum(tolerance * scale, xp.minimum(rounding, _EXCUSED * scale))
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from hks_jax.checks import require_number
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
 from hks_jax.linear.pencil import SymmetricPencil
@@ -55,6 +56,9 @@ class Eigensolver(eqx.Module, Generic[P]):
     indefinite: ClassVar[bool] = True
     tolerance: eqx.AbstractVar[float]
     adjoint: Adjoint = eqx.field(default=FactorisedAdjoint(), static=True, kw_only=True)
+
+    def __check_init__(self) -> None:
+        require_number("tolerance", self.tolerance, 1)
 
     @abstractmethod
     def lowest(self, pencil: P, k: int, report: Report = silent) -> RawPairs:

@@ -26,11 +26,7 @@ def weyl(count: float, volume: Volume, dimension: int) -> Volume:
 
 
 def weyl_number(values: Real, volume: float, dimension: int, rim: float = 0.0) -> Real:
-    """Return about how many eigenvalues lie below a λ ≥ 0, by two terms (Ivrii 1980).
-
-    In 2D N(λ) ≈ (A λ + L √λ)/4π with the area A, in 3D N(λ) ≈ V λ^(3/2)/6π² + S λ/16π. L or S is the length or the area
-    of the natural part of the rim, less that of its Dirichlet part.
-    """
+    """Return about how many eigenvalues lie below λ ≥ 0; of the rim, natural parts count less Dirichlet ones."""
     if dimension == 2:
         return (volume * values + rim * values**0.5) / (4 * math.pi)
     return volume * values**1.5 / (6 * math.pi**2) + rim * values / (16 * math.pi)
@@ -81,12 +77,7 @@ def weyl_count(
 
 
 def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
-    """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part.
-
-    Args:
-        domain: the field or mesh; not traced.
-        space: the space of its functions, which knows the conditions.
-    """
+    """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part."""
     if isinstance(domain, SimplicialMesh):
         return _mesh_rim(domain, space)
     assert isinstance(space, GridSpace)

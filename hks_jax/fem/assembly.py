@@ -12,12 +12,12 @@ from hks_jax.checks import require_count
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
+from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.fields import Field, checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
 from hks_jax.fem.grid_assembly import assemble_grid, grid_points
 from hks_jax.fem.mesh_assembly import assemble_mesh, mesh_nodes, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.quadrature import Quadrature
 from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
@@ -191,11 +191,11 @@ def _checked_operator(
 def _checked_fields(
     operator: WeakForm, given: dict[str, Any], space: GridSpace | MeshSpace, points: Callable[[], Array], dtype: Any
 ) -> dict[str, Field]:
-    def checked(name: str) -> Field:
-        positive = name == "density" and not operator.own
-        return checked_field(name, given[name], space, points, dtype, scalar=not operator.own, positive=positive)
-
-    return {name: checked(name) for name in given}
+    known = not operator.own
+    return {
+        name: checked_field(name, value, space, points, dtype, scalar=known, positive=known and name == "density")
+        for name, value in given.items()
+    }
 
 
 def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:

@@ -56,7 +56,6 @@ def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, .
 
 
 def _pair(entry: str | Sides) -> Sides:
-    """Return the (low, high) conditions of one axis."""
     pair = (entry, entry) if isinstance(entry, str) else entry
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise ValueError(f"boundary: got {entry!r} for one axis; expected a name or a pair (low, high)")
@@ -117,12 +116,8 @@ def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
     mixed = list(product(*choices))
     if not any("mean" in sides for sides in boundary):
         return mixed
-    return [_replaced(problem, "mean", condition) for condition in ("neumann", "dirichlet") for problem in mixed]
-
-
-def _replaced(boundary: tuple[Sides, ...], old: Side, new: Side) -> tuple[Sides, ...]:
-    """Return the conditions, with another name for one of them."""
-    return tuple((new if low == old else low, new if high == old else high) for low, high in boundary)
+    halves = [{"mean": condition} for condition in ("neumann", "dirichlet")]
+    return [tuple((half.get(a, a), half.get(b, b)) for a, b in problem) for half in halves for problem in mixed]
 
 
 def reflect(field: TensorField, width: int) -> TensorField:
@@ -143,14 +138,9 @@ def reflect(field: TensorField, width: int) -> TensorField:
         raise ValueError(f"width: got {width}; expected 1 … {min(grid.shape) - 1} nodes for shape {grid.shape}")
     pad = [(width, width)] * d
     tensors = jnp.pad(field.tensors, [*pad, (0, 0), (0, 0)], mode="reflect")
-    for axis in range(d):
-        index = np.arange(-width, grid.shape[axis] + width)
-        beyond = (index < 0) | (index > grid.shape[axis] - 1)
-        sign = np.where(beyond, -1.0, 1.0).reshape([-1 if a == axis else 1 for a in range(d)] + [1, 1])
-        flips = np.zeros((d, d), dtype=bool)
-        flips[axis, :] = flips[:, axis] = True
-        flips[axis, axis] = False
-        tensors = tensors * jnp.where(flips, sign, 1.0).astype(tensors.dtype)
+    inside = [np.pad(np.ones(n), width, constant_values=-1) for n in grid.shape]
+    sign = np.stack(np.meshgrid(*inside, indexing="ij"), axis=-1)
+    tensors = tensors * jnp.asarray(sign[..., :, None] * sign[..., None, :], tensors.dtype)
     mask = None if grid.mask is None else np.pad(grid.mask, pad, mode="reflect")
     origin = [o - width * h for o, h in zip(grid.origin, grid.spacing, strict=True)]
     shape = [n + 2 * width for n in grid.shape]

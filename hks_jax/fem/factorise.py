@@ -196,7 +196,6 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
 
 
 def _patterned(operator: Any) -> PatternedOperator:
-    """Return a real symmetric operator as a sparse matrix."""
     match operator:
         case SparseLinearOperator():
             return operator.matrix

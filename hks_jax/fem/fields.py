@@ -31,12 +31,9 @@ class Field(eqx.Module):
     def at_points(
         self, corners: Callable[[Array], Array], shape_values: Float[np.ndarray, "q n"], elements: tuple[int, ...]
     ) -> Float[Array, "E q ..."]:
-        """Return the field at the quadrature points of all elements; nodal values are interpolated.
+        """Return the field at the quadrature points of all elements.
 
-        Args:
-            corners: what takes values at the nodes to those at the nodes of each element, (E, n, …).
-            shape_values: the shape functions at the quadrature points.
-            elements: the shape of the elements.
+        Nodal values are interpolated by the shape functions at these points; `corners` takes them to each element's.
         """
         values, n, q, axes = self.values, int(np.prod(elements)), len(shape_values), len(elements)
         if self.at == "nodes":
@@ -59,19 +56,10 @@ def checked_field(
     scalar: bool = False,
     positive: bool = False,
 ) -> Field:
-    """Return a field as a user gives it.
+    """Return what a user gives as a field: a number, an array over nodes or elements, or a function of one position.
 
     What lies outside of the domain is ignored. Where values are traced, those that should be positive and are not
-    become NaN.
-
-    Args:
-        name: of the argument.
-        given: a number, an array over the nodes or the elements, or a function of one position.
-        space: of the domain.
-        positions: returns the quadrature points' positions, for functions.
-        dtype: that of the matrices.
-        scalar: whether it must have one number at each place.
-        positive: whether these must be positive.
+    become NaN. Functions are evaluated at the quadrature points, whose `positions` are computed for them alone.
 
     Raises:
         ValueError: another shape; values that are NaN, infinite, or not positive (how many, and where the first is).

@@ -105,13 +105,9 @@ def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
 # A form is linear in u, so that it is a number for the value of u and one for each derivative, which its transpose
 # reads off: form(u, v, w) = flux(v)·(value, grad of u). For T⁻¹∇u·∇v it is T⁻¹∇v. So n evaluations do for n² pairs.
 def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, points: Point) -> Float[Array, "n n"]:
-    """Integrate a form over one element, for all pairs of shape functions.
+    """Integrate a form over one element, for all pairs of n shape functions: value (q, n, *c), grad (q, n, *c, d).
 
-    Args:
-        form: the form.
-        volume: of each quadrature point, √|T| included.
-        functions: value (q, n, *c) and grad (q, n, *c, d).
-        points: q of them.
+    The volume of each of the q points includes √|T|.
 
     Raises:
         ValueError: a form that does not return one number, or is not linear in u.

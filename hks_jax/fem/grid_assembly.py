@@ -16,12 +16,10 @@ from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.assembled import assembled, gathered, row_sums_of
-from hks_jax.fem.elements import Element, at_quadrature, element_matrices, tensor_product_element
+from hks_jax.fem.elements import MASS, Element, at_quadrature, element_matrices, moved, tensor_product_element
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
-from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.quadrature import MASS, moved
+from hks_jax.fem.pencil import Pencil, assembled, gathered, row_sums_of
 from hks_jax.fem.resolution import SampledMetric
 from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator
@@ -147,7 +145,7 @@ def _grid_integrals(
     Of functions with several components the matrices of all elements in place of stencils.
     """
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
-    tensors = spd.positive_or_nan(spd.identity_unless(domain, tensors))
+    tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 
     # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them
     # into everything that reads a component, and compute them again for each.

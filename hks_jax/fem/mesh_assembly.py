@@ -10,11 +10,10 @@ from hks_jax.checks import real_array
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.fem.assembled import assembled, gathered, row_sums_of
 from hks_jax.fem.elements import element_matrices, simplex_element
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
-from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.pencil import Pencil, assembled, gathered, row_sums_of
 from hks_jax.fem.resolution import SampledMetric
 from hks_jax.fem.space import MeshSpace, vector_space
 

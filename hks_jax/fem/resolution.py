@@ -68,7 +68,7 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
 # A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6, which adds d/24 Σₐ hₐ²gₐₐ/t, by E λkₐ² = (d + 2)gₐₐ/4t²;
 # 1/20 in place of 1/24 is what the next terms make of it at t = 6h².
 #
-# Where the leading error cancels (hks_jax/fem/quadrature.py) and the tensor is diagonal, λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240 and
+# Where the leading error cancels (hks_jax/fem/elements.py) and the tensor is diagonal, λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240 and
 # the nodal square is larger by (Σₐ hₐ²kₐ²)²/576: with E kₐ⁶ = 15gₐₐ³/8t³ the relative error is
 #
 #     Σₐ hₐ⁴gₐₐ²/128t² + Σₐᵦ hₐ²hᵦ² (gₐₐgᵦᵦ + 2gₐᵦ²)/2304t².

@@ -16,8 +16,8 @@ from scipy.sparse.linalg import LinearOperator
 from hks_jax.checks import real_array, require_number
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.quadrature import Quadrature
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.operators import ROUNDING, DiagonalOperator, Operator, SparseOperator, require_symmetric
 from hks_jax.linear.pattern import SparsePattern
@@ -48,9 +48,8 @@ def sparse_pencil(
 ) -> Pencil:
     """Return a pair of matrices as a pencil with one pattern, that of either matrix and of its transpose.
 
-    The entries of the operators are what K and M have as numbers; of an entry and the one across the diagonal it is the
-    mean that counts, in derivatives too. Eigenpairs of the pencil have every signature. Those that need a geometry say
-    which of the arguments below they lack.
+    Of an entry and the one across the diagonal the mean counts, in derivatives too. Eigenpairs of the pencil have every
+    signature. Those that need a geometry say which of the arguments below they lack.
 
     Args:
         K: symmetric (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data may be
@@ -169,26 +168,29 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
     if np.ndim(M) == 0 and isinstance(M, numbers.Number):
         raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If it is k, pass k={M}")
     stiffness = _entries("K", K)
-    dtype = stiffness.values.dtype
-    n = stiffness.size
-    diagonal, mass = _diagonal(M, n, dtype), None
+    n, dtype = stiffness.size, stiffness.values.dtype
+    diagonal, matrices = _diagonal(M, n, dtype), [stiffness]
     if diagonal is None:
         mass = _entries("M", M)
         if mass.size != n:
             raise ValueError(f"M: got shape {(mass.size, mass.size)}; expected that of K, {(n, n)}")
         if (mass.rows == mass.cols).all():
-            index = jnp.asarray(mass.rows)
-            diagonal = jnp.zeros(n, mass.values.dtype).at[index].add(mass.values)
-    given = diagonal.dtype if mass is None and diagonal is not None else mass.values.dtype  # type: ignore[union-attr]
+            diagonal = jnp.zeros(n, mass.values.dtype).at[jnp.asarray(mass.rows)].add(mass.values)
+        else:
+            matrices.append(mass)
+    given = matrices[-1].values.dtype if diagonal is None else diagonal.dtype
     if given != dtype:
         raise ValueError(f"M: got {given}, and K is {dtype}; expected one dtype. Convert one of them with .astype")
-    if diagonal is not None:
-        _check_diagonal(diagonal)
-        pattern = _pattern(n, stiffness)
-        return SymmetricPencil(_operator(pattern, stiffness), DiagonalOperator(diagonal))
-    assert mass is not None
-    pattern = _pattern(n, stiffness, mass)
-    return SymmetricPencil(_operator(pattern, stiffness), _operator(pattern, mass))
+    if diagonal is not None and not is_traced(diagonal):
+        wrong = np.flatnonzero(~(np.asarray(diagonal) > 0))
+        if wrong.size:
+            raise ValueError(
+                f"M: {wrong.size} of its {diagonal.size} diagonal entries are not positive (the first is "
+                f"{float(diagonal[wrong[0]]):.6g}, of row {wrong[0]}); a mass must be positive definite"
+            )
+    pattern = _pattern(n, *matrices)
+    one, *other = (_operator(pattern, matrix) for matrix in matrices)
+    return SymmetricPencil(one, other[0] if diagonal is None else DiagonalOperator(diagonal))
 
 
 def _entries(name: str, matrix: Any) -> _Entries:
@@ -250,16 +252,6 @@ def _diagonal(M: Any, n: int, dtype: np.dtype) -> Array | None:
 def _check_square(name: str, shape: tuple[int, ...]) -> None:
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
         raise ValueError(f"{name}: got shape {tuple(shape)}; expected a square matrix (n, n)")
-
-
-def _check_diagonal(diagonal: Array) -> None:
-    if not is_traced(diagonal):
-        wrong = np.flatnonzero(~(np.asarray(diagonal) > 0))
-        if wrong.size:
-            raise ValueError(
-                f"M: {wrong.size} of its {diagonal.size} diagonal entries are not positive (the first is "
-                f"{float(diagonal[wrong[0]]):.6g}, of row {wrong[0]}); a mass must be positive definite"
-            )
 
 
 def _pattern(n: int, *matrices: _Entries) -> SparsePattern:

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import ByKey
 from hks_jax.fem.halo import Slabs, neighbours, product_with_rim, side_by_side, with_rim
 from hks_jax.fem.space import GridSpace, taken
 from hks_jax.linear import accelerators
 from hks_jax.linear.bisection import Parts
-from hks_jax.linear.operators import OfColumns, PatternedOperator, Places
+from hks_jax.linear.operators import DiagonalOperator, OfColumns, Operator, PatternedOperator, Places
 from hks_jax.linear.pattern import Pattern
 from hks_jax.linear.products import of_each_row
 
@@ -25,11 +26,12 @@ _CELL = {2: 25, 3: 64}
 
 
 @jax.tree_util.register_static
-class GridPattern(Pattern):
+class GridPattern(ByKey, Pattern):
     """The couplings of a grid's free nodes with their 3^d neighbours, as places in stencil coefficients."""
 
     def __init__(self, space: GridSpace) -> None:
         self.space, self.size, self.n_entries = space, space.n_dof, 3**space.dimension * space.free.size
+        self._key = space
 
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for each place its index into the flat coefficients, its row, and its column."""
@@ -43,41 +45,23 @@ class GridPattern(Pattern):
         """Return how to cut the grid."""
         return _bisect(self.space)
 
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, GridPattern) and self.space == other.space)
-
-    def __hash__(self) -> int:
-        return hash(self.space)
-
 
 @lru_cache(maxsize=16)
 def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where in the coefficients each entry lies, its row and its column, for the couplings of free nodes."""
-    shape, d = space.node_shape, space.dimension
-    number = space.degrees_of_freedom.reshape(shape).astype(np.int32)
-    place = np.arange(number.size, dtype=np.int32).reshape(shape)
+    own = space.degrees_of_freedom.reshape(space.node_shape).astype(np.int32)
+    rimmed = own
     for axis, wraps in enumerate(space.periodic):
-        if wraps:
-            number = np.pad(number, [(1, 1) if a == axis else (0, 0) for a in range(d)], mode="wrap")
-    centre = number[tuple(slice(int(wraps), n + int(wraps)) for n, wraps in zip(shape, space.periodic, strict=True))]
+        widths = [(1, 1) if a == axis else (0, 0) for a in range(own.ndim)]
+        rimmed = np.pad(rimmed, widths, mode="wrap") if wraps else np.pad(rimmed, widths, constant_values=-1)
     where, rows, cols = [], [], []
-    for o, offset in enumerate(product((-1, 0, 1), repeat=d)):
-        # Both ends of all couplings, without those across a side.
-        ends = [_ends(n, k, wraps) for n, k, wraps in zip(shape, offset, space.periodic, strict=True)]
-        own, others = (tuple(slices) for slices in zip(*ends, strict=True))
-        row, col = centre[own].ravel(), number[others].ravel()
-        both = np.flatnonzero((row >= 0) & (col >= 0))
-        where.append(o * place.size + place[own].ravel()[both].astype(int))
-        rows.append(row[both])
-        cols.append(col[both])
+    for o, start in enumerate(product((0, 1, 2), repeat=own.ndim)):
+        other = rimmed[tuple(slice(s, s + n) for s, n in zip(start, own.shape, strict=True))]
+        both = np.flatnonzero((own >= 0) & (other >= 0))
+        where.append(o * own.size + both)
+        rows.append(own.ravel()[both])
+        cols.append(other.ravel()[both])
     return np.concatenate(where), np.concatenate(rows), np.concatenate(cols)
-
-
-def _ends(n: int, offset: int, wraps: bool) -> tuple[slice, slice]:
-    """Return which nodes of an axis have a neighbour at an offset, and where these are; with a rim if it wraps."""
-    if wraps:
-        return slice(0, n), slice(1 + offset, 1 + offset + n)
-    return slice(max(-offset, 0), n - max(offset, 0)), slice(max(offset, 0), n - max(-offset, 0))
 
 
 def _bisect(space: GridSpace) -> Parts:
@@ -205,6 +189,14 @@ def _distances(shape: tuple[int, ...]) -> tuple[list[int], int]:
     return distances, distances[-1]
 
 
+def coefficients_of(operator: Operator, space: GridSpace) -> Float[Array, "offsets *shape"]:
+    """Return the coefficients of a grid's matrix, (1, *shape) of a diagonal one."""
+    if isinstance(operator, DiagonalOperator):
+        return space.extend(operator.entries, outside=0.0)[None]
+    assert isinstance(operator, StencilOperator)
+    return operator.coefficients
+
+
 class StencilOperator(PatternedOperator):
     """A stencil on the free nodes of a grid: 9 coefficients a node in 2D, 27 in 3D.
 
@@ -218,11 +210,6 @@ class StencilOperator(PatternedOperator):
     def pattern(self) -> GridPattern:
         """Where the entries are."""
         return GridPattern(self.space)
-
-    @property
-    def nodal(self) -> Stencil:
-        """The matrix on nodal arrays."""
-        return Stencil(self.coefficients, self.space.periodic)
 
     def flat(self) -> Float[Array, " m"]:
         """Return the coefficients."""
@@ -247,7 +234,8 @@ class StencilOperator(PatternedOperator):
 
     def of_columns(self) -> OfColumns:
         """Return the product with a block of columns, twice as fast as with rows."""
-        product_with, shape = self.nodal.of_columns(), self.space.node_shape
+        shape = self.space.node_shape
+        product_with = Stencil(self.coefficients, self.space.periodic).of_columns()
         free, numbers = np.flatnonzero(self.space.free), self.space.degrees_of_freedom
         if free.size == numbers.size:
             return lambda x: product_with(x.reshape(*shape, -1)).reshape(x.shape)

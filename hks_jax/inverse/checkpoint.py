@@ -1,17 +1,14 @@
-"""Checkpoints of a fit, which appear whole or not at all, and the log of its steps."""
+"""Checkpoints of a fit, which appear whole or not at all."""
 
 import dataclasses
 import hashlib
 import os
-import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
 from hks_jax.inverse.metric_fit import Step
-from hks_jax.inverse.unknowns import Values
 from hks_jax.npz import load_npz, write_npz
 
 
@@ -29,16 +26,18 @@ class Checkpoint:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and settings."""
+    """Return a hash of arrays and settings; functions count by their names, which are those of the next session too."""
     digest = hashlib.blake2b(digest_size=16)
     for leaf in jax.tree.leaves(parts):
-        digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else repr(leaf).encode())
+        text = getattr(leaf, "__qualname__", repr(leaf)).encode()
+        digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else text)
     return digest.hexdigest()
 
 
 def save(path: str | os.PathLike[str], mark: str, checkpoint: Checkpoint) -> None:
     """Write a checkpoint."""
-    rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], np.float64)
+    columns = np.dtype([(field.name, field.type) for field in dataclasses.fields(Step)])
+    rows = np.array([dataclasses.astuple(step) for step in checkpoint.history], columns)
     content = vars(checkpoint) | {"mark": mark, "history": rows, "losses": np.array(checkpoint.losses)}
     write_npz(path, content, compressed=False)
 
@@ -58,38 +57,6 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
             f"checkpoint: {path} is of another fit (another target, initial field or setting); give another name, "
             "or remove it"
         )
-    history = []
-    for step, loss, misfit, gradient, accepted, seconds, stage, start in data["history"]:
-        history.append(Step(int(step), loss, misfit, gradient, bool(accepted), float(seconds), int(stage), int(start)))
-    return Checkpoint(
-        data["values"],
-        history,
-        int(data["start"]),
-        int(data["stage"]),
-        float(data["step_size"]),
-        data["best"],
-        list(map(float, data["losses"])),
-    )
-
-
-@dataclasses.dataclass
-class Log:
-    """Called after each step of a fit, it tells and saves it."""
-
-    now: Checkpoint  # where the fit stands
-    progress: Callable[[Step], None] | None  # called with each step
-    path: str | os.PathLike[str] | None  # of the checkpoint
-    mark: str  # of what fit it is
-    clock: float  # when the fit began, by `time.perf_counter`
-
-    def __call__(
-        self, number: int, told: tuple[float, float, float], accepted: bool, values: Values, step_size: float
-    ) -> None:
-        """Take up a step by its number within the stage: loss, misfit and gradient, and whether it was taken."""
-        now, seconds = self.now, time.perf_counter() - self.clock
-        now.values, now.step_size = values, step_size
-        now.history.append(Step(number, *told, accepted, seconds, now.stage, now.start))
-        if self.progress is not None:
-            self.progress(now.history[-1])
-        if self.path is not None:
-            save(self.path, self.mark, now)
+    history = [Step(*row) for row in data["history"].tolist()]
+    start, stage, step_size = (data[name].item() for name in ("start", "stage", "step_size"))
+    return Checkpoint(data["values"], history, start, stage, step_size, data["best"], data["losses"].tolist())

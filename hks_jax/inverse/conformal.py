@@ -11,11 +11,10 @@ from jaxtyping import Array, Float
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace
-from hks_jax.inverse.unknowns import Nodal, Values
+from hks_jax.inverse.unknowns import Nodal, Values, flat_field
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 
@@ -29,31 +28,19 @@ class Preconditioner(eqx.Module):
 
 
 class InnerProduct(Preconditioner):
-    """A symmetric positive definite operator on unknowns."""
+    """A symmetric positive definite operator on unknowns: the identity, unless a subclass says otherwise."""
 
-    @abstractmethod
     def apply(self, values: Values) -> Values:
         """Return its product with the unknowns."""
+        return values
 
-    @abstractmethod
     def solve(self, values: Values) -> Values:
         """Return the product of its inverse with the unknowns."""
+        return values
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
         """Return `solve`: of JᵀJ nothing is known."""
         return self.solve(values)
-
-
-class Euclidean(InnerProduct):
-    """The identity."""
-
-    def apply(self, values: Values) -> Values:
-        """Return the values."""
-        return values
-
-    def solve(self, values: Values) -> Values:
-        """Return the values."""
-        return values
 
 
 class Smoothing(InnerProduct):
@@ -77,14 +64,12 @@ class Smoothing(InnerProduct):
         """Return the inverse's product."""
         if self.factor is None:
             return values * (self.cell / self.pencil.mass.diagonal())[:, None]
-        return (self.factor.solve(values.T) * self.cell / self.length**2).T
+        return self.factor.solve(values) * self.cell / self.length**2
 
 
 def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     """Return the inner product for numbers at the nodes of a grid's domain."""
-    d = grid.dimension
-    flat = TensorField(grid, np.broadcast_to(np.eye(d, dtype=dtype), (*grid.shape, d, d)))
-    pencil = assemble(flat, mass="lumped")
+    pencil = assemble(flat_field(grid, dtype), mass="lumped")
     assert isinstance(pencil, Pencil)
     assert isinstance(pencil.space, GridSpace)
     factor = None

@@ -11,9 +11,12 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.inverse.conformal import Euclidean, InnerProduct, Preconditioner
+from hks_jax.inverse.conformal import InnerProduct, Preconditioner
 from hks_jax.inverse.unknowns import Values
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
+
+_Options = dict[str, Any]
+_Tags = frozenset[object]
 
 _TIGHTER, _LONGER = 30, 3
 """By what the linear systems are solved more exactly in steps that may be the last."""
@@ -25,9 +28,8 @@ _FREE = 0.01
 
 def remaining_change(last: Array, before: Array) -> Array:
     """Return the last step, or the sum of the steps to come if it is larger, were the last two a geometric series."""
-    ratio = last / jnp.where(before > 0, before, jnp.inf)
-    ratio = jnp.where(before > 0, ratio, jnp.inf)
-    return jnp.where(ratio < 1, last * jnp.maximum(1, ratio / jnp.where(ratio < 1, 1 - ratio, 1)), jnp.inf)
+    ratio = jnp.where(before > 0, last / before, jnp.inf)
+    return jnp.where(ratio < 1, last * jnp.maximum(1, ratio / (1 - ratio)), jnp.inf)
 
 
 class _State(eqx.Module):
@@ -42,70 +44,10 @@ class _State(eqx.Module):
     done: Bool[Array, ""]  # whether no step is needed any more
 
 
-class DampedDescent(eqx.Module):
-    """Solves (JᵀJ + μB) δ = −Jᵀr, with B an inner product of the unknowns and μ = damping / step size.
-
-    The conjugate gradients stop early: far from the solution more digits would be lost on the linearisation. Their
-    result is a descent direction whenever they stop.
-    """
-
-    tolerance: Float[Array, ""]  # the change of the unknowns, relative and absolute, at which steps end
-    damping: Float[Array, ""]  # μ at step size 1
-    inner_product: InnerProduct  # B
-    inner_tolerance: Float[Array, ""]  # reduction of the residual, in the norm of the preconditioner's inverse
-    inner_steps: Int[Array, ""]  # the most products with JᵀJ
-    preconditioner: Preconditioner  # of the conjugate gradients
-
-    def init(self, y: Values) -> _State:
-        """Return the state before any unknowns were accepted."""
-        far, no = jnp.asarray(jnp.inf, y.dtype), jnp.zeros((), bool)
-        return _State(y, jnp.zeros_like(y), jnp.zeros((), y.dtype), far, far, no, no)
-
-    def accepted(self, y: Values, state: _State) -> _State:
-        """Return what the step that led to the new unknowns tells; their own gradient comes with the next step."""
-        step = y - state.values
-        change = optx.rms_norm(step / (self.tolerance * (1 + jnp.abs(y))))
-        moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
-        damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
-        damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
-        settled = moved & (remaining_change(change, state.change) < 1)
-        # The next step may be the last: if steps go on to shrink like this, it is below the tolerance.
-        near = moved & jnp.isfinite(state.change) & (change**2 < state.change)
-        change = jnp.where(moved, change, jnp.inf)
-        tight, done = state.tight | near | settled, state.tight & settled
-        return _State(y, state.gradient, state.promised, change, damped, tight, done)
-
-    def done(self, step_size: Array, state: _State) -> Bool[Array, ""]:
-        """Tell whether the unknowns have converged, and not only been held by damping."""
-        return state.done & (self.damping / step_size * state.damped < _FREE)
-
-    # With g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
-    #
-    #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
-    def step(
-        self, step_size: Array, linearised: Any, state: _State, needed: bool | Bool[Array, ""]
-    ) -> tuple[Values, _State]:
-        """Return the step δ, zero if none is needed, and the state with the gradient and what the step promises."""
-        jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape
-        adjoint, damping = jacobian.transpose(), self.damping / step_size
-
-        # J and Jᵀ stand in the program once: they are most of what there is to compile.
-        def normal(x: Array, first: Bool[Array, ""]) -> tuple[Array, float]:
-            x = x.reshape(shape)
-            image = adjoint.mv(jax.lax.cond(first, lambda: residual, lambda: jacobian.mv(x)))
-            return (image + damping * self.inner_product.apply(x)).reshape(-1, 1), 0.0  # x = 0 at first
-
-        def precondition(r: Array) -> Array:
-            return self.preconditioner.precondition(r.reshape(shape), damping).reshape(-1, 1)
-
-        tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
-        most = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
-        most = jnp.where(needed & ~self.done(step_size, state), most, 0)
-        column = state.values.reshape(-1, 1)
-        solution = conjugate_gradients(normal, precondition, column, tolerance[None], most=most, orthogonal=True)
-        x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
-        promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
-        return -x, eqx.tree_at(lambda s: (s.gradient, s.promised), state, (gradient, promised))
+def begun(y: Values) -> _State:
+    """Return the state before any unknowns were accepted."""
+    far, no = jnp.asarray(jnp.inf, y.dtype), jnp.zeros((), bool)
+    return _State(y, jnp.zeros_like(y), jnp.zeros((), y.dtype), far, far, no, no)
 
 
 class _Progress(eqx.Module):
@@ -134,11 +76,15 @@ def _empty(structure: Any) -> Any:
 class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     """The default solver of `hks_jax.fit_metric`.
 
+    Its steps δ solve (JᵀJ + μB) δ = −Jᵀr, with B an inner product of the unknowns and μ = damping / step size. The
+    conjugate gradients stop early: far from the solution more digits would be lost on the linearisation. Their result
+    is a descent direction whenever they stop.
+
     Its settings are arrays: steps compiled for some serve all others.
 
     Args:
-        tolerance: what the unknowns still change, relative and absolute (root mean square), when it stops; see
-            `hks_jax.fit_metric`.
+        tolerance: what the unknowns still change, relative and absolute (root mean square), when it stops: see
+            `Search`.
         damping: μ of the first step, relative to the scale of the data.
         growth: by what μ is divided after a step that kept what the linearisation promised.
         inner_product: B, in which steps are small.
@@ -151,7 +97,11 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     atol: Float[Array, ""]  # type: ignore[assignment]
     norm: Callable[[Any], Array]
     growth: Float[Array, ""]
-    descent: DampedDescent
+    damping: Float[Array, ""]
+    inner_product: InnerProduct
+    inner_tolerance: Float[Array, ""]
+    inner_steps: Int[Array, ""]
+    preconditioner: Preconditioner
 
     def __init__(
         self,
@@ -169,34 +119,67 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         require_number("inner_tolerance", inner_tolerance, 1)
         require_count("inner_steps", inner_steps)
         self.rtol = self.atol = jnp.asarray(tolerance)
-        self.norm, self.growth = optx.rms_norm, jnp.asarray(growth)
-        inner_product = inner_product or Euclidean()
-        self.descent = DampedDescent(
-            self.rtol,
-            jnp.asarray(damping),
-            inner_product,
-            jnp.asarray(inner_tolerance),
-            jnp.asarray(inner_steps),
-            preconditioner or inner_product,
-        )
+        self.norm, self.growth, self.damping = optx.rms_norm, jnp.asarray(growth), jnp.asarray(damping)
+        self.inner_tolerance, self.inner_steps = jnp.asarray(inner_tolerance), jnp.asarray(inner_steps)
+        self.inner_product = inner_product or InnerProduct()
+        self.preconditioner = preconditioner or self.inner_product
+
+    def accepted(self, y: Values, state: _State) -> _State:
+        """Return what the step that led to the new unknowns tells; their own gradient comes with the next step."""
+        step = y - state.values
+        change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(y))))
+        moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
+        damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
+        damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
+        settled = moved & (remaining_change(change, state.change) < 1)
+        # The next step may be the last: if steps go on to shrink like this, it is below the tolerance.
+        near = moved & jnp.isfinite(state.change) & (change**2 < state.change)
+        change = jnp.where(moved, change, jnp.inf)
+        tight, done = state.tight | near | settled, state.tight & settled
+        return _State(y, state.gradient, state.promised, change, damped, tight, done)
+
+    def _done(self, step_size: Array, state: _State) -> Bool[Array, ""]:
+        """Tell whether the unknowns have converged, and not only been held by damping."""
+        return state.done & (self.damping / step_size * state.damped < _FREE)
+
+    # With g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
+    #
+    #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
+    def _next(
+        self, step_size: Array, linearised: Any, state: _State, needed: bool | Bool[Array, ""]
+    ) -> tuple[Values, _State]:
+        """Return the step δ, zero if none is needed, and the state with the gradient and what the step promises."""
+        jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape
+        adjoint, damping = jacobian.transpose(), self.damping / step_size
+
+        # J and Jᵀ stand in the program once: they are most of what there is to compile.
+        def normal(x: Array, first: Bool[Array, ""]) -> tuple[Array, float]:
+            x = x.reshape(shape)
+            image = adjoint.mv(jax.lax.cond(first, lambda: residual, lambda: jacobian.mv(x)))
+            return (image + damping * self.inner_product.apply(x)).reshape(-1, 1), 0.0  # x = 0 at first
+
+        def precondition(r: Array) -> Array:
+            return self.preconditioner.precondition(r.reshape(shape), damping).reshape(-1, 1)
+
+        tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
+        most = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
+        most = jnp.where(needed & ~self._done(step_size, state), most, 0)
+        column = state.values.reshape(-1, 1)
+        solution = conjugate_gradients(normal, precondition, column, tolerance[None], most=most, orthogonal=True)
+        x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
+        promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
+        return -x, eqx.tree_at(lambda s: (s.gradient, s.promised), state, (gradient, promised))
 
     def init(
-        self,
-        fn: Callable,
-        y: Values,
-        args: Any,
-        options: dict[str, Any],
-        f_struct: Any,
-        aux_struct: Any,
-        tags: frozenset[object],
+        self, fn: Callable, y: Values, args: Any, options: _Options, f_struct: Any, aux_struct: Any, tags: _Tags
     ) -> _Progress:
         """Return the state before the first step, in which ``y`` is looked at."""
         structure, _ = eqx.filter_eval_shape(_linearise, fn, y, args)
         yes, one = jnp.asarray(True), jnp.ones((), y.dtype)
-        return _Progress(yes, y, one, _empty(structure), _empty(aux_struct), self.descent.init(y), yes)
+        return _Progress(yes, y, one, _empty(structure), _empty(aux_struct), begun(y), yes)
 
     def step(
-        self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
+        self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Values, _Progress, Any]:
         """Look at the trial, take it or not, and choose the next; return the unknowns and what is told of them.
 
@@ -215,22 +198,20 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         step_size = state.step_size * jnp.where(good, self.growth, jnp.where(accept, 1, _SHRINKING))
 
         before, static = eqx.partition((y, state.linearised, state.aux, state.descent), eqx.is_array)
-        taken = state.trial, linearised, aux, self.descent.accepted(state.trial, state.descent)
+        taken = state.trial, linearised, aux, self.accepted(state.trial, state.descent)
         now = jax.lax.cond(accept, lambda: eqx.filter(taken, eqx.is_array), lambda: before)
         values, linearised, aux, descent = eqx.combine(now, static)
         needed = ~options["enough"](aux) if "enough" in options else True
-        step, descent = self.descent.step(step_size, linearised, descent, needed)
+        step, descent = self._next(step_size, linearised, descent, needed)
         no, finite = jnp.asarray(False), jnp.all(jnp.isfinite(step))
         return values, _Progress(no, values + step, step_size, linearised, aux, descent, finite), aux
 
     def terminate(
-        self, fn: Callable, y: Values, args: Any, options: dict[str, Any], state: _Progress, tags: frozenset[object]
+        self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Tell whether the unknowns have converged."""
         successful, not_finite = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
-        return self.descent.done(state.step_size, state.descent), optx.RESULTS.where(
-            state.finite, successful, not_finite
-        )
+        return self._done(state.step_size, state.descent), optx.RESULTS.where(state.finite, successful, not_finite)
 
     def postprocess(
         self,
@@ -238,10 +219,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         y: Values,
         aux: Any,
         args: Any,
-        options: dict[str, Any],
+        options: _Options,
         state: _Progress,
-        tags: frozenset[object],
-        result: optx.RESULTS,
+        tags: _Tags,
+        result: Any,
     ) -> tuple[Values, Any, dict[str, Any]]:
         """Return the unknowns and what is told of them as they are."""
         return y, aux, {}

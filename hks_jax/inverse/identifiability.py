@@ -142,7 +142,8 @@ def _information(problem: Problem, values: Values) -> Any:
 def _strongest(problem: Problem, values: Values, start: Array, iterations: int) -> tuple[Array, Array]:
     product = _information(problem, values)
     block = jax.lax.fori_loop(0, iterations, lambda _, block: _orthonormal(product(block)), _orthonormal(start))
-    return _ritz(block, product(block), largest=True)
+    values, vectors = _ritz(block, product(block))
+    return values[::-1], vectors[::-1]
 
 
 @jit_quickly(eqx.filter_jit)
@@ -160,7 +161,7 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
 
         block, _, _ = chebyshev_recurrence(scaled, block, degree)
         block = _orthonormal(block)
-        return _ritz(block, product(block), largest=False)
+        return _ritz(block, product(block))
 
     return jax.lax.fori_loop(0, _ROUNDS, improve, (jnp.full(len(start), 0.2 * top), _orthonormal(start)))
 
@@ -169,11 +170,9 @@ def _orthonormal(block: Float[Array, "n *values"]) -> Float[Array, "n *values"]:
     return lapack.orthonormal_columns(block.reshape(len(block), -1).T).T.reshape(block.shape)
 
 
-def _ritz(block: Array, image: Array, largest: bool) -> tuple[Array, Array]:
-    """Return Ritz values and vectors in the span of orthonormal directions."""
+def _ritz(block: Array, image: Array) -> tuple[Array, Array]:
+    """Return Ritz values, ascending, and vectors in the span of orthonormal directions."""
     flat, images = block.reshape(len(block), -1), image.reshape(len(block), -1)
     projected = jnp.matmul(flat, images.T, precision="highest")
     values, mix = lapack.eigh((projected + projected.T) / 2)
-    mix = mix[:, ::-1] if largest else mix
-    values = values[::-1] if largest else values
     return values, jnp.matmul(mix.T, flat, precision="highest").reshape(block.shape)

@@ -6,18 +6,20 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.checks import checked_times, require_number, require_real
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.signatures.hks import hks_of_pairs
-from hks_jax.signatures.kernels import heat_trace, wks
-from hks_jax.static_array import StaticArray
+from hks_jax.inverse.signature import SIGNATURES, Signature
+from hks_jax.inverse.unknowns import named
 
-Function = Callable[[Eigenpairs], Array]
 Loss = Callable[[Array, Array], Array]
 
 LOSSES: dict[str, Loss] = {
@@ -28,25 +30,44 @@ LOSSES: dict[str, Loss] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Signature:
-    """A kind of signature."""
+class Data:
+    """What the target of `hks_jax.fit_metric` is, and how exactly it is known.
 
-    name: str  # what `fit_metric` calls it; empty for a function of the user's
-    # Takes eigenpairs, times, the width of a wave kernel, the number of entries; a user's takes the eigenpairs alone.
-    function: Callable[..., Array]
-    symbol: str = ""  # "t": it depends on times of the flow of heat; "e": on energies; empty: on the eigenpairs alone
-    at_nodes: bool = False  # whether it has a value for each node
+    Attributes:
+        signature: ``"hks"``; ``"heat-trace"``; ``"eigenvalues"``, the lowest; `wave_kernel` (σ); or a function of
+            `Eigenpairs` to an array of the target's shape.
+        loss: ``"log"`` (differences of logarithms), ``"relative"``, ``"absolute"``, or a function of predicted and
+            target values, flat, to residuals.
+        weights: ≥ 0, broadcast to the target's shape; 0 for what is not observed (it may be NaN there).
+        noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``): the fit stops where the misfit
+            reaches it (discrepancy principle), which regularises it.
+        deviation: the standard deviation of the target's noise, in its unit, broadcast to its shape, as
+            `hks_jax.uncertainty` gives it. Residuals are weighed by its inverse square, besides by `weights`, and
+            `noise` follows from it unless it is given. Correlations of the noise are not heeded.
 
+    Raises:
+        ValueError: an unknown signature or loss; a noise that is not positive; a deviation with a loss that is a
+            function.
+    """
 
-SIGNATURES = {
-    each.name: each
-    for each in (
-        Signature("hks", lambda pairs, times, *_: hks_of_pairs(pairs, times), "t", at_nodes=True),
-        Signature("wks", lambda pairs, energies, sigma, _: wks(pairs, energies, sigma), "e", at_nodes=True),
-        Signature("heat-trace", lambda pairs, times, *_: heat_trace(pairs, times), "t"),
-        Signature("eigenvalues", lambda pairs, _, __, count: pairs.eigenvalues[:count]),  # there may be spare ones
-    )
-}
+    signature: str | Signature | Callable[[Eigenpairs], Array] = "hks"
+    loss: str | Loss = "log"
+    weights: Any = None
+    noise: float | None = None
+    deviation: Any = None
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without the target."""
+        if not callable(self.signature) and not isinstance(self.signature, Signature):
+            named("signature", self.signature, SIGNATURES, "wave_kernel(sigma), or a function of eigenpairs")
+        if not callable(self.loss):
+            named("loss", self.loss, LOSSES, "or a function of predicted and target values")
+        elif self.deviation is not None:
+            raise ValueError("deviation: it cannot be taken through a loss that is a function; give weights and noise")
+        if self.noise is not None:
+            require_number("noise", self.noise)
+        for name in ("weights", "deviation"):
+            require_real(name, getattr(self, name))
 
 
 class Observation(eqx.Module):
@@ -55,16 +76,22 @@ class Observation(eqx.Module):
     target: Float[Array, " m"]  # their values
     root_weights: Float[Array, " m"]  # the square roots of their weights, which add up to one
     times: Float[Array, " n_times"] | None  # the times, energies, or None
-    sigma: Float[Array, ""] | None  # the width of a wave kernel signature, or None
+    signature: Signature  # its kind
     shape: tuple[int, ...] = eqx.field(static=True)  # of the whole target
     entries: StaticArray = eqx.field(static=True)  # which of the flat target's entries they are
-    signature: Signature = eqx.field(static=True)  # its kind
-    loss: str | Loss = eqx.field(static=True)  # one of `LOSSES`, or a function of predicted and target to residuals
+    loss: Loss = eqx.field(static=True)  # of predicted and target values to residuals
 
     def predict(self, pairs: Eigenpairs) -> Array:
         """Return the whole signature."""
-        beside = (self.times, self.sigma, self.shape[0]) if self.signature.name else ()
-        return self.signature.function(pairs, *beside)
+        values = self.signature.predict(pairs, self.times)
+        return values[: self.shape[0]] if self.signature.lowest else values  # there may be spare pairs
+
+    def pairs_needed(self, k: int | None, pencil: AnyPencil, field: TensorField) -> int:
+        """Return how many eigenpairs to compute: k, or enough for what is observed."""
+        if self.signature.lowest:
+            return self.shape[0]
+        times = None if self.times is None else self.observed_times
+        return self.signature.pairs_needed(k, times, pencil, field)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
         """Return the residuals, half of whose sum of squares is the misfit."""
@@ -72,109 +99,101 @@ class Observation(eqx.Module):
 
     def compare(self, predicted: Array) -> Float[Array, " m"]:
         """Return the residuals of a whole signature."""
-        loss = self.loss if callable(self.loss) else LOSSES[self.loss]
-        return self.root_weights * loss(predicted.reshape(-1)[self.entries.value], self.target)
+        return self.root_weights * self.loss(predicted.reshape(-1)[self.entries.value], self.target)
+
+    def truncation_misfit(self, pairs: Eigenpairs) -> Float[Array, ""]:
+        """Estimate the misfit that the metric itself would have to a target of all pairs, as k are computed.
+
+        It is half the weighted sum of squares of the changes that the missing pairs make to the residuals: zero for
+        signatures that k pairs define.
+        """
+        if self.signature.left_out is None:
+            return jnp.zeros(())
+        pairs = jax.lax.stop_gradient(pairs)
+        predicted, share = self.predict(pairs), self.signature.left_out(pairs, self.times)
+        return jnp.sum((self.compare(predicted / (1 - share)) - self.compare(predicted)) ** 2) / 2
+
+    @property
+    def observed_times(self) -> Float[np.ndarray, " m"]:
+        """The time of each observed entry."""
+        assert self.times is not None
+        return np.asarray(self.times)[self.entries.value // math.prod(self.shape[1:])]
+
+    def stages(self, count: int) -> list["Observation"]:
+        """Return what several stages observe: the largest times first, all of them in the last."""
+        if self.signature.left_out is None:
+            return [self]
+        times, stages = self.observed_times, []
+        levels = np.unique(times)[::-1]
+        for stage in range(1, count):
+            kept = np.flatnonzero(times >= levels[math.ceil(len(levels) * stage / count) - 1])
+            root, entries = self.root_weights[kept], StaticArray(self.entries.value[kept])
+            root = root / jnp.linalg.norm(root)
+            stages.append(dataclasses.replace(self, target=self.target[kept], root_weights=root, entries=entries))
+        return [*stages, self]
 
 
-def observe(
-    target: Any,
-    times: Any,
-    weights: Any,
-    signature: str | Function,
-    loss: str | Loss,
-    sigma: Any,
-    space: FunctionSpace,
-    dtype: Any,
-) -> Observation:
-    """Check what is given and return the observation; see `hks_jax.fit_metric` for the arguments."""
-    if not callable(signature) and signature not in SIGNATURES:
-        names = ", ".join(map(repr, SIGNATURES))
-        raise ValueError(f"signature: got {signature!r}; expected {names}, or a function of eigenpairs")
-    kind = Signature("", signature) if callable(signature) else SIGNATURES[signature]
-    if not callable(loss) and loss not in LOSSES:
-        names = ", ".join(map(repr, LOSSES))
-        raise ValueError(f"loss: got {loss!r}; expected {names}, or a function of predicted and target values")
-    for name, given in (("target", target), ("times", times), ("weights", weights)):
+def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: Any) -> tuple[Observation, float | None]:
+    """Check the target; return what is observed, and the standard deviation of the residuals where it is known."""
+    signature: Any = data.signature
+    if not isinstance(signature, Signature):
+        signature = SIGNATURES[signature] if isinstance(signature, str) else Signature(signature)
+    for name, given in (("target", target), ("times", times)):
         require_real(name, given)
     values = np.asarray(target, np.float64)
-    if kind.symbol == "e":
-        if sigma is None:
-            raise ValueError("sigma: got None; expected the width of the wave kernel signature, as for `wks`")
-        require_number("sigma", sigma)
-        times, sigma = jnp.asarray(times, dtype), jnp.asarray(sigma, dtype)
+    if signature.symbol == "e" and times is None:
+        raise ValueError("times: got None; expected energies (n_energies,) for a wave kernel signature")
+    if signature.symbol == "t":
+        times = checked_times(times, dtype)
     else:
-        times, sigma = checked_times("times", times, dtype) if kind.symbol else None, None
-    nodes = space.node_shape if kind.at_nodes else ()
+        times = jnp.asarray(times, dtype) if signature.symbol else None
+    nodes = space.node_shape if signature.at_nodes else ()
     expected = None if times is None else (times.size, *nodes)
-    if (expected is not None and values.shape != expected) or (kind.name == "eigenvalues" and values.ndim != 1):
-        what = "(n_times, *grid.shape)" if kind.at_nodes else "(n_times,)"
+    if (expected is not None and values.shape != expected) or (signature.lowest and values.ndim != 1):
+        what = "(n_times, *grid.shape)" if signature.at_nodes else "(n_times,)"
         wanted = "(m,), the lowest ones ascending" if expected is None else f"{what} = {expected}"
         raise ValueError(f"target: got shape {values.shape}; expected {wanted}")
 
-    observed = np.broadcast_to(space.free, values.shape) if kind.at_nodes else np.ones(values.shape, dtype=bool)
-    if kind.name == "eigenvalues":
-        observed = observed & (np.arange(values.size) >= space.n_null)  # zero whatever the metric is
-    share = _checked_weights(weights, values.shape) * observed
-    used = share > 0
+    weights, noise = _weights(values, data)
+    weights = weights * (space.free if signature.at_nodes else 1)
+    if signature.lowest:
+        weights = weights * (np.arange(values.size) >= space.n_null)  # zero whatever the metric is
+    used = weights > 0
     if not used.any():
         raise ValueError("weights: all are zero inside the domain; expected some observed entries")
-    _check_values(values, used, positive=loss in ("log", "relative"))
+    remedy = "Give them the weight 0, take their nodes out of the mask, or correct them"
+    _refuse("target", values, used & ~np.isfinite(values), used, "NaN or infinite", remedy)
+    if data.loss in ("log", "relative"):
+        _refuse("target", values, used & (values <= 0), used, "not positive", remedy)
     entries = np.flatnonzero(used)
-    share = share.ravel()[entries]
-    return Observation(
+    share = weights.ravel()[entries]
+    observation = Observation(
         target=jnp.asarray(values.ravel()[entries], dtype),
         root_weights=jnp.asarray(np.sqrt(share / share.sum()), dtype),
         times=times,
-        sigma=sigma,
+        signature=signature,
         shape=values.shape,
         entries=StaticArray(entries),
-        signature=kind,
-        loss=loss,
+        loss=LOSSES[data.loss] if isinstance(data.loss, str) else data.loss,
     )
+    return observation, noise
 
 
-def stages_of(
-    whole: Observation, weights: Any, shape: tuple[int, ...], count: int, build: Callable[[Any], Observation]
-) -> list[Observation]:
-    """Return the observation of each stage: the largest times first."""
-    if count == 1 or whole.signature.symbol != "t":
-        return [whole]
-    assert whole.times is not None
-    order = np.argsort(-np.asarray(whole.times))
-    base = np.broadcast_to(np.ones(()) if weights is None else np.asarray(weights, float), shape)
-    stages = []
-    for stage in range(1, count):
-        used = np.zeros(shape[0], dtype=bool)
-        used[order[: math.ceil(shape[0] * stage / count)]] = True
-        stages.append(build(base * used.reshape(-1, *[1] * (len(shape) - 1))))
-    return [*stages, whole]
-
-
-def weigh(target: Any, weights: Any, deviation: Any, loss: str | Loss) -> tuple[np.ndarray, float]:
-    """Return the weights that a stated deviation of the target makes, and the deviation of a residual in their mean."""
-    if callable(loss):
-        raise ValueError("deviation: it cannot be taken through a loss that is a function; give weights and noise")
-    require_real("deviation", deviation)
-    values = np.asarray(target, np.float64)
-    given = _checked_weights(weights, values.shape)
-    size = _broadcast("deviation", deviation, values.shape)
-    used = (given > 0) & np.isfinite(values)
-    if (bad := used & ~(np.isfinite(size) & (size > 0))).any():
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"deviation: {int(bad.sum())} of {int(used.sum())} are not positive numbers (the first at {first}: "
-            f"{size[first]:.4g}); expected one for every observed value. Give others the weight 0"
-        )
-    of_residuals = np.where(used, size if loss == "absolute" else size / np.abs(values), 1.0)
-    weighed = np.where(used, given / of_residuals**2, 0.0)
-    return weighed, float(np.sqrt(np.sum(given, where=used) / np.sum(weighed)))
-
-
-def _checked_weights(weights: Any, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.ones(shape) if weights is None else _broadcast("weights", weights, shape)
-    if not (np.isfinite(array) & (array >= 0)).all():
+def _weights(values: np.ndarray, data: Data) -> tuple[np.ndarray, float | None]:
+    """Return the weights, those that a deviation makes included, and the deviation of a residual in their mean."""
+    given = np.ones(values.shape) if data.weights is None else _broadcast("weights", data.weights, values.shape)
+    if not (np.isfinite(given) & (given >= 0)).all():
         raise ValueError("weights: got negative, infinite or NaN ones; expected numbers ≥ 0 (0: not observed)")
-    return array
+    if data.deviation is None:
+        return given, data.noise
+    size = _broadcast("deviation", data.deviation, values.shape)
+    used = (given > 0) & np.isfinite(values)
+    remedy = "Expected one for every observed value; give others the weight 0"
+    _refuse("deviation", size, used & ~(np.isfinite(size) & (size > 0)), used, "not positive numbers", remedy)
+    of_residuals = np.where(used, size if data.loss == "absolute" else size / np.abs(values), 1.0)
+    weighed = np.where(used, given / of_residuals**2, 0.0)
+    stated = float(np.sqrt(np.sum(given, where=used) / np.sum(weighed)))
+    return weighed, stated if data.noise is None else data.noise
 
 
 def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -187,12 +206,11 @@ def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
         ) from None
 
 
-def _check_values(values: np.ndarray, used: np.ndarray, positive: bool) -> None:
-    finite = np.isfinite(values)
-    for bad, what in ((used & ~finite, "NaN or infinite"), (used & finite & (values <= 0), "not positive")):
-        if bad.any() and (positive or what != "not positive"):
-            first = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise ValueError(
-                f"target: {int(bad.sum())} of {int(used.sum())} observed values are {what} (the first at {first}: "
-                f"{values[first]:.4g}). Give them the weight 0, take their nodes out of the mask, or correct them"
-            )
+def _refuse(name: str, values: np.ndarray, bad: np.ndarray, used: np.ndarray, what: str, remedy: str) -> None:
+    """Raise ValueError if some of the observed values are bad."""
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name}: {int(bad.sum())} of {int(used.sum())} observed values are {what} (the first at {first}: "
+            f"{values[first]:.4g}). {remedy}"
+        )

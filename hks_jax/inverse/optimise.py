@@ -1,7 +1,7 @@
 """The loop: steps of an optimistix solver, each compiled, with what lies between them in Python."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,9 +11,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.inverse.checkpoint import Log
 from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.problem import Outcome, Problem, residuals_and_outcome
+from hks_jax.inverse.problem import Outcome, Problem
 from hks_jax.inverse.unknowns import Values
 
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -34,7 +33,7 @@ def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
 
     They are scaled by the number of nodes, so that a step's curvature is of order one whatever the grid.
     """
-    data, penalties, outcome = residuals_and_outcome(problem, values)
+    data, penalties, outcome = problem.evaluate(values)
     everything = jnp.sqrt(len(values)) * jnp.concatenate([data, penalties])
     return everything, _Told(values, outcome, jnp.full((), jnp.nan, data.dtype))
 
@@ -90,22 +89,25 @@ def _strongly_typed(state: Any) -> Any:
     return jax.tree.map(lambda x: x.astype(x.dtype) if eqx.is_array(x) else x, state)
 
 
-def optimise(
-    problem: Problem,
-    values: Values,
-    optimiser: Optimiser,
-    noise: float | None,
-    max_steps: int,
-    log: Log,
-) -> tuple[Values, Outcome | None, str]:
-    """Run until the solver, the noise level or the number of steps says stop.
+class Reached(NamedTuple):
+    """Where a search has come to."""
 
-    Returns the best unknowns seen, their outcome (None where none was computed), and one of the keys of
-    `metric_fit.RESULTS`.
-    """
+    values: Values  # the unknowns
+    outcome: Outcome | None  # what a fit has come to with them; None where it is not known
+    result: str  # one of the keys of `metric_fit.RESULTS`
+
+    @property
+    def stopped(self) -> bool:
+        """Whether there is nothing to go on with."""
+        return self.result in ("interrupted", "not finite")
+
+
+def optimise(
+    problem: Problem, values: Values, optimiser: Optimiser, noise: float | None, max_steps: int, log: Callable
+) -> Reached:
+    """Run until the solver, the noise level or the number of steps says stop; return the best unknowns seen."""
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
-    best, least, seen = values, np.inf, None
-    outcome: Outcome | None = None
+    best, least, seen = Reached(values, None, ""), np.inf, None
     rejected, number, end = 0, 0, ""
     explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # as rounded in `_advance`
     try:
@@ -122,25 +124,25 @@ def optimise(
                 seen, loss, misfit = told.values, float(told.outcome.loss), float(told.outcome.misfit)
                 gradient = float(told.gradient) / np.sqrt(len(values))
                 if not np.isfinite(loss):
-                    return best, outcome, "not finite"
+                    return best._replace(result="not finite")
                 if loss <= least:
-                    best, least, outcome = seen, loss, told.outcome
+                    best, least = Reached(seen, told.outcome, ""), loss
                 log(number, (loss, misfit, gradient), new, seen, float(size))
                 number += 1
                 if misfit <= explained:
-                    return best, outcome, "noise level reached"
+                    end = "noise level reached"
             if end:
-                return best, outcome, end
+                break
             if not bool(fine):
-                return best, outcome, "not finite"
-            if bool(done):
+                end = "not finite"
+            elif bool(done):
                 end = "converged"
             elif rejected >= _REJECTIONS:
                 end = "stalled"
             elif count == max_steps:
                 end = "steps exhausted"
-            if end and not bool(jnp.any(values != seen)):
-                return best, outcome, end
+            if end == "not finite" or (end and not bool(jnp.any(values != seen))):
+                break
     except KeyboardInterrupt:
-        return best, outcome, "interrupted"
-    return best, outcome, end
+        end = "interrupted"
+    return best._replace(result=end)

@@ -12,12 +12,11 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_number
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.inverse.parametrisation import to_coordinates
 from hks_jax.inverse.unknowns import Unknowns, Values
 
 
 class Regulariser(eqx.Module):
-    """A penalty on the unknowns or on the field.
+    """A penalty on the unknowns or on the field: half the weighted sum of the squares of `deviations` over the nodes.
 
     Attributes:
         weight: what the penalty is multiplied by.
@@ -29,9 +28,14 @@ class Regulariser(eqx.Module):
         """Check the weight."""
         require_number("weight", self.weight, inclusive=True)
 
-    @abstractmethod
     def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
         """Return residuals, half of whose sum of squares is the penalty."""
+        deviations = self.deviations(unknowns, values, field)
+        return jnp.sqrt(self.weight / int(field.grid.inside.sum())) * deviations.ravel()
+
+    @abstractmethod
+    def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
+        """Return what the penalty keeps small."""
 
 
 class H1(Regulariser):
@@ -39,10 +43,9 @@ class H1(Regulariser):
 
     weight: float
 
-    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
-        """Return the scaled differences along the grid's edges."""
-        edges = [slopes.ravel() for slopes in unknowns.slopes(values)]
-        return jnp.sqrt(self.weight / _size(field)) * jnp.concatenate(edges)
+    def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
+        """Return the slopes along the grid's edges."""
+        return jnp.concatenate([slopes.ravel() for slopes in unknowns.slopes(values)])
 
 
 class TotalVariation(Regulariser):
@@ -60,19 +63,19 @@ class TotalVariation(Regulariser):
         """Check the threshold."""
         require_number("epsilon", self.epsilon)
 
-    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
+    def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
         """Return gradients at the nodes, scaled so that half their square is the penalty."""
         d = field.grid.dimension
         # Differences to the next node along each axis; none beyond the last.
-        padded = [
-            jnp.pad(slopes, [(0, 0)] + [(0, int(axis == along)) for axis in range(d)])
-            for along, slopes in enumerate(unknowns.slopes(values))
-        ]
-        gradient = jnp.stack(padded)
+        gradient = jnp.stack(
+            [
+                jnp.pad(slopes, [(0, 0)] + [(0, int(axis == along)) for axis in range(d)])
+                for along, slopes in enumerate(unknowns.slopes(values))
+            ]
+        )
         square = jnp.sum(gradient**2, axis=(0, 1))
         # 2(√(s² + ε²) − ε)/s², without cancellation.
-        scale = 2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon)
-        return jnp.sqrt(self.weight / _size(field)) * (jnp.sqrt(scale) * gradient).ravel()
+        return gradient * jnp.sqrt(2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon))
 
 
 class LogDeterminant(Regulariser):
@@ -81,10 +84,9 @@ class LogDeterminant(Regulariser):
     weight: float
     prior: TensorField
 
-    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
+    def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
         """Return the differences of the logarithms of the determinants."""
-        ratio = spd.determinant(field.domain_tensors) / spd.determinant(self.prior.domain_tensors)
-        return jnp.sqrt(self.weight / _size(field)) * jnp.log(ratio).ravel()
+        return jnp.log(spd.determinant(field.domain_tensors) / spd.determinant(self.prior.domain_tensors))
 
 
 class Prior(Regulariser):
@@ -93,12 +95,6 @@ class Prior(Regulariser):
     weight: float
     prior: TensorField
 
-    def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
-        """Return the coordinates of log T − log T₀."""
-        d = field.grid.dimension
-        difference = spd.log(field.domain_tensors) - spd.log(self.prior.domain_tensors)
-        return jnp.sqrt(self.weight / _size(field)) * to_coordinates(difference.reshape(-1, d, d)).ravel()
-
-
-def _size(field: TensorField) -> int:
-    return int(field.grid.inside.sum())
+    def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
+        """Return log T − log T₀."""
+        return spd.log(field.domain_tensors) - spd.log(self.prior.domain_tensors)

@@ -1,7 +1,8 @@
-"""The unknowns of a fit: arrays of parameters, and the field that they stand for."""
+"""The unknowns of a fit: which metrics it searches among, and by which numbers."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -11,11 +12,121 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
+from hks_jax.checks import require_real
+from hks_jax.domain import spd
+from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.inverse.parametrisation import Parametrisation
-from hks_jax.static_array import StaticArray
+from hks_jax.linear.dense_eigh import differentiable_eigh
 
 Values = Float[Array, "..."]
+Tensors = Float[Array, "n d d"]
+Parameters = Float[Array, "n c"]
+
+
+def named(argument: str, given: Any, table: Mapping[str, Any], others: str) -> Any:
+    """Return what a name stands for; raise ValueError, with the names and what else may be given, if it is none."""
+    if isinstance(given, str) and given in table:
+        return table[given]
+    raise ValueError(f"{argument}: got {given!r}; expected {', '.join(map(repr, table))}, {others}")
+
+
+def flat_field(grid: Grid, dtype: Any = float) -> TensorField:
+    """Return the flat metric: the identity everywhere."""
+    d = grid.dimension
+    return TensorField(grid, np.broadcast_to(np.eye(d, dtype=dtype), (*grid.shape, d, d)))
+
+
+class Parametrisation(eqx.Module):
+    """A few numbers at each node that stand for a tensor, given the tensor of the initial field there.
+
+    Attributes:
+        start: maps the initial tensors (n, d, d) to their parameters (n, c).
+        tensors: maps parameters (n, c) and the initial tensors to those that the parameters stand for; they must be
+            symmetric positive definite for any parameters.
+        smooth: whether the data determine high frequencies so weakly that steps should be smooth.
+    """
+
+    start: Callable[[Tensors], Parameters] = eqx.field(static=True)
+    tensors: Callable[[Parameters, Tensors], Tensors] = eqx.field(static=True)
+    smooth: bool = eqx.field(static=True, default=True)
+
+
+def _logarithm(base: Tensors) -> Parameters:
+    """Return the diagonal of log T, then √2 times what is below it: their Euclidean norm is the Frobenius norm."""
+    logarithm = spd.log(base)
+    rows, columns = np.tril_indices(base.shape[-1], -1)
+    diagonal = jnp.diagonal(logarithm, axis1=1, axis2=2)
+    return jnp.concatenate([diagonal, np.sqrt(2) * logarithm[:, rows, columns]], axis=1)
+
+
+def _exponential(parameters: Parameters, base: Tensors) -> Tensors:
+    d = base.shape[-1]
+    rows, columns = np.tril_indices(d, -1)
+    below = parameters[:, d:] / np.sqrt(2)
+    matrix = jnp.zeros_like(base).at[:, np.arange(d), np.arange(d)].set(parameters[:, :d])
+    return spd.exp(matrix.at[:, rows, columns].set(below).at[:, columns, rows].set(below))
+
+
+def _cholesky(base: Tensors) -> Parameters:
+    """Return the logarithms of the diagonal of L, T = LLᵀ, then what is below it."""
+    factor, d = spd.cholesky(base), base.shape[-1]
+    rows, columns = np.tril_indices(d, -1)
+    diagonal = jnp.diagonal(factor, axis1=1, axis2=2)
+    return jnp.concatenate([jnp.log(diagonal), factor[:, rows, columns]], axis=1)
+
+
+def _from_cholesky(parameters: Parameters, base: Tensors) -> Tensors:
+    d = base.shape[-1]
+    rows, columns = np.tril_indices(d, -1)
+    factor = jnp.zeros_like(base).at[:, rows, columns].set(parameters[:, d:])
+    factor = factor.at[:, np.arange(d), np.arange(d)].set(jnp.exp(parameters[:, :d]))
+    return jnp.matmul(factor, jnp.swapaxes(factor, 1, 2), precision="highest")
+
+
+def _scaled(parameters: Parameters, base: Tensors) -> Tensors:
+    return jnp.exp(parameters)[:, :, None] * base
+
+
+def _stretched(parameters: Parameters, base: Tensors) -> Tensors:
+    values, vectors = jax.vmap(partial(differentiable_eigh, None))(base)
+    return jnp.einsum("nia,na,nja->nij", vectors, jnp.exp(parameters) * values, vectors, precision="highest")
+
+
+def _turned(parameters: Parameters, base: Tensors) -> Tensors:
+    d = base.shape[-1]
+    vectors = parameters if d == 3 else jnp.pad(parameters, ((0, 0), (2, 0)))  # across the plane
+    rotation = _rotation(vectors)[:, :d, :d]
+    return jnp.einsum("nia,nab,njb->nij", rotation, base, rotation, precision="highest")
+
+
+def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
+    """Return rotations by Rodrigues' formula, in functions of the squared angle that are smooth at zero."""
+    square = jnp.sum(vector**2, axis=1)
+    small = square < 1e-4
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    sinc = jnp.where(small, 1 - square / 6 + square**2 / 120, jnp.sin(angle) / angle)
+    versine = jnp.where(small, 0.5 - square / 24 + square**2 / 720, (1 - jnp.cos(angle)) / angle**2)
+    x, y, z = vector.T
+    o = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack(row, axis=-1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
+    square_of_cross = jnp.matmul(cross, cross, precision="highest")
+    return jnp.eye(3, dtype=vector.dtype) + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
+
+
+def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
+    """Return a function to parameters that are zero for the initial tensors, so many for d dimensions."""
+    return lambda base: jnp.zeros((len(base), count(base.shape[-1])), base.dtype)
+
+
+PARAMETRISATIONS = {
+    # T = exp S, T = LLᵀ, T = e^u T₀, T = V diag(e^uᵢ λᵢ) Vᵀ with the eigenvectors of T₀, and T = R T₀ Rᵀ.
+    "log-euclidean": Parametrisation(_logarithm, _exponential),
+    "cholesky": Parametrisation(_cholesky, _from_cholesky),
+    "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),
+    "eigenvalues": Parametrisation(_zeros(lambda d: d), _stretched),
+    "rotation": Parametrisation(_zeros(lambda d: 1 if d == 2 else 3), _turned),  # an angle, or a rotation vector
+}
 
 
 class Unknowns(eqx.Module):
@@ -39,7 +150,8 @@ class Nodal(Unknowns):
 
     parametrisation: Parametrisation  # what they mean
     init: TensorField  # the initial field, which stays as it is outside the domain
-    nodes: StaticArray = eqx.field(static=True)  # the flat indices of the domain's nodes
+    # The flat indices of the domain's nodes, made of the domain (*shape).
+    nodes: Any = eqx.field(static=True, converter=lambda domain: StaticArray(np.flatnonzero(domain)))
 
     @property
     def _base(self) -> Float[Array, "n d d"]:
@@ -73,11 +185,21 @@ class Nodal(Unknowns):
 
 
 class Free(Unknowns):
-    """The parameters of a function of the user's."""
+    """Parameters of a function, as the parametrisation of `hks_jax.fit_metric`.
 
-    function: Callable[[Any], Any] = eqx.field(static=True)  # maps them to a field, or to tensors on its grid
-    parameters: Any  # where to start, any pytree of floating point arrays
-    init: TensorField  # the initial field, for its grid and interpolation
+    Attributes:
+        function: maps the parameters to a `TensorField`, or to tensors on the grid of the initial field.
+        parameters: where to start, any pytree of floating point arrays.
+        init: the initial field, for its grid and interpolation; the fit gives it.
+    """
+
+    function: Callable[[Any], Any] = eqx.field(static=True)
+    parameters: Any
+    init: TensorField | None = None
+
+    def __check_init__(self) -> None:
+        """Check the parameters."""
+        require_real("parameters", self.parameters)
 
     def start(self) -> Values:
         """Return the initial parameters, flat."""
@@ -88,9 +210,15 @@ class Free(Unknowns):
         tensors = self.function(ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values))
         if isinstance(tensors, TensorField):
             return tensors
+        assert self.init is not None
         return TensorField(self.init.grid, tensors, self.init.interpolation)
 
 
-def nodes_of(domain: np.ndarray) -> StaticArray:
-    """Return the flat indices of the nodes of a domain."""
-    return StaticArray(np.flatnonzero(domain))
+def unknowns_for(parametrisation: str | Parametrisation | Free, init: TensorField, domain: np.ndarray) -> Unknowns:
+    """Return what varies, for a field that a fit starts from."""
+    if isinstance(parametrisation, Free):
+        return Free(parametrisation.function, parametrisation.parameters, init)
+    if isinstance(parametrisation, Parametrisation):
+        return Nodal(parametrisation, init, domain)
+    others = "a Parametrisation, or Free(function, parameters)"
+    return Nodal(named("parametrisation", parametrisation, PARAMETRISATIONS, others), init, domain)

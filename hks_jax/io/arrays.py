@@ -1,6 +1,5 @@
 """Tensors in NumPy's own files, .npz and .npy."""
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,18 +7,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.io.tensor_order import choices, invalid_by_order, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
 from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
 from hks_jax.npz import load_npy, load_npz, write_npz
 
 
-def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
+def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
     """Return the array of an npy, or ``mask`` of an npz; neither says where it lies."""
-    if os.fspath(path).lower().endswith(".npy"):
-        return load_npy(path), None
-    arrays = load_npz(path)
+    if name.lower().endswith(".npy"):
+        return load_npy(name), None
+    arrays = load_npz(name)
     if "mask" not in arrays:
-        raise ValueError(f"{os.fspath(path)}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
+        raise ValueError(f"{name}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
     return arrays["mask"], None
 
 
@@ -42,35 +41,40 @@ def read_tensors(
         if values.dtype.kind not in "fiu":
             raise ValueError(f"{name}: {wanted!r} has dtype {values.dtype}; expected real numbers")
         values = values.astype(np.float64)
-    tensors, order = _matrices(name, values, order or _text(arrays, "order"))
-    d = tensors.shape[-1] if tensors.ndim else 0
-    affine, mask = arrays.get("affine"), arrays.get("mask")
-    affine = None if affine is None else _real(f"{name}: affine", affine)
+    order = order or _text(arrays, "order") or None
+    if (values.ndim, values.shape[-1:]) in ((4, (6,)), (3, (3,))):
+        found = matrices(name, values, order)
+    elif order in (None, "matrix"):
+        found = Matrices(values, "matrix", None)
+    else:
+        raise ValueError(f"order: {name} holds whole matrices along the grid's axes; leave this out")
     frame = frame or _text(arrays, "frame") or "voxel"
     if frame != "voxel":
-        if affine is None or d != 3:
+        if "affine" not in arrays or found.tensors.shape[-1] != 3:
             raise ValueError(f'frame: {name} has no 3×3 tensors with an affine; expected "voxel", the grid\'s own axes')
-        tensors = to_voxel_axes(tensors, frame, affine)
+        found = found._replace(tensors=to_voxel_axes(found.tensors, frame, _real(f"{name}: affine", arrays["affine"])))
     if spacing is not None and "spacing" in arrays:
         raise ValueError(f"spacing: {name} has its own, {np.asarray(arrays['spacing']).tolist()}; leave this out")
+    given = arrays if spacing is None else {**arrays, "spacing": spacing}
+    about = {"order": found.order, "frame": frame, "source": name, "invalid_by_order": found.invalid}
+    units = {key: _text(arrays, key) for key in ("length_unit", "unit")}
+    return volume_of(name, given, found.tensors, **about, **units)
+
+
+def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
+    """Return tensors with the place that `place_of` has written, or a spacing of 1 and the origin 0."""
+    mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,
-        _per_axis(f"{name}: spacing", arrays.get("spacing", 1.0) if spacing is None else spacing, d),
+        _per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
         _per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
         None if mask is None else as_mask(f"{name}: mask", mask),
-        affine,
-        order=order,
-        frame=frame,
-        source=name,
-        invalid_by_order=None if order == "matrix" else invalid_by_order(values, order),
-        length_unit=_text(arrays, "length_unit") or "",
-        unit=_text(arrays, "unit") or "",
+        None if affine is None else _real(f"{name}: affine", affine),
+        **about,
     )
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars and the place that they have; see `hks_jax.io.save`."""
     slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
     write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})
@@ -91,22 +95,8 @@ def place_of(volume: TensorVolume) -> dict[str, Any]:
     return {"spacing": volume.spacing, "origin": volume.origin, **given}
 
 
-def _matrices(name: str, values: np.ndarray, order: str | None) -> tuple[Float[np.ndarray, "..."], str]:
-    """Return matrices from the six or three components of symmetric ones, other arrays as they are; and their order."""
-    if (values.ndim, values.shape[-1:]) not in ((4, (6,)), (3, (3,))):
-        if order not in (None, "matrix"):
-            raise ValueError(f"order: {name} holds whole matrices along the grid's axes; leave this out")
-        return values, "matrix"
-    if order is None:
-        raise ValueError(
-            f"{name}: {values.shape[-1]} components of undeclared order, and programs differ. Pass order, or store it "
-            f"as 'order' in an npz: one of {choices()}"
-        )
-    return unpack(values, order), order
-
-
-def _text(arrays: Mapping[str, Any], key: str) -> str | None:
-    return None if key not in arrays else str(np.asarray(arrays[key]))
+def _text(arrays: Mapping[str, Any], key: str) -> str:
+    return str(np.asarray(arrays.get(key, "")))
 
 
 def _real(name: str, value: Any) -> Float[np.ndarray, "..."]:

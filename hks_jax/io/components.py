@@ -4,7 +4,6 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ def component_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def siblings(path: str | os.PathLike[str]) -> list[str]:
-    """Return the six files of which one is given: their names differ in the component alone."""
+    """Return the six files of one tensor image, given one of them: their names differ in the component alone."""
     folder, name = os.path.split(os.fspath(path))
     matches = list(_NAME.finditer(name))
     if not matches:
@@ -35,28 +34,22 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
     missing = [os.path.basename(each) for each in names if not os.path.isfile(each)]
     if missing:
         raise FileNotFoundError(
-            f"{os.fspath(path)}: by its name it holds the component {component_of(path)} of tensors, of which six are "
-            f"needed; not beside it: {', '.join(missing)}"
+            f"{os.fspath(path)}: by its name it holds the component {component_of(path)} of tensors. Six are needed; "
+            f"not beside it: {', '.join(missing)}"
         )
     return names
 
 
 def is_one_of_six(path: str | os.PathLike[str]) -> bool:
     """Tell whether a NIfTI file holds one component alone: by its name, and as it has one value for each voxel."""
-    return component_of(path) is not None and math.prod(nifti.load(path).shape[3:]) == 1
+    return component_of(path) is not None and math.prod(nifti.load(os.fspath(path)).shape[3:]) == 1
 
 
-def read_tensors(
-    paths: Sequence[str | os.PathLike[str]], order: str | None = None, frame: str | None = None
-) -> TensorVolume:
-    """Read tensors from six NIfTI images, whose names say which component each has, in any sequence.
+def read_tensors(paths: Sequence[str | os.PathLike[str]], order: str | None, frame: str | None) -> TensorVolume:
+    """Read tensors from six NIfTI images in any sequence, whose names say which component each has.
 
     The axes of the components are those asked for, or those that the BIDS sidecar beside an image says
-    (``Reference`` of ``OrientationEncoding``), or the voxels'. An order is refused.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not six images, or names that do not say which; shapes or affines that differ.
+    (``Reference`` of ``OrientationEncoding``), or the voxels'.
     """
     if order is not None:
         raise ValueError(f"order: got {order!r}; the names of six images say which component each has. Leave it out")
@@ -67,12 +60,16 @@ def read_tensors(
             f"files: got {given}; expected six NIfTI images, one for each component {' '.join(NAMES)}, which their "
             "names tell, as in sub-01_param-txx_dwimap.nii.gz or dtxx.nii.gz"
         )
-    images = [_image(files[name]) for name in NAMES]
+    images = [nifti.load(files[name]) for name in NAMES if nifti.is_nifti(files[name])]
+    if len(images) < 6:
+        raise ValueError(f"{', '.join(files.values())}: six images of components; expected NIfTI, .nii or .nii.gz")
     first = images[0]
     affine = nifti.affine_in_mm(files["xx"], first)[0]
     for name, image in zip(NAMES, images, strict=True):
-        if image.shape != first.shape:
-            raise ValueError(f"{files[name]}: got shape {image.shape}; expected that of {files['xx']}, {first.shape}")
+        if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
+            raise ValueError(
+                f"{files[name]}: got shape {image.shape}; expected one component, (nx, ny, nz), as all six"
+            )
         if not np.allclose(nifti.affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected the same voxels")
     values = np.stack([nifti.voxels(files[name], image) for name, image in zip(NAMES, images, strict=True)], axis=-1)
@@ -80,12 +77,3 @@ def read_tensors(
     joined.header["xyzt_units"] = first.header["xyzt_units"]
     joined.header.set_intent(nifti.SYMMETRIC_MATRIX, (3,))
     return nifti.tensors_of(files["xx"], joined, None, frame)
-
-
-def _image(path: str) -> Any:
-    if not nifti.is_nifti(path):
-        raise ValueError(f"{path}: one of six images; expected NIfTI, .nii or .nii.gz")
-    image = nifti.load(path)
-    if len(image.shape) < 3 or math.prod(image.shape[3:]) != 1:
-        raise ValueError(f"{path}: got shape {image.shape}; expected (nx, ny, nz), one component")
-    return image

@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Literal, NamedTuple
@@ -13,9 +14,9 @@ from jaxtyping import Bool, Float
 from hks_jax.checks import require_number
 from hks_jax.io import nifti
 from hks_jax.io.masks import read_mask
-from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import Matrices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
-from hks_jax.io.volume import TensorVolume, as_mask, digest
+from hks_jax.io.volume import TensorVolume, as_mask, digest, placed
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
@@ -44,10 +45,8 @@ def find_example_brain() -> ExampleBrain | None:
         files = importlib.metadata.files("mdt") or []
     except importlib.metadata.PackageNotFoundError:
         return None
-    paths = {file.name: Path(str(file.locate())) for file in files if file.name in names}
-    if any(name not in paths or not paths[name].is_file() for name in names):
-        return None
-    return ExampleBrain(*(paths[name] for name in names))
+    paths = {file.name: Path(str(file.locate())) for file in files if Path(str(file.locate())).is_file()}
+    return ExampleBrain(*(paths[name] for name in names)) if paths.keys() >= set(names) else None
 
 
 def fit_dwi(
@@ -76,8 +75,8 @@ def fit_dwi(
         unit: of diffusivity, whose reciprocal is the b-values' unit: ``"m2/s"`` for b-values in s/m², ``"um2/ms"`` for
             ms/µm². None: mm²/s.
         noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
-            ``"residuals"``, in each voxel what the fit leaves, of as many degrees of freedom as there are images more
-            than 7. None: no covariance.
+            ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
+            for n images. None: no covariance.
 
     Returns:
         Tensors along the voxel axes, in mm²/s, and with `noise` their covariance, to first order in it. DIPY replaces
@@ -92,8 +91,9 @@ def fit_dwi(
             residuals; residuals that are zero; no signal.
     """
     dti, gradients, segmentation = map(optional, ("dipy.reconst.dti", "dipy.core.gradients", "dipy.segment.mask"))
-    image = nifti.load(path)
-    affine, _ = nifti.affine_in_mm(os.fspath(path), image)
+    name = os.fspath(path)
+    image = nifti.load(name)
+    affine, _ = nifti.affine_in_mm(name, image)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
     if directions.shape[-1] != 3 or directions.shape == (3, 3) != (b.size, 3):
         directions = directions.T
@@ -114,11 +114,11 @@ def fit_dwi(
             "at least 6 and 1"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
-    signal = nifti.voxels(path, image)[..., used]
-    inside, found = _inside(os.fspath(path), mask, signal, b[used] <= threshold, affine, segmentation)
+    signal = nifti.voxels(name, image)[..., used]
+    inside, found = _inside(name, mask, signal, b[used] <= threshold, affine, segmentation)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
-    tensors = to_voxel_axes(np.where(inside[..., None, None], fit.quadratic_form, 0.0), bvec_frame, affine)
+    fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
     covariance = None
     if noise is not None:
         covariance = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
@@ -137,21 +137,8 @@ def fit_dwi(
         notes.append(f"covariances of the tensors from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
-    return TensorVolume(
-        tensors,
-        tuple(np.linalg.norm(affine[:3, :3], axis=0).tolist()),
-        (0.0, 0.0, 0.0),
-        inside,
-        affine,
-        order="fit",
-        frame=bvec_frame,
-        notes=tuple(notes),
-        source=os.fspath(path),
-        digest=digest(path),
-        length_unit="mm",
-        unit=MM2_PER_S,
-        covariance=covariance,
-    )
+    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance)
+    return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
 # With the logarithms y of the signals, weights w (the signals that an unweighted fit predicts), and the rows X of the
@@ -201,7 +188,7 @@ def _covariance(
 def _of_length_one(
     name: str, directions: Float[np.ndarray, "n 3"], weighted: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], list[str]]:
-    """Return the directions of weighted images with length 1, those of others zero; and a note of what was rounded."""
+    """Return the directions of weighted images with length 1, those of others zero; and a note of their lengths."""
     lengths = np.linalg.norm(directions, axis=1)
     bad = weighted & ~(np.abs(lengths - 1) <= _LENGTH)
     if bad.any():

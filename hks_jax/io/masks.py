@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Integer
 from scipy import ndimage
 
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
-from hks_jax.io.volume import as_mask
+from hks_jax.io.volume import TensorVolume, as_mask, corners
 from hks_jax.reading import existing, reading
 
 
@@ -27,9 +28,14 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         ImportError: NIfTI without nibabel, NRRD without pynrrd.
     """
     name = os.fspath(path)
-    values, place = _image(path, affine, IMAGES)
+    values, place = _image(name, affine, IMAGES)
     if affine is not None and place is not None:
-        _check_same_place(name, place, affine, values.shape)
+        shift = np.linalg.norm(corners(values.shape) @ (place - affine).T, axis=1).max()
+        if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
+            raise ValueError(
+                f"{name}: the mask's affine places it up to {shift:.3g} away from the tensors'; expected the same "
+                "place. Resample the mask to the tensors' voxels"
+            )
     return as_mask(name, values)
 
 
@@ -52,42 +58,21 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
     return eroded
 
 
-def _check_same_place(name: str, mask_affine: np.ndarray, affine: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Raise ValueError if any corner of the mask lies over half a voxel from the same corner of the image."""
-    corners = np.stack(np.meshgrid(*[(0, n - 1) for n in shape[:3]], [1], indexing="ij"), -1).reshape(-1, 4)
-    shift = np.linalg.norm(corners @ (mask_affine - affine).T, axis=1).max()
-    if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
-        raise ValueError(
-            f"{name}: the mask's affine places it up to {shift:.3g} away from the tensors'; expected the same place. "
-            "Resample the mask to the tensors' voxels"
-        )
-
-
 NEAR = 0.1
 """By how many voxels two images may lie apart and still be on the same voxels."""
 
 
-def read_labels(
-    path: str | os.PathLike[str],
-    shape: tuple[int, ...],
-    affine: np.ndarray | None = None,
-    slice_axis: int | None = None,
-) -> Integer[np.ndarray, "*shape"]:
-    """Read whole numbers, 0 for none, at the voxels of an image: NIfTI, or ``.npy`` of the image's shape.
+def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
+    """Read whole numbers, 0 for none, at the voxels of an image, or a mesh's vertices: NIfTI, or ``.npy`` of the shape.
 
     NIfTI has its place in space. Where the image has one, the two must have the same voxels; a slice takes its own from
     a label map of the volume.
-
-    Args:
-        path: the file.
-        shape: that of the image.
-        affine: voxel indices of the image to world coordinates, (4, 4); for a slice, those of a volume one voxel thick.
-        slice_axis: for a slice, the axis that it cuts.
     """
+    shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
-    values, place = _image(path, affine, (*nifti.SUFFIXES, ".npy"))
-    if affine is not None and place is not None and values.ndim == 3:
-        values = _at_voxels(name, values, place, affine, shape, slice_axis)
+    values, place = _image(name, affine, (*nifti.SUFFIXES, ".npy"))
+    if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim == 3:
+        values = _at_voxels(name, values, np.linalg.solve(place, affine), on)
     if values.shape != shape:
         raise ValueError(f"{name}: got labels of shape {values.shape}; expected the shape of the image, {shape}")
     if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
@@ -128,33 +113,27 @@ def names_beside(path: str | os.PathLike[str]) -> str | None:
     return str(table) if table.is_file() else None
 
 
-def _image(
-    path: str | os.PathLike[str], affine: np.ndarray | None, suffixes: tuple[str, ...]
-) -> tuple[np.ndarray, np.ndarray | None]:
+def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the voxel values, without a fourth axis of one entry, and the affine where the file has one."""
-    read = format_of(path, suffixes).read_image
+    read = format_of(name, suffixes).read_image
     assert read is not None
-    values, place = read(path, affine)
+    values, place = read(name, affine)
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     return values, place
 
 
-def _at_voxels(
-    name: str, values: np.ndarray, place: np.ndarray, affine: np.ndarray, shape: tuple[int, ...], slice_axis: int | None
-) -> np.ndarray:
-    """Return the labels at the image's voxels; raise ValueError where the two are not on the same voxels."""
-    to_labels = np.linalg.solve(place, affine)
-    size = list(shape)
+def _at_voxels(name: str, values: np.ndarray, to_labels: np.ndarray, volume: TensorVolume) -> np.ndarray:
+    """Return the labels at an image's voxels; raise ValueError where the two are not on the same voxels."""
+    size = list(volume.shape)
     if len(size) == 2:
-        size.insert(2 if slice_axis is None else slice_axis, 1)
-    corners = np.stack(np.meshgrid(*[(0, n - 1) for n in size], [1], indexing="ij"), -1).reshape(-1, 4)
-    first = np.rint(to_labels[:3, 3]).astype(int)
-    apart = np.abs((corners @ to_labels.T)[:, :3] - corners[:, :3] - first).max()
+        size.insert(volume.thin_axis, 1)
+    first, ends = np.rint(to_labels[:3, 3]).astype(int), corners(tuple(size))
+    apart = np.abs((ends @ to_labels.T)[:, :3] - ends[:, :3] - first).max()
     box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
     inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
     if apart > NEAR or not inside:
-        if values.shape != tuple(size) and np.allclose(place, affine):
+        if values.shape != tuple(size) and np.allclose(to_labels, np.eye(4)):
             raise ValueError(
                 f"{name}: its affine is the image's, and its shape {values.shape} is not, which is {tuple(size)}; "
                 "expected labels of the image's voxels. One of them was cropped or resampled without its affine"
@@ -163,4 +142,4 @@ def _at_voxels(
             f"{name}: its affine places the labels on other voxels than the image's; expected the image's own. "
             "Resample them to the image, by the nearest neighbour"
         )
-    return values[box].reshape(shape)
+    return values[box].reshape(volume.shape)

@@ -14,12 +14,11 @@ from scipy.spatial import cKDTree
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.atomic import atomic_path
 from hks_jax.domain.simplices import WORDS, signed_measure
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.domain.simplicial_mesh import SimplicialMesh, SurfaceMesh, TetMesh
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.io import cortex
 from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
+from hks_jax.io.tables import write_json
 from hks_jax.io.vtk_image import holds_dataset
 from hks_jax.optional import optional
 from hks_jax.reading import existing
@@ -38,13 +37,12 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
     """Read a mesh: tetrahedra, where the file has any, or else triangles.
 
     ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply``, ``.stl`` through meshio; ``.obj`` and ``.off``; polygonal data in
-    ``.vtk`` and ``.vtp``, which meshio does not read, through VTK; GIFTI (``.gii``) and FreeSurfer's surfaces
-    (``lh.white``, … by their first bytes) through nibabel, their coordinates as they are in the file.
+    ``.vtk`` and ``.vtp`` through VTK; GIFTI (``.gii``) and FreeSurfer's surfaces (``lh.white``, … by their first bytes)
+    through nibabel.
 
     Quadrilaterals (of polygonal data, OBJ and OFF all polygons) are cut into triangles; vertices keep their order. STL
-    has no vertices, only corners: those at the same place become one vertex. Beside tetrahedra, the triangles, lines
-    and points of their boundary are passed over. A warning says where vertices lie at the same place, as at the seams
-    of a texture: the surface is torn there.
+    has only corners: those at the same place become one vertex. Cells of lower dimension beside tetrahedra are passed
+    over. A warning says where vertices lie at the same place, as at the seams of a texture: the surface is torn there.
 
     Args:
         path: the file.
@@ -54,15 +52,14 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
             vertices are in the other order. The vertices are numbered anew, in the order of the file. A warning says
             what was done.
         in_space: take the coordinates of the scanner, in which images lie: FreeSurfer's are turned and moved by the
-            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Others are taken to
-            have them.
+            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Others, and all
+            without it, stay as they are.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: with ``in_space`` a surface of FreeSurfer's that does not say where its volume lies; an unknown
-            kind of file, an unreadable one, cells that are neither triangles, quadrilaterals nor
-            tetrahedra, a mesh in pieces that touch at vertices at the same place, or one that `SurfaceMesh` or
-            `TetMesh` refuses.
+        ValueError: an unknown kind of file, an unreadable one, other cells, a mesh in pieces that touch at vertices at
+            the same place, or one that `SurfaceMesh` or `TetMesh` refuses; with `in_space` a surface of FreeSurfer's
+            that does not say where its volume lies.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
     loaded, said = _load(path, clean, in_space)
@@ -110,27 +107,23 @@ def is_mesh(path: Path) -> bool:
     return name.endswith(READ) or cortex.is_freesurfer(path)
 
 
-def write(
-    path: str | os.PathLike[str], arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str
-) -> Path:
+def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str) -> None:
     """Write a mesh with values at its vertices, and a file ``path.json`` beside it that says where they came from."""
-    name = os.fspath(path)
-    suffix, solid = Path(name).suffix.lower(), mesh.triangulation.dimension == 3
+    suffix, solid = path.suffix.lower(), mesh.triangulation.dimension == 3
     allowed = [s for s in WRITTEN if not (solid and s == ".ply")]
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
-        raise ValueError(f"path: got {name!r}; {what} are written as {', '.join(allowed)} or .npz")
+        raise ValueError(f"path: got {str(path)!r}; {what} are written as {', '.join(allowed)} or .npz")
     library = optional("meshio")
     cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # what PLY has room for
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})
-    with atomic_path(name + ".json") as beside, atomic_path(name) as temporary:
+    with atomic_path(path) as temporary:
         getattr(library, WRITTEN[suffix]).write(str(temporary), whole)
-        beside.write_text(json.dumps(json.loads(record), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    return Path(path)
+        write_json(path.with_name(f"{path.name}.json"), json.loads(record))
 
 
 def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
-    """Return what is in a file, cleaned if asked to, and what was done about it."""
+    """Return the mesh in a file, cleaned if asked to, and a text that lists the changes."""
     file = existing(path)
     name = file.name.lower()
     if name.endswith((".gii", ".gii.gz")):
@@ -188,7 +181,7 @@ def _require_joined(loaded: Loaded) -> str:
 
 
 def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
-    """Return the mesh as `read_mesh` documents it, and what was done, in words; the empty text if that is nothing."""
+    """Return the mesh cleaned as `read_mesh` documents it, and a text that lists the changes, empty without any."""
     words = WORDS[loaded.cells.shape[1] - 1]
     first, n_cells, done = _same_places(loaded.vertices), len(loaded.cells), []
 
@@ -223,10 +216,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
 def _without_thin(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "m 3"], int]:
-    """Flip the longest edges of triangles that have hardly a height: the surface stays, and has no crack.
-
-    Returns the triangles, without those that lie on a boundary, and how many edges were flipped.
-    """
+    """Return triangles after flips at those with hardly a height, which go at a boundary, and the number of flips."""
     cells, gone, flipped = cells.copy(), np.zeros(len(cells), bool), 0
     corners = vertices[cells]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

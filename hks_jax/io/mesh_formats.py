@@ -1,4 +1,7 @@
-"""Meshes as meshio reads them, VTK's polygonal data, and OBJ and OFF files, whose variants it does not know."""
+"""Meshes as meshio reads them, VTK's polygonal data, and OBJ and OFF files, whose variants it does not know.
+
+Of a damaged mesh, meshio does not notice numbers that are not those declared, and cells that it leaves out.
+"""
 
 import re
 from pathlib import Path
@@ -7,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from hks_jax.io.mesh_checks import MeshChecks
 from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
 from hks_jax.reading import reading
@@ -30,10 +32,11 @@ def through_meshio(path: Path) -> Loaded:
     library = optional("meshio")
     # Overflow is of a text's letters, which it takes for a number of triangles first.
     with reading(path, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
+        content = path.read_bytes()
+        declared = _declared(content, suffix)
         # The format's own reader: meshio.read ends the process where it cannot read a file.
-        checks = MeshChecks(path)
         read = getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(path))
-        checks.compare(read)
+        _compare(content, suffix, declared, read)
         points = np.asarray(read.points, np.float64)
         tetrahedra = [_corners(block.data, 4) for block in read.cells if block.type == "tetra"]
         if points.ndim != 2 or points.shape[1] not in (2, 3):
@@ -50,6 +53,97 @@ def through_meshio(path: Path) -> Loaded:
     if not blocks:
         raise ValueError(f"{path}: has no triangles and no tetrahedra; expected a mesh in two or three dimensions")
     return Loaded(points, np.concatenate(blocks).astype(np.int64), arrays)
+
+
+_GMSH = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+([48])\b", re.DOTALL)
+_COUNTS = {
+    ".ply": (rb"element\s+vertex\s+(-?\d+)", rb"element\s+face\s+(-?\d+)"),
+    ".vtk": (rb"\bPOINTS\s+(-?\d+)", rb"\bCELL_TYPES\s+(-?\d+)"),
+    ".vtu": (rb"NumberOfPoints\s*=\s*[\"'](-?\d+)", rb"NumberOfCells\s*=\s*[\"'](-?\d+)"),
+}
+"""Where each format says how many points and cells it has; .stl, whose length meshio compares, does not."""
+
+_PLY = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
+"""The bytes of the types of .ply that NumPy calls otherwise."""
+
+
+def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
+    """Return the numbers of points and cells that a file declares, and for Gmsh the largest tag of a point."""
+    patterns = _COUNTS.get(suffix, ())
+    declared = tuple(sum(map(int, re.findall(pattern, content))) for pattern in patterns)
+    if suffix == ".msh":
+        declared = _declared_by_gmsh(content)
+    if max(declared, default=0) > 8 * len(content):
+        raise ValueError(f"it declares {max(declared)} points or cells in {len(content)} bytes")
+    return declared
+
+
+def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) -> None:
+    """Raise ValueError unless meshio found as many points and cells as are declared, and nothing follows them."""
+    counts = (len(mesh.points), sum(len(block.data) for block in mesh.cells))
+    if declared and declared[:2] != counts:
+        what = "it declares {} points and {} cells, of which {} and {} are there"
+        raise ValueError(what.format(*declared[:2], *counts))
+    corners = sum(block.data.size for block in mesh.cells)
+    lists = re.search(rb"\bCELLS\s+(\d+)\s+(\d+)", content) if suffix == ".vtk" else None
+    if lists is not None:  # before version 5 with each cell's own number
+        listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
+        if listed != corners:  # of a type that is damaged, meshio leaves some out
+            raise ValueError(f"its cells declare {listed} corners, and have {corners} by their types")
+    if suffix == ".ply":
+        _compare_ply(content, mesh)
+
+
+def _compare_ply(content: bytes, mesh: Any) -> None:
+    head, _, body = re.split(rb"(\bend_header\s*?\n)", content, maxsplit=1)
+    ascii_ = b"format ascii" in head
+    of_points, _, of_cells = head.partition(b"element face")
+    lists = re.findall(rb"property\s+list\s+(\w+)\s+(\w+)", of_cells)
+    if len(lists) != 1:
+        return  # the lengths of further lists are nowhere else
+
+    def size(name: bytes) -> int:
+        return 1 if ascii_ else _PLY.get(name.decode()) or np.dtype(name.decode()).itemsize
+
+    length, index = map(size, lists[0])
+    scalar = re.compile(rb"property\s+(?!list)(\w+)")
+    point, cell = (sum(map(size, scalar.findall(part))) for part in (of_points, of_cells))
+    of_blocks = (len(b.data) * (length + index * b.data.shape[1] + cell) for b in mesh.cells)
+    wanted, got = len(mesh.points) * point + sum(of_blocks), len(body.split() if ascii_ else body)
+    if wanted != got:
+        raise ValueError(f"its points and cells take {wanted} {'words' if ascii_ else 'bytes'}, and there are {got}")
+
+
+def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
+    """Return the numbers of nodes and elements, and the largest tag of a node: meshio makes a table as long as that."""
+    head = _GMSH.match(content)
+    if head is None or head[1] not in (b"2", b"2.2", b"4", b"4.1"):
+        version = "no format of Gmsh's" if head is None else f"format {head[1].decode(errors='replace')}"
+        raise ValueError(f"{version}; expected 2.2 or 4.1, as gmsh -format msh41 writes")
+    text, width = head[2] == b"0", int(head[3])
+    nodes, elements = (_section(content, name) for name in (b"Nodes", b"Elements"))
+    if head[1].startswith(b"4"):
+        (_, n_nodes, _, largest), (_, n_elements, _, _) = (
+            map(int, each.split(maxsplit=4)[:4] if text else np.frombuffer(each[: 4 * width], f"<u{width}"))
+            for each in (nodes, elements)
+        )
+    else:
+        n_nodes, n_elements = (int(each.partition(b"\n")[0]) for each in (nodes, elements))
+        for each, declared in ((nodes, n_nodes), (elements, n_elements)) if text else ():
+            there = sum(1 for line in each.splitlines()[1:] if line.strip())
+            if there != declared:  # meshio passes over the rest
+                raise ValueError(f"it declares {declared} nodes or elements, and has {there} lines for them")
+        rows, node = nodes.partition(b"\n")[2], np.dtype("<i4, (3,)<f8")
+        tags = map(int, rows.split()[::4]) if text else np.frombuffer(rows[: n_nodes * node.itemsize], node)["f0"]
+        largest = int(max(tags, default=0))
+    return n_nodes, n_elements, largest
+
+
+def _section(content: bytes, name: bytes) -> bytes:
+    start, end = re.search(rb"\$" + name + rb"[ \t]*\r?\n", content), content.rfind(b"$End" + name)
+    if start is None or end < start.end():
+        raise ValueError(f"it has no section ${name.decode()}, or one without an end")
+    return content[start.end() : end]
 
 
 def polygonal(path: Path) -> Loaded:
@@ -93,10 +187,7 @@ def _triangles(cells: Int[np.ndarray, "n corners"], points: Float[np.ndarray, "V
 
 
 def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "n m 3"]:
-    """Return each polygon cut into triangles around one of its corners; −1 where no corner sees all others.
-
-    It is the first corner from which all triangles lie on one side; of a flat polygon the first corner of all.
-    """
+    """Return polygons cut into triangles around the first corner that sees all others; −1 where none does."""
     n, size = polygons.shape
     found = np.full((n, size - 2, 3), -1)
     for first in reversed(range(size)):
@@ -149,7 +240,7 @@ def load_off(file: Path) -> Loaded:
         n_vertices, n_faces = (int(word) for word in head.split()[:2])
         if min(n_vertices, n_faces) < 0 or len(rest) != n_vertices + n_faces:
             raise ValueError(
-                f"it declares {n_vertices} vertices and {n_faces} faces, and has {len(rest)} lines for them"
+                f"it declares {n_vertices} vertices and {n_faces} faces, and has {len(rest)} lines of them"
             )
         rows = [line.split() for line in rest]
         if len({len(row) for row in rows[:n_vertices]}) != 1:
@@ -179,7 +270,7 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
         if (cut < 0).any():
             bad = which[np.argmax((cut < 0).any(axis=(1, 2)))]
             raise ValueError(
-                f"{file}: face {bad} of {size} corners is not convex; have it cut into triangles by what wrote it"
+                f"{file}: face {bad} of {size} corners is not convex; expected triangles: cut it into some"
             )
         order.append(np.repeat(which, size - 2))
         triangles.append(cut.reshape(-1, 3))

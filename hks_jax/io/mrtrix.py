@@ -6,30 +6,21 @@ up to ``END``, and the voxels at the offset that ``file`` names, in the order th
 
 import gzip
 import math
-import os
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.io.tensor_order import FRAMES, invalid_by_order, to_voxel_axes, unpack
-from hks_jax.io.volume import Format, TensorVolume
+from hks_jax.io.tensor_order import FRAMES, matrices
+from hks_jax.io.volume import Format, TensorVolume, placed
 from hks_jax.reading import existing, reading
 
 _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
-class Image(NamedTuple):
-    """The voxel values, in the header's order of axes, and the affine: voxel indices to scanner coordinates, in mm."""
-
-    values: np.ndarray
-    affine: Float[np.ndarray, "4 4"]
-
-
-def load(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Image:
-    """Read an image, whatever lies beside it. A compressed one is read to its end, where its checksum is compared."""
-    file = existing(path)
+def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"]]:
+    """Return the voxel values, with the header's axes, and the affine to the scanner's coordinates in mm."""
+    file = existing(name)
     with reading(file, "a readable image of MRtrix (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
         header, offset = _header(content)
@@ -51,7 +42,7 @@ def load(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> Imag
         affine[:3, :3] *= [float(word) for word in header["vox"][0].split(",")[:3]]
         if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
             raise ValueError("transform and vox place the voxels nowhere")
-    return Image(values, affine)
+    return values, affine
 
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
@@ -61,21 +52,9 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
         raise ValueError(
             f"{name}: got an image of shape {values.shape}; expected the six components of dwi2tensor, (nx, ny, nz, 6)"
         )
-    order = order or "mrtrix"
-    frame = frame or FRAMES[order]
     components = np.ascontiguousarray(values, np.float32 if values.dtype.itemsize <= 4 else np.float64)
-    return TensorVolume(
-        to_voxel_axes(unpack(components, order), frame, affine),
-        tuple(np.linalg.norm(affine[:3, :3], axis=0).tolist()),
-        (0.0, 0.0, 0.0),
-        affine=affine,
-        order=order,
-        frame=frame,
-        notes=(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes',),
-        source=name,
-        invalid_by_order=invalid_by_order(components, order),
-        length_unit="mm",
-    )
+    found = matrices(name, components, order, "mrtrix")
+    return placed(name, found, frame or FRAMES[found.order], affine)
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], int]:

@@ -5,8 +5,9 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +16,9 @@ from hks_jax.checks import require_real
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
-from hks_jax.io.tensor_order import FRAMES, choices, invalid_by_order, pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import FRAMES, matrices, pack
 from hks_jax.io.units import by_axis, scaled_beside
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
+from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
@@ -37,21 +38,15 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
-def load(path: str | os.PathLike[str]) -> Any:
+def load(name: str) -> Any:
     """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared."""
-    nib, file = optional("nibabel"), existing(path)
+    nib, file = optional("nibabel"), existing(name)
     with reading(file, "a readable NIfTI image"):
+        image, length = nib.load(file), file.stat().st_size
         if file.name.lower().endswith(".gz"):
             with gzip.open(file) as stream:
                 content = stream.read()
-            kinds = {348: nib.Nifti1Image, 540: nib.Nifti2Image}
-            orders: tuple[Literal["little", "big"], ...] = ("little", "big")
-            kind = next((kinds[n] for order in orders if (n := int.from_bytes(content[:4], order)) in kinds), None)
-            if kind is None:
-                raise ValueError("it does not begin with the size of NIfTI's header")
-            image, length = kind.from_bytes(content), len(content)
-        else:
-            image, length = nib.load(file), file.stat().st_size
+            image, length = type(image).from_bytes(content), len(content)
         data = image.dataobj
         declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
         if declared != length:
@@ -59,13 +54,13 @@ def load(path: str | os.PathLike[str]) -> Any:
     return image
 
 
-def voxels(path: str | os.PathLike[str], image: Any) -> np.ndarray:
+def voxels(name: str, image: Any) -> np.ndarray:
     """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64."""
-    with reading(path, "a readable NIfTI image"):
+    with reading(name, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
-    require_real(os.fspath(path), data)
+    require_real(name, data)
     if data.dtype.kind not in "fiub":
-        raise ValueError(f"{os.fspath(path)}: has voxels of type {data.dtype}; expected real numbers")
+        raise ValueError(f"{name}: has voxels of type {data.dtype}; expected real numbers")
     dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
     return np.ascontiguousarray(data, dtype=dtype.newbyteorder("="))
 
@@ -79,30 +74,22 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
-def read_image(path: str | os.PathLike[str], beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the voxel values of an image, and its affine in mm.
-
-    Without a unit of its own it has that of the image whose affine is `beside` (see `scaled_beside`).
-    """
-    image = load(path)
-    own, unit = affine_in_mm(os.fspath(path), image)
-    return voxels(path, image), own if unit or beside is None else scaled_beside(own, beside)
+def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image's voxel values, and its affine in mm; without a unit, in that of the image `beside` it."""
+    image = load(name)
+    own, unit = affine_in_mm(name, image)
+    return voxels(name, image), own if unit or beside is None else scaled_beside(own, beside)
 
 
-def sidecar_of(path: str | os.PathLike[str]) -> Path | None:
-    """Return the BIDS sidecar beside an image, if it is there."""
-    sidecar = _sidecar(path)
-    return sidecar if sidecar.is_file() else None
-
-
-def _sidecar(path: str | os.PathLike[str]) -> Path:
+def sidecar_of(path: str | os.PathLike[str]) -> Path:
+    """Return the path of the BIDS sidecar beside an image, which need not be there."""
     return Path(os.fspath(path).removesuffix(".gz")).with_suffix(".json")
 
 
 def _encoding(path: str) -> dict[str, Any]:
     """Return the field OrientationEncoding of the sidecar beside an image; empty if there is none."""
     sidecar = sidecar_of(path)
-    if sidecar is None:
+    if not sidecar.is_file():
         return {}
     with reading(sidecar, "a BIDS sidecar in JSON"):
         content = json.loads(sidecar.read_text(encoding="utf-8"))
@@ -119,11 +106,7 @@ def _encoding(path: str) -> dict[str, Any]:
 
 
 def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
-    """Return what the file says of its tensors, where we wrote it; empty otherwise.
-
-    Where the affine's directions are no longer those that were recorded, another program has moved the voxels, and
-    the record is no longer true.
-    """
+    """Return the record of `save_tensors`; empty if another program wrote the file, or turned its voxels since."""
     for extension in image.header.extensions:
         record = own_record(extension.get_content()) if extension.get_code() == COMMENT else {}
         if "axes" in record and np.allclose(record["axes"], affine[:3, :3], rtol=1e-4, atol=1e-4):
@@ -150,29 +133,18 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     affine, length_unit = affine_in_mm(name, image)
     encoding, record, notes = _encoding(name), _own_record(image, affine) if declared else {}, list[str]()
-    if order is None and declared:
-        order = "nifti"
-    elif order is None and encoding.get("Type") == "tensor":
-        order = "fsl"  # as BIDS has it: xx xy xz yy yz zz
-    elif order is None:
-        raise ValueError(
-            f"{name}: six components, but the file does not declare their order (its NIfTI intent is not "
-            f"symmetric-matrix), and programs differ. Pass order (--order), one of {choices()}"
-        )
-    elif declared and order != "nifti":
+    by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # xx xy xz yy yz zz
+    found = matrices(name, voxels(name, image).reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
+    if declared and found.order != "nifti":
         notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
     declared_frame = _REFERENCES.get(encoding.get("Reference", ""), record.get("frame"))
-    open_frame = frame is None and declared_frame is None and order == "nifti"
+    open_frame = frame is None and declared_frame is None and found.order == "nifti"
     if frame is not None and declared_frame not in (None, frame):
         notes.append(f"the {declared_frame} axes that the file declares are set aside for the {frame} axes, as asked")
-    frame = frame or declared_frame or FRAMES[order]
-    components = voxels(name, image).reshape(*shape[:3], 6)
-    tensors = unpack(components, order)
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if not (np.isfinite(affine).all() and spacing.min() > 0):
-        raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
+    frame = frame or declared_frame or FRAMES[found.order]
+    volume = placed(name, found, frame, affine, unit=record.get("unit", ""))
     notes += placement_notes(image)
-    axes = affine[:3, :3] / spacing
+    axes = affine[:3, :3] / volume.spacing
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
         notes.append("the affine's axes are not orthogonal: the shear is ignored")
     stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
@@ -183,34 +155,18 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
         notes.append(f"voxel sizes {by_axis(stored)} are those of the affine; the header's own are {by_axis(header)}")
     if open_frame and np.linalg.det(affine[:3, :3]) > 0:
         notes.append(OPEN_FRAME)
-    notes.append(f'tensors in order "{order}", given along the {frame} axes, taken to the voxel axes')
-    return TensorVolume(
-        to_voxel_axes(tensors, frame, affine),
-        tuple(spacing.tolist()),
-        (0.0, 0.0, 0.0),
-        affine=affine,
-        order=order,
-        frame=frame,
-        notes=tuple(notes),
-        source=name,
-        invalid_by_order=invalid_by_order(components, order),
-        length_unit="mm",
-        unit=record.get("unit", ""),
-    )
+    return replace(volume, notes=(*notes, *volume.notes))
 
 
 def placement_notes(image: Any) -> list[str]:
-    """Say what is doubtful about where an image lies: its sform and qform differ, or there is neither."""
+    """Say if the place of an image is in doubt: its sform and qform differ, or there is neither."""
     by_sform, sform = image.header.get_sform(coded=True)
     by_qform, qform = image.header.get_qform(coded=True)
     if not (sform or qform):
-        return [
-            "the file does not say where its voxels lie (neither sform nor qform is set): which side is left is a guess"
-        ]
+        return ["neither sform nor qform places the voxels in space: which side is left is a guess"]
     if not (sform and qform):
         return []
-    ends = np.stack(np.meshgrid(*((0, n - 1) for n in image.shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
-    apart = float(np.linalg.norm(ends @ (by_sform - by_qform).T, axis=1).max())
+    apart = float(np.linalg.norm(corners(image.shape) @ (by_sform - by_qform).T, axis=1).max())
     if apart <= 0.1 * np.linalg.norm(by_sform[:3, :3], axis=0).min():
         return []
     mirrored = np.linalg.det(by_sform[:3, :3]) * np.linalg.det(by_qform[:3, :3]) < 0
@@ -220,16 +176,14 @@ def placement_notes(image: Any) -> list[str]:
     ]
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars with times along the fourth axis, a slice one voxel thick; see `hks_jax.io.save`."""
     others = sorted(extra.keys() - {"times"})
     if others:
         raise ValueError(f"extra: got {', '.join(others)}; NIfTI has no place for more arrays. Write an .npz too")
     if "times" in extra:
         sources = [Path(volume.source).name] if volume.source else []
-        write_json(_sidecar(path), {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources})
+        write_json(sidecar_of(path), {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources})
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
@@ -240,9 +194,7 @@ def write(
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     """Write a symmetric-matrix image; see `hks_jax.io.save_tensors`."""
     if volume.dimension != 3:
-        raise ValueError(
-            "volume: NIfTI has no 2×2 tensors; write the volume that the slice is of, or an .npz, .nrrd or .vti"
-        )
+        raise ValueError("volume: NIfTI has no 2×2 tensors; write the whole volume, or an .npz, .nrrd or .vti")
     require_symmetric(volume)
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)

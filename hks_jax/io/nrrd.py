@@ -1,6 +1,5 @@
 """NRRD through pynrrd, which is optional: tensors of every kind that the format defines, masks and results."""
 
-import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,39 +9,21 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.nrrd_checks import check_data, check_header
+from hks_jax.io.nrrd_checks import PATIENT, check_data, check_header, space_of
 from hks_jax.io.repair import require_symmetric
-from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
 
-TO_RAS = {
-    "right-anterior-superior": (1.0, 1.0, 1.0),
-    "ras": (1.0, 1.0, 1.0),
-    "left-anterior-superior": (-1.0, 1.0, 1.0),
-    "las": (-1.0, 1.0, 1.0),
-    "left-posterior-superior": (-1.0, -1.0, 1.0),
-    "lps": (-1.0, -1.0, 1.0),
-}
-"""The signs that take a patient-based space to the scanner axes right, anterior, superior, as NIfTI has them."""
-
-
-class Kind(NamedTuple):
-    """What an axis of tensor components holds: d×d tensors, behind a confidence or not, symmetric or whole."""
-
-    d: int
-    masked: bool
-    symmetric: bool
-
-
 KINDS = {
-    f"{d}D-{'masked-' if masked else ''}{'symmetric-' if symmetric else ''}matrix": Kind(d, masked, symmetric)
+    f"{d}D-{masked}{symmetric}matrix": (d * (d + 1) // 2 if symmetric else d * d) + bool(masked)
     for d in (2, 3)
-    for masked in (False, True)
-    for symmetric in (False, True)
+    for masked in ("", "masked-")
+    for symmetric in ("", "symmetric-")
 }
+"""The kinds of axes of tensor components, and how many numbers each has, its confidence among them."""
 
 
 class Placement(NamedTuple):
@@ -52,8 +33,9 @@ class Placement(NamedTuple):
     origin: Float[np.ndarray, " d"]  # in the file's space
     # The signs that take the file's space to right, anterior, superior; None where it is not patient-based.
     signs: Float[np.ndarray, " d"] | None
+    measured: Float[np.ndarray, "m n"] | None  # the vectors of the measurement frame as columns
     placed: bool  # whether the file gives directions at all, and not spacings alone
-    unit: str = ""  # of length in the file; empty if it declares none
+    unit: str  # of length in the file; empty if it declares none
 
     @property
     def affine(self) -> Float[np.ndarray, "4 4"] | None:
@@ -68,9 +50,9 @@ class Placement(NamedTuple):
         return affine
 
 
-def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
+def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the array, first axis fastest in the file, in native floating point or as it is; and the header."""
-    nrrd, file = optional("nrrd"), existing(path)
+    nrrd, file = optional("nrrd"), existing(name)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not
         header = dict(nrrd.read_header(stream))
@@ -83,15 +65,10 @@ def load(path: str | os.PathLike[str]) -> tuple[np.ndarray, dict[str, Any]]:
     return data.astype(data.dtype.newbyteorder("=")), header
 
 
-def read_image(
-    path: str | os.PathLike[str], beside: np.ndarray | None = None
-) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
-    """Return the voxel values of a scalar image, and its affine if it has one.
-
-    Without a unit of its own it has that of the image whose affine is `beside` (see `scaled_beside`).
-    """
-    data, header = load(path)
-    place = _placement(os.fspath(path), header, list(range(data.ndim)))
+def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
+    """Return an image's voxel values, and its affine if any; without a unit, in that of the image `beside` it."""
+    data, header = load(name)
+    place = _placement(name, header, list(range(data.ndim)))
     affine = place.affine
     return data, affine if affine is None or beside is None or place.unit else scaled_beside(affine, beside)
 
@@ -104,67 +81,49 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
     components = np.moveaxis(data, axis, -1)
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
     notes, mask = [], None
-    if label is None:
-        if order is None:
-            raise ValueError(
-                f"{name}: {components.shape[-1]} components along axis {axis}, but the file does not declare their "
-                f"order (its kind is no kind of tensor), and programs differ. Pass order (--order), one of {choices()}"
-            )
-        tensors, used = unpack(components, order), order
-    else:
-        kind, used = KINDS[label], order or "nrrd"
-        if kind.masked:
-            mask, components = components[..., 0] > confidence, components[..., 1:]
-            notes.append(f"inside where the file's confidence exceeds {confidence:g}: {int(mask.sum())} voxels")
-        if not kind.symmetric:
-            if order is not None:
-                raise ValueError(f"order: {name} holds whole matrices ({label}); leave this out")
-            tensors, used = components.reshape(*components.shape[:-1], kind.d, kind.d), "matrix"
-        elif order is None:
-            tensors = unpack(components, "fsl")  # xx xy xz yy yz zz: the components alone, not FSL's frame
-        else:
-            notes.append(f'read in order "{order}" as asked, though the file declares {label}')
-            tensors = unpack(components, order)
-    d = tensors.shape[-1]
+    if label is not None and "masked" in label:
+        mask, components = components[..., 0] > confidence, components[..., 1:]
+        notes.append(f"inside where the file's confidence exceeds {confidence:g}: {int(mask.sum())} voxels")
+    found = matrices(name, components, order, "" if label is None else "nrrd")
+    if label is not None and order is not None:
+        notes.append(f'read in order "{order}" as asked, though the file declares {label}')
+    d = found.tensors.shape[-1]
     if len(domain) != d:
         raise ValueError(f"{name}: {d}×{d} tensors on {len(domain)} axes of voxels; expected {d} axes")
     place = _placement(name, header, domain)
     spacing = np.linalg.norm(place.directions, axis=0)
     affine = place.affine
-    tensors, frame = _to_voxel_axes(name, tensors, frame, place, header.get("measurement frame"), notes)
+    tensors, frame = _to_voxel_axes(name, found.tensors, frame, place, notes)
     if affine is not None and place.signs is None:
         notes.append(f"space {header.get('space', 'unnamed')!r}: the affine's axes are those of the file")
     elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
         notes.append("the grid's axes are those of the voxels; their directions in the plane are not kept")
     if place.unit not in ("", "mm"):
         notes.append(f"lengths in {place.unit}, as the file declares, are in mm here")
-    what = "whole matrices" if used == "matrix" else f'components in order "{used}"'
-    notes.append(f"{what} ({label or 'as asked'}), given along the {frame} axes, taken to the voxel axes")
+    notes.append(found._replace(of=f" ({label or 'as asked'})").note(frame))
     return TensorVolume(
         np.ascontiguousarray(tensors),
         tuple(spacing.tolist()),
         tuple((place.origin if affine is None else np.zeros(d)).tolist()),
         mask,
         affine,
-        order=used,
+        order=found.order,
         frame=frame,
         notes=tuple(notes),
         source=name,
-        invalid_by_order=invalid_by_order(components, order) if order is not None else None,
+        invalid_by_order=found.invalid,
         length_unit="mm" if place.unit or place.signs is not None else "",  # patients are measured in mm
         unit=own_record(header.get("provenance", "")).get("unit", ""),
     )
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars with times along the last axis; see `hks_jax.io.save`."""
     if volume.affine is not None:
         array = images_of(array, volume)
     elif array.ndim > volume.dimension:
         array = np.moveaxis(array, 0, -1)
-    _write(path, array, volume, record, more=extra)
+    _write(path, array, volume, record, "", extra)
 
 
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
@@ -174,25 +133,17 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
     components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
     record = describe_tensors(volume, "nrrd", "measurement", provenance)
     kind = f"{volume.dimension}D-masked-symmetric-matrix"
-    _write(path, np.moveaxis(components, -1, 0), volume, record, kind=kind)
+    _write(path, np.moveaxis(components, -1, 0), volume, record, kind, {})
 
 
-def _write(
-    path: Path,
-    array: np.ndarray,
-    volume: TensorVolume,
-    record: str,
-    *,
-    kind: str | None = None,
-    more: Mapping[str, Any] | None = None,
-) -> None:
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
     """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
 
-    It has one more axis for tensor components, of some `kind`, first, or for times last. A slice that has an affine
-    must come one voxel thick. More arrays go as text into the header.
+    Tensor components, of some `kind`, are along the first axis, times along the last. A slice with an affine must come
+    one voxel thick. More arrays go as text into the header.
     """
     nrrd = optional("nrrd")
-    placed = volume.affine is not None and (kind is None or kind.startswith("3D"))
+    placed = volume.affine is not None and not kind.startswith("2D")
     if placed:
         d, linear, origin = 3, volume.volume_affine[:3, :3], volume.volume_affine[:3, 3]
     else:
@@ -201,7 +152,7 @@ def _write(
     # pynrrd writes a direction of NaN as "none", which is what axes have that are not in space.
     directions, kinds, none = linear.T, ["space"] * d, np.full((1, d), np.nan)
     header: dict[str, Any] = {"space": "right-anterior-superior"} if placed else {"space dimension": d}
-    if kind is not None:
+    if kind:
         directions, kinds = np.concatenate([none, directions]), [kind, *kinds]
         header["measurement frame"] = nearest_rotation(linear).T  # its vectors, which are the matrix's columns
     elif array.ndim > d:
@@ -209,7 +160,7 @@ def _write(
     if placed or volume.length_unit:
         header["space units"] = ["mm"] * d
     header |= {"space directions": directions, "space origin": origin, "kinds": kinds, "encoding": "gzip"}
-    header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in (more or {}).items()}
+    header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in more.items()}
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     with atomic_path(path) as temporary:
@@ -222,10 +173,8 @@ def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -
     matrix_axes = [(axis, kind) for axis, kind in enumerate(kinds) if kind in KINDS]
     if len(matrix_axes) == 1:
         axis, kind = matrix_axes[0]
-        n = KINDS[kind].d
-        expected = (n * (n + 1) // 2 if KINDS[kind].symmetric else n * n) + KINDS[kind].masked
-        if shape[axis] != expected:
-            raise ValueError(f"{name}: axis {axis} is a {kind} of {shape[axis]} components; expected {expected}")
+        if shape[axis] != KINDS[kind]:
+            raise ValueError(f"{name}: axis {axis} is a {kind} of {shape[axis]} components; expected {KINDS[kind]}")
         return axis, kind
     count = {4: 6, 3: 3}.get(len(shape))
     rows = _rows(header, len(shape))
@@ -251,9 +200,12 @@ def _rows(header: Mapping[str, Any], n: int) -> Float[np.ndarray, "n d"] | None:
 def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Placement:
     d, rows = len(domain), _rows(header, int(header["dimension"]))
     unit, scales = _lengths(name, header, domain)
+    measured = np.asarray(header.get("measurement frame", np.nan), np.float64).T  # the file lists it by columns
+    frame = measured if np.isfinite(measured).all() else None
     if rows is None:
         spacings = np.asarray(header.get("spacings", np.full(int(header["dimension"]), np.nan)), np.float64)[domain]
-        return Placement(np.diag(np.where(np.isnan(spacings), 1.0, spacings * scales)), np.zeros(d), None, False, unit)
+        directions = np.diag(np.where(np.isnan(spacings), 1.0, spacings * scales))
+        return Placement(directions, np.zeros(d), None, frame, False, unit)
     directions = rows[domain].T
     if directions.shape != (d, d) or not np.isfinite(directions).all() or np.linalg.norm(directions, axis=0).min() == 0:
         raise ValueError(
@@ -261,16 +213,13 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
             "finite numbers, none of them zero"
         )
     origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
-    signs = TO_RAS.get(str(header.get("space", "")).lower().removesuffix("-time").removesuffix("t"))
-    to_ras = None if signs is None or d != 3 else np.array(signs)
-    return Placement(scales[:, None] * directions, origin, to_ras, True, unit)
+    signs = PATIENT.get(space_of(header)) if d == 3 else None
+    to_ras = None if signs is None else np.array(signs)
+    return Placement(scales[:, None] * directions, origin, to_ras, frame, True, unit)
 
 
 def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
-    """Return the unit of the file's lengths, empty if it declares none, and how many mm it is along each axis.
-
-    Directions are in the units of the axes of space, spacings in those of the voxels' axes.
-    """
+    """Return the unit of the file's lengths, empty if it declares none, and how many mm it is along each axis."""
     if "space directions" in header:
         field, given = "space units", list(header.get("space units", ()))[: len(domain)]
     else:
@@ -286,21 +235,14 @@ def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[s
 
 
 def _to_voxel_axes(
-    name: str,
-    tensors: Float[np.ndarray, "*shape d d"],
-    frame: str | None,
-    place: Placement,
-    measurement: Any,
-    notes: list[str],
+    name: str, tensors: Float[np.ndarray, "*shape d d"], frame: str | None, place: Placement, notes: list[str]
 ) -> tuple[Float[np.ndarray, "*shape d d"], str]:
     """Return the tensors along the voxel axes, and the frame that they were in."""
-    d = tensors.shape[-1]
-    affine = np.eye(d + 1)
-    affine[:d, :d] = place.directions
-    if measurement is None or not np.isfinite(np.asarray(measurement, np.float64)).all():
+    d, directions, columns = tensors.shape[-1], place.directions, place.measured
+    if columns is None:
         if frame == "measurement":
             raise ValueError(f'frame: {name} has no measurement frame; expected "voxel" or "world"')
-        rotation = nearest_rotation(place.directions)
+        rotation = nearest_rotation(directions)
         # With all axes along or all against those of space, both readings give the same tensors.
         same = np.allclose(rotation, np.eye(d), atol=1e-6) or np.allclose(rotation, -np.eye(d), atol=1e-6)
         if frame is None and not same:
@@ -310,18 +252,17 @@ def _to_voxel_axes(
             )
         frame = frame or ("world" if place.placed else "voxel")
     elif frame in (None, "measurement"):
-        columns = np.asarray(measurement, np.float64).T  # the file lists the matrix by columns
         if columns.shape != (d, d):
             raise ValueError(f"{name}: got a measurement frame of shape {columns.shape}; expected {(d, d)}")
         if np.abs(columns.T @ columns - np.eye(d)).max() > 1e-3:
             notes.append("the measurement frame is not orthonormal: it scales the tensors, as NRRD defines")
         columns = columns.astype(tensors.dtype)
-        return to_voxel_axes(columns @ tensors @ columns.T, "world", affine), "measurement"
+        return to_voxel_axes(columns @ tensors @ columns.T, "world", directions), "measurement"
     else:
         notes.append(f"the file's measurement frame is set aside for the {frame} axes, as asked")
     if frame == "fsl" and place.signs is not None:  # FSL's rule is about the axes right, anterior, superior
-        affine[:d, :d] = place.signs[:, None] * place.directions
-    return to_voxel_axes(tensors, frame, affine), frame
+        directions = place.signs[:, None] * directions
+    return to_voxel_axes(tensors, frame, directions), frame
 
 
 _NAMES = (".nrrd", ".nhdr")

@@ -1,6 +1,7 @@
 """What pynrrd does not notice in a damaged NRRD file: fields that are none, and data that end early or late."""
 
 import bz2
+import math
 import os
 import zlib
 from collections.abc import Mapping
@@ -21,17 +22,15 @@ _FIELDS = frozenset(
 )
 """All fields that the format has (Teem, "Definition of NRRD File Format")."""
 
-SPACES = frozenset(
-    name + time
-    for names, time in (
-        ("right-anterior-superior left-anterior-superior left-posterior-superior", "-time"),
-        ("scanner-xyz 3d-right-handed 3d-left-handed", "-time"),
-        ("ras las lps", "t"),
-    )
-    for name in names.split()
-    for time in ("", time)
-)
-"""All spaces that the format has, in lower case."""
+PATIENT = {
+    "right-anterior-superior": (1.0, 1.0, 1.0),
+    "left-anterior-superior": (-1.0, 1.0, 1.0),
+    "left-posterior-superior": (-1.0, -1.0, 1.0),
+}
+"""The spaces about a patient, and the signs that take them to right, anterior, superior, as NIfTI has them."""
+
+_SHORT = {"".join(word[0] for word in name.split("-")): name for name in PATIENT}
+_SPACES = (*PATIENT, "scanner-xyz", "3d-right-handed", "3d-left-handed")
 
 _PER_AXIS = ("sizes", "spacings", "thicknesses", "kinds", "space directions")
 _DECOMPRESSORS: dict[str, Any] = {
@@ -56,9 +55,16 @@ def check_header(text: bytes, header: Mapping[str, Any]) -> None:
     for name in _PER_AXIS:
         if name in header and len(header[name]) != n:
             raise ValueError(f"{name}: {len(header[name])} entries for {n} axes")
-    space = str(header.get("space", "ras")).lower()
-    if space not in SPACES:
+    space_of(header)
+
+
+def space_of(header: Mapping[str, Any]) -> str:
+    """Return the space in full and in lower case, without its time; the empty text if there is none."""
+    space = str(header.get("space", "")).lower()
+    name = _SHORT.get(space.removesuffix("t"), space.removesuffix("-time"))
+    if name and name not in _SPACES:
         raise ValueError(f"space: {space!r} is none of the format's, such as left-posterior-superior")
+    return name
 
 
 def check_data(file: Path, header: Mapping[str, Any], stream: BufferedReader, start: int) -> None:
@@ -87,9 +93,7 @@ def _check_stream(source: BufferedReader, decompressor: Any) -> None:
 
 
 def _check_length(source: BufferedReader, header: Mapping[str, Any]) -> None:
-    start = source.tell()
-    held, count = source.seek(0, os.SEEK_END) - start, 1
-    for size in header["sizes"]:
-        count *= int(size)
+    start, count = source.tell(), math.prod(int(size) for size in header["sizes"])
+    held = source.seek(0, os.SEEK_END) - start
     if count <= 0 or held % count:
         raise ValueError(f"{held} bytes of data for {count} values")

@@ -1,6 +1,5 @@
 """What makes one doubt that tensors were read as they were meant: units, frames, and how fibres cohere."""
 
-import itertools
 import math
 from dataclasses import replace
 from typing import NamedTuple
@@ -62,20 +61,30 @@ class Coherence(NamedTuple):
     @property
     def note(self) -> str:
         """Say how well fibres continue, and along which axes worse; the empty text where they tell nothing."""
-        frames = [f"along the {a.name} axes" for a in self.worse if a.is_frame]
-        flips = [a.name for a in self.worse if not a.is_frame]
-        worse = [*frames, *([f"with {', '.join(flips)} reversed"] if flips else [])]
+        worse = [f"along the {a.name} axes" for a in self.worse if a.is_frame]
+        if flips := [a.name for a in self.worse if not a.is_frame]:
+            worse.append(f"with {', '.join(flips)} reversed")
         return f"{_SAID} {self.angle:.1f}° in the mean, and clearly more {', or '.join(worse)}" if worse else ""
+
+    def question(self, option: str) -> str:
+        """Ask whether the frame, which `option` says, is wrong; the empty text where no other axes are better."""
+        best, said = self.better, f"Wrong frame? {_SAID} {self.angle:.1f}° in the mean along the {self.frame} axes"
+        if best is None:
+            return ""
+        if best.is_frame:
+            return f'{said}, and by {best.angle:.1f}° along the {best.name} axes: try {option} "{best.name}"'
+        return (
+            f"{said}, and by {best.angle:.1f}° with the {best.name} axis reversed: look at the signs of the gradient "
+            "directions, or at what turned the image but not its tensors"
+        )
 
 
 def coherence(volume: TensorVolume) -> Coherence | None:
     """Measure whether fibres continue along their own direction, along the axes of the file and along others.
 
     A principal direction v is compared with the mean of those of the two neighbours nearest to ±v, where both are
-    anisotropic, too. Tensors along the right axes agree best. The axes compared are the frames of
-    `hks_jax.io.read_tensors`, and the file's own with one axis reversed, of the voxels or of the scanner.
-
-    Returns None for a slice, and where fewer than a thousand voxels have such neighbours.
+    anisotropic, too. Tensors along the right axes agree best. Compared are the frames of `hks_jax.io.read_tensors`, and
+    the file's own with one axis reversed. None for a slice, and for fewer than a thousand voxels with such neighbours.
     """
     if volume.dimension != 3:
         return None
@@ -101,20 +110,6 @@ def coherence(volume: TensorVolume) -> Coherence | None:
         errors = float(gain.sum()) / max(scatter, 1e-12)
         others.append(Alternative(name, is_frame, float(np.nanmean(angles)), errors))
     return Coherence(volume.frame, float(np.nanmean(own)), tuple(others))
-
-
-def frame_question(found: Coherence | None, option: str = "frame") -> str:
-    """Ask whether the frame, which `option` says, is wrong; the empty text where no other axes are clearly better."""
-    if found is None or found.better is None:
-        return ""
-    best = found.better
-    said = f"Wrong frame? {_SAID} {found.angle:.1f}° in the mean along the {found.frame} axes"
-    if best.is_frame:
-        return f'{said}, and by {best.angle:.1f}° along the {best.name} axes: try {option} "{best.name}"'
-    return (
-        f"{said}, and by {best.angle:.1f}° with the {best.name} axis reversed: look at the signs of the gradient "
-        "directions, or at what turned the image but not its tensors"
-    )
 
 
 def _fibres(volume: TensorVolume) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
@@ -154,10 +149,7 @@ def _angles(
 
 
 def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarray, "3 3"]]]:
-    """Return other axes by name, whether they are a frame, and what turns directions, as read, to them.
-
-    Each is there once, the frames first; those that are the file's own are not among them.
-    """
+    """Return other axes, frames first: name, whether they are a frame, and a matrix that turns directions to them."""
     affine = volume.volume_affine
     to_voxel = {
         "voxel": np.eye(3),
@@ -172,13 +164,12 @@ def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarra
     candidates += [(AXES[a], False, flip) for a, flip in enumerate(flips)]
     turn = to_voxel["world"]
     candidates += [(f"scanner's {AXES[a]}", False, turn @ flip @ turn.T) for a, flip in enumerate(flips)]
-    kept: list[tuple[str, bool, Float[np.ndarray, "3 3"]]] = []
+    kept = [("own", True, np.eye(3))]
     for name, is_frame, turn in candidates:
-        before = [np.eye(3), *(other for _, _, other in kept)]
         # A turn and its negative are the same of a direction's two ends; below 5° nobody could tell.
-        if all(np.linalg.norm(turn - s * other, 2) > 0.09 for other, s in itertools.product(before, (1, -1))):
+        if all(np.linalg.norm(turn - s * other, 2) > 0.09 for _, _, other in kept for s in (1, -1)):
             kept.append((name, is_frame, turn))
-    return kept
+    return kept[1:]
 
 
 OPEN_FRAME = (
@@ -189,17 +180,17 @@ OPEN_FRAME = (
 
 
 def questions(volume: TensorVolume) -> tuple[str, ...]:
-    """Ask what the tensors of a volume give reason to: "Wrong frame?", "Wrong unit of length?", "Wrong unit?".
+    """Ask about tensors that look wrong: "Wrong frame?", "Wrong unit of length?", "Wrong unit?".
 
     Mirrored or turned tensors are as positive definite as right ones, but the fibres of neighbours no longer continue
     each other: the mean angle between a principal direction and those of the two neighbours along it is compared with
-    what it is along other axes. It needs a volume of some thousand anisotropic voxels; lay the mask over it first.
+    the mean angle along other axes. This needs some thousand anisotropic voxels; lay the mask over the volume first.
 
-    Units are asked about where lengths are in mm and the median mean diffusivity is one that no living tissue has, or
-    the voxels are of a size that no scan has.
+    Units are asked about where lengths are in mm, and no living tissue has the median mean diffusivity, or no scan has
+    voxels of this size.
 
     Args:
-        volume: from `read_tensors` or `fit_dwi`; not a slice, for the former.
+        volume: from `read_tensors` or `fit_dwi`; of a slice, only units are asked about.
 
     Returns:
         Sentences, with the remedy; none where nothing is to be asked.
@@ -208,16 +199,15 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the volume with notes of what its fibres tell, and the questions.
-
-    The note of an open frame is then a question, or settled.
-    """
+    """Return the volume with notes about its fibres, in place of the note of an open frame, and the questions."""
     found = coherence(volume) if volume.length_unit == "mm" else None
     notes = [note for note in volume.notes if note != OPEN_FRAME]
-    wrong_frame = frame_question(found, "bvec_frame" if volume.order == "fit" else "frame")
-    if found is not None and not wrong_frame and found.note:
-        notes.append(found.note)
-    settled = found is not None and any(a.is_frame and a.name == "fsl" for a in found.worse)
+    wrong_frame, settled = "", False
+    if found is not None:
+        wrong_frame = found.question("bvec_frame" if volume.order == "fit" else "frame")
+        settled = any(a.is_frame and a.name == "fsl" for a in found.worse)
+        if found.note and not wrong_frame:
+            notes.append(found.note)
     if OPEN_FRAME in volume.notes and not (wrong_frame or settled):
         wrong_frame = OPEN_FRAME
     asked = tuple(filter(None, (wrong_frame, length_question(volume), unit_question(volume))))

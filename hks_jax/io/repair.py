@@ -1,9 +1,11 @@
-"""Tensors that are not positive definite: how many, where, and what is done about them, if asked."""
+"""Tensors that are not positive definite: finding, counting and, if asked, repairing them."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import product
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -37,7 +39,7 @@ REPAIRS: dict[str, str] = {
 """The choices, for messages."""
 
 LISTED = 20
-"""So many voxels are listed in a report."""
+"""The number of voxels that a report lists."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
 """Relative difference of tensors that are the same; relative size of tensors that are nothing; least share of them."""
@@ -65,25 +67,25 @@ def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
     """Raise ValueError where tensors inside are not positive definite: how many, where the first is, the choices."""
     bad = find_invalid(volume)
     if bad.any():
-        finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
-        what = "not positive definite"
+        tensors = volume.tensors[bad]
+        finite, what = np.isfinite(tensors).all(axis=(-2, -1)), "not positive definite"
         if finite.any():
-            what += f", worst eigenvalue {least_eigenvalue(volume.tensors[finite]):.3g}"
-        if (bad & ~finite).any():
-            what += f", {int((bad & ~finite).sum())} of them NaN or infinite"
+            what += f", worst eigenvalue {least_eigenvalue(tensors[finite]):.3g}"
+        if not finite.all():
+            what += f", {int((~finite).sum())} of them NaN or infinite"
         choices = ", ".join(f'"{name}" ({does})' for name, does in REPAIRS.items())
         remedy = f"Choose {argument}: {choices}"
         if bad.sum() > MANY * volume.inside.sum():
-            remedy = f"{_why_so_many(volume, finite)}. For a few exceptions c{remedy[1:]}"
+            remedy = f"{_why_so_many(volume, tensors[finite])}. For a few exceptions c{remedy[1:]}"
         refuse("tensors", bad, volume.inside, "voxel", what, remedy)
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
-    """Return the volume with the tensors inside its mask positive definite, and a report of what was done.
+    """Return the volume with the tensors inside its mask positive definite, and a report of the changes.
 
     Args:
-        volume: the tensors. Without a mask, voxels whose tensor is exactly zero, as programs write what is outside,
-            are left out first.
+        volume: the tensors. Without a mask, voxels whose tensor is exactly zero are left out first: programs write the
+            background so.
         method: what to do with tensors that are not positive definite (or have an eigenvalue below `floor`):
             ``"clip"`` raises their eigenvalues to the floor, which gives the nearest such tensor in the Frobenius norm;
             ``"mask"`` takes them out of the mask; ``"nearest"`` puts the tensor of the nearest valid voxel (by
@@ -99,71 +101,75 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         ValueError: an unknown method, a floor that is not positive; no valid tensor at all; NaN or infinite tensors
             for ``"clip"``.
     """
-    if method not in get_args(Repair):
+    if method not in REPAIRS:
         raise ValueError(f"repair: got {method!r}; expected {', '.join(map(repr, REPAIRS))}")
     if floor is not None:
         require_number("floor", floor)
     volume = without_background(volume)
-    bad, lowest = find_invalid(volume, floor), floor
-    inside = volume.inside
-    if not bad.any():
-        return replace(volume, repair=_report(volume, bad, method, floor))
-    if (bad == inside).all():
-        raise ValueError(f"repair: none of the {int(inside.sum())} tensors is positive definite; check order and units")
-    if method == "clip":
-        typical = np.trace(volume.tensors[inside & ~bad], axis1=-2, axis2=-1) / volume.dimension
-        floor = 0.01 * float(np.median(typical)) if floor is None else floor
-    report = _report(volume, bad, method, floor)
-    if report["voxels"] > MANY * report["of"]:
-        finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
-        warn_of_accuracy(
-            f"repair: {report['voxels']} of {report['of']} tensors ({report['voxels'] / report['of']:.0%}) are not as "
-            "required, and the signature is to that part one of the repair. " + _why_so_many(volume, finite)
-        )
-    wrong = f"have an eigenvalue below {lowest:g}" if lowest else "are not positive definite"
-    worst = "" if report["worst_eigenvalue"] is None else f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})"
-    done = {
-        "clip": f"eigenvalues raised to {floor or 0:.3g}",
-        "mask": "left out",
-        "nearest": "replaced by the nearest valid one",
+    bad, inside = find_invalid(volume, floor), volume.inside
+    finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
+    count, of, where = int(bad.sum()), int(inside.sum()), np.argwhere(bad)
+    report: dict[str, Any] = {
+        "method": method,
+        "floor": floor,
+        "voxels": count,
+        "of": of,
+        "not_finite": int((bad & ~finite).sum()),
+        "worst_eigenvalue": least_eigenvalue(volume.tensors[finite]) if finite.any() else None,
+        "box": [where.min(0).tolist(), where.max(0).tolist()] if count else None,
+        "first": where[:LISTED].tolist(),
     }
-    note = f"repair: {report['voxels']} of {report['of']} tensors {wrong}{worst}: {done[method]}"
-    changed = replace(volume, repair=report, notes=(*volume.notes, note))
+    if not count:
+        return replace(volume, repair=report)
+    if count == of:
+        raise ValueError(f"repair: none of the {of} tensors is positive definite; check order and units")
+    if count > MANY * of:
+        warn_of_accuracy(
+            f"repair: {count} of {of} tensors ({count / of:.0%}) are not as required, and the signature is to that "
+            f"part one of the repair. {_why_so_many(volume, volume.tensors[finite])}"
+        )
+    wrong = "are not positive definite" if floor is None else f"have an eigenvalue below {floor:g}"
+    worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
+    mask, tensors, covariance = volume.mask, volume.tensors.copy(), volume.covariance
     if method == "mask":
-        return changed.with_mask(inside & ~bad)
-    tensors = volume.tensors.copy()
-    if method == "clip":
+        mask, done = inside & ~bad, "left out"
+    elif method == "clip":
         if report["not_finite"]:
             raise ValueError(
                 f"repair: {report['not_finite']} tensors are NaN or infinite and have no eigenvalues to clip; "
                 'choose "mask" or "nearest"'
             )
-        assert floor is not None
-        tensors[bad] = _clip(tensors[bad], floor)
+        if floor is None:
+            typical = np.trace(tensors[inside & ~bad], axis1=-2, axis2=-1) / volume.dimension
+            report["floor"] = floor = 0.01 * float(np.median(typical))
+        tensors[bad], done = (
+            _of_eigenvalues(tensors[bad], partial(np.maximum, floor)),
+            f"eigenvalues raised to {floor:.3g}",
+        )
     else:
         nearest = ndimage.distance_transform_edt(
             bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
         )
-        source = tuple(index[bad] for index in nearest)
-        tensors[bad] = volume.tensors[source]
-        if volume.covariance is not None:
-            covariance = volume.covariance.copy()
-            covariance[bad] = volume.covariance[source]
-            changed = replace(changed, covariance=covariance)
-    return replace(changed, tensors=tensors)
+        source, done = tuple(index[bad] for index in nearest), "replaced by the nearest valid one"
+        tensors[bad] = tensors[source]
+        if covariance is not None:
+            covariance = covariance.copy()
+            covariance[bad] = covariance[source]
+    notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}: {done}")
+    return replace(volume, tensors=tensors, mask=mask, covariance=covariance, repair=report, notes=notes)
 
 
-def _why_so_many(volume: TensorVolume, finite: Bool[np.ndarray, "*shape"]) -> str:
-    """Ask why more than a few tensors, finite ones among them, are invalid: a wrong order, or no diffusion tensors."""
+def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
+    """Ask why more than a few tensors, whose finite ones are given, are invalid: a wrong order, or no diffusion."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
-    if question or not finite.any():
+    if question or not len(finite):
         return question or "So many are no noise: NaN is often what lies outside a mask"
-    sizes = np.abs(np.linalg.eigvalsh(volume.tensors[finite].astype(np.float64)))
+    largest = np.abs(np.linalg.eigvalsh(finite.astype(np.float64))).max()
     return (
         "So many are no noise. Tensors that are indefinite by nature, such as stress, become a metric by a map of all "
-        f"of them: exp(S/s) with a scale s (eigenvalues of the invalid ones reach {sizes.max():.3g} in size), or "
-        f"S + c·I with a shift c > {-least_eigenvalue(volume.tensors[finite]):.3g}; see positive_tensors, on the "
-        "command line --positive"
+        f"of them: exp(S/s) with a scale s (eigenvalues of the invalid ones reach {largest:.3g} in size), or "
+        f"S + c·I with a shift c > {-least_eigenvalue(finite):.3g}; see positive_tensors, on the command line "
+        "--positive"
     )
 
 
@@ -179,7 +185,7 @@ def without_background(volume: TensorVolume) -> TensorVolume:
 
 
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
-    """Return which voxels look as if a program had filled in what lies outside, and a sentence; None if few do.
+    """Return the voxels that a program seems to have filled in as background, and a sentence; None if few do.
 
     No measurement gives the same isotropic tensor twice, nor one that is a millionth of the others: programs such as
     ANTs write either where there is no signal. Of a volume with a mask, and of one that is alike everywhere, None.
@@ -187,7 +193,7 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
     if volume.mask is not None:
         return None
     tensors, d = volume.tensors, volume.dimension
-    with np.errstate(invalid="ignore", over="ignore"):  # of what is not finite
+    with np.errstate(invalid="ignore", over="ignore"):  # of tensors that are not finite
         mean = np.trace(tensors, axis1=-2, axis2=-1, dtype=np.float64) / d
         isotropic = mean > 0
         for i, j in product(range(d), repeat=2):  # one by one: volumes are large
@@ -208,27 +214,13 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
     )
 
 
-def _clip(tensors: Float[np.ndarray, "n d d"], floor: float) -> Float[np.ndarray, "n d d"]:
-    symmetric = 0.5 * (tensors + np.swapaxes(tensors, -1, -2)).astype(np.float64)
-    values, vectors = np.linalg.eigh(symmetric)
-    clipped = (vectors * np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return (0.5 * (clipped + np.swapaxes(clipped, -1, -2))).astype(tensors.dtype)
-
-
-def _report(volume: TensorVolume, bad: np.ndarray, method: str, floor: float | None) -> dict[str, Any]:
-    finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
-    where = np.argwhere(bad)
-    worst = least_eigenvalue(volume.tensors[finite]) if finite.any() else None
-    return {
-        "method": method,
-        "floor": floor,
-        "voxels": len(where),
-        "of": int(volume.inside.sum()),
-        "not_finite": int((bad & ~finite).sum()),
-        "worst_eigenvalue": worst,
-        "box": [where.min(0).tolist(), where.max(0).tolist()] if len(where) else None,
-        "first": where[:LISTED].tolist(),
-    }
+def _of_eigenvalues(
+    tensors: Float[np.ndarray, "n d d"], function: Callable[[np.ndarray], np.ndarray]
+) -> Float[np.ndarray, "n d d"]:
+    """Return the symmetric parts of tensors with a function of their eigenvalues in place of these."""
+    values, vectors = np.linalg.eigh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)).astype(np.float64))
+    mapped = (vectors * function(values)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
+    return (0.5 * (mapped + np.swapaxes(mapped, -1, -2))).astype(tensors.dtype)
 
 
 def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
@@ -250,15 +242,15 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     inside, before = volume.inside, int(find_invalid(volume).sum())
     require_finite_symmetric("tensors", volume.tensors, inside, "voxel")
     check_shift("tensors", volume.tensors[inside], how, number)
-    values, vectors = np.linalg.eigh(volume.tensors[inside].astype(np.float64))
     with np.errstate(over="ignore"):  # told below
-        values = np.exp(values / number) if how == "exp" else values + number
-        mapped = ((vectors * values[:, None, :]) @ np.swapaxes(vectors, -1, -2)).astype(volume.tensors.dtype)
+        mapped = _of_eigenvalues(
+            volume.tensors[inside], lambda values: np.exp(values / number) if how == "exp" else values + number
+        )
     check_mapped(volume.tensors[inside], mapped, how, number)
     tensors = volume.tensors.copy()
-    tensors[inside] = 0.5 * (mapped + np.swapaxes(mapped, -1, -2))
+    tensors[inside] = mapped
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
-    note = f"{formula} of all tensors S, {before} of {int(inside.sum())} of which are not positive definite"
+    note = f"{formula} of all tensors S, {before} of {int(inside.sum())} not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
     return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))
 

@@ -1,4 +1,4 @@
-"""Results: what is computed and saved, to be read back and drawn, explored, tabulated or fitted."""
+"""Results: signatures and other scalar fields, which are saved, read back, drawn, explored, tabulated or fitted."""
 
 import json
 import math
@@ -14,8 +14,9 @@ from jaxtyping import Float
 from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.io.save import save
-from hks_jax.io.volume import TensorVolume, as_mask
+from hks_jax.io.arrays import volume_of
+from hks_jax.io.files import save
+from hks_jax.io.volume import TensorVolume
 from hks_jax.npz import load_npz
 
 NAMES = ("hks", "curvature")
@@ -30,7 +31,7 @@ class Result:
         values: (n_times, *shape).
         times: (n_times,), or (0,) for a result without.
         eigenvalues: (k,), or (0,) where they are not known.
-        report: what is known about it; ``settings`` are those of the computation.
+        report: facts about the computation; ``settings`` are those of the computation.
         arrays: more arrays by name, which are saved with it: ``deviation``, ``bias`` and ``noise_maps`` (n_draws,
             n_times, *shape) of error bars; ``scaled_times`` λ₁t; ``input_tensors``, where they are known.
         name: ``"hks"`` or ``"curvature"``.
@@ -82,7 +83,15 @@ class Result:
         values = values.reshape(-1, *values.shape[values.ndim - d :]).astype(np.float64)
         place: TensorVolume | SimplicialMesh
         if not on_mesh:
-            place = _volume(path, arrays, values.shape[1:], record)
+            shape = (*values.shape[1:], d, d)
+            tensors = arrays.get("input_tensors", np.broadcast_to(np.eye(d), shape))
+            if tensors.shape != shape:
+                raise ValueError(f"{path}: got input_tensors of shape {tensors.shape}; expected {shape}")
+            about: dict[str, Any] = {"order": record.get("order", "matrix"), "frame": record.get("frame", "voxel")}
+            about |= {"source": record.get("source") or "", "digest": record.get("sha256") or ""}
+            about |= {"notes": tuple(record.get("notes", ()))}
+            about["slice_axis"] = int(arrays["slice_axis"]) if "slice_axis" in arrays else None
+            place = volume_of(str(path), arrays, tensors, **about)
         elif "cells" in arrays:
             place = TetMesh(arrays["vertices"], arrays["cells"])
         else:
@@ -100,7 +109,7 @@ class Result:
         Args:
             stem: the files' path without a suffix.
             image: the suffix; see `hks_jax.io.save`.
-            origin: what the files say of its origin beside the settings and the times.
+            origin: more entries of the files' provenance, beside the settings and the times.
         """
         single = isinstance(self.place, TensorVolume) and self.place.tensors.dtype == np.float32
         values = self.values.astype(np.float32) if single else self.values
@@ -167,7 +176,7 @@ def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold: no NaN or infinity, no tuples or NumPy scalars."""
+    """Return what JSON can hold: no NaN or infinity, no tuples, paths or NumPy scalars."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -176,26 +185,4 @@ def plain(value: Any) -> Any:
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
-
-
-def _volume(
-    path: Path, arrays: Mapping[str, np.ndarray], shape: tuple[int, ...], record: Mapping[str, Any]
-) -> TensorVolume:
-    d, affine = len(shape), arrays.get("affine")
-    tensors = arrays.get("input_tensors", np.broadcast_to(np.eye(d), (*shape, d, d)))
-    if tensors.shape != (*shape, d, d):
-        raise ValueError(f"{path}: got input_tensors of shape {tensors.shape}; expected {(*shape, d, d)}")
-    return TensorVolume(
-        tensors,
-        tuple(np.atleast_1d(arrays["spacing"]).tolist()),
-        tuple(np.atleast_1d(arrays["origin"]).tolist()),
-        as_mask(f"{path}: mask", arrays["mask"]) if "mask" in arrays else None,
-        None if affine is None else affine.astype(np.float64),
-        int(arrays["slice_axis"]) if "slice_axis" in arrays else None,
-        order=record.get("order", "matrix"),
-        frame=record.get("frame", "voxel"),
-        notes=tuple(record.get("notes", ())),
-        source=record.get("source") or "",
-        digest=record.get("sha256") or "",
-    )
+    return str(value) if isinstance(value, Path) else value

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,21 +14,18 @@ MISSING = "n/a"
 
 
 def write_table(
-    path: str | os.PathLike[str],
-    columns: Sequence[str],
-    rows: Iterable[Sequence[Any]],
-    about: Mapping[str, Any] | None = None,
+    path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]], about: Mapping[str, Any] | None = None
 ) -> list[Path]:
     """Write a table, and beside it, where there is something to say about it, a JSON file; return their paths.
 
     Both appear whole or not at all, the JSON file last: where it is there, the table is.
     """
-    written = [Path(path)]
+    written = [path]
     with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as stream:
         stream.write("\t".join(columns) + "\n")
         stream.writelines("\t".join(map(cell, row)) + "\n" for row in rows)
     if about is not None:
-        written.append(write_json(Path(path).with_suffix(".json"), about))
+        written.append(write_json(path.with_suffix(".json"), about))
     return written
 
 
@@ -48,7 +44,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> Path:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return what is in a JSON file; nothing if there is no such file, or it is no object."""
+    """Return the object in a JSON file; an empty one if there is no such file, or it holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -56,7 +52,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def read_table(path: str | os.PathLike[str]) -> list[dict[str, str]]:
+def read_table(path: Path) -> list[dict[str, str]]:
     """Return the rows of a table with a header, tab-separated, or separated by commas if its name ends in ``.csv``.
 
     Cells that are empty or ``n/a`` are left out, and rows of nothing else.

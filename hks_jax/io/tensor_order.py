@@ -15,6 +15,7 @@ The three components of a 2×2 tensor follow each other as they do among the six
 matrix have xx xy xz yy yz zz, along the measurement frame.
 """
 
+import math
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -53,13 +54,13 @@ def pack(tensors: Float[np.ndarray, "*shape d d"], order: str) -> Float[np.ndarr
 
 
 def to_voxel_axes(
-    tensors: Float[np.ndarray, "*shape d d"], frame: str, affine: Float[np.ndarray, "d+1 d+1"]
+    tensors: Float[np.ndarray, "*shape d d"], frame: str, affine: Float[np.ndarray, "m m"]
 ) -> Float[np.ndarray, "*shape d d"]:
     """Return the tensors with components along the voxel axes, from components along those of `frame`.
 
-    The affine maps voxel indices to world coordinates. ``"voxel"``: unchanged; ``"fsl"``: the first axis is reversed
-    where det(affine) > 0; ``"world"``: along the axes that the affine maps to, D_voxel = RᵀDR with R the rotation (or
-    reflection) nearest to the affine.
+    The affine, or its linear part alone, maps voxel indices to world coordinates. ``"voxel"``: unchanged; ``"fsl"``:
+    the first axis is reversed where det(affine) > 0; ``"world"``: along the axes that the affine maps to,
+    D_voxel = RᵀDR with R the rotation (or reflection) nearest to the affine.
     """
     if frame == "voxel":
         return tensors
@@ -88,15 +89,9 @@ def nearest_rotation(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d
 
 
 def _indices(order: str, d: int) -> list[tuple[int, int]]:
-    if order not in ORDERS:
-        raise ValueError(f"order: got {order!r}; expected {choices()}")
-    pairs = [("xyz".index(pair[0]), "xyz".index(pair[1])) for pair in ORDERS[order]]
+    components = ORDERS["fsl" if order == "nrrd" else order]  # the same components, along other axes
+    pairs = [("xyz".index(pair[0]), "xyz".index(pair[1])) for pair in components]
     return [pair for pair in pairs if max(pair) < d]
-
-
-def choices() -> str:
-    """Name the orders, for messages."""
-    return ", ".join(f'"{name}" ({" ".join(components)})' for name, components in ORDERS.items())
 
 
 _SAMPLE = 20_000
@@ -131,8 +126,7 @@ class InvalidByOrder(NamedTuple):
 def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> InvalidByOrder | None:
     """Count the tensors that are not positive definite under each order; None where few are under their own.
 
-    Validity does not depend on the axes that components are along, only on their order. It tells ``"nifti"``,
-    ``"fsl"`` and the orders with the diagonal first apart, but hardly ``"mrtrix"`` and ``"vtk"``, which exchange two
+    The axes of components do not matter for this. It hardly tells ``"mrtrix"`` from ``"vtk"``, which exchange two
     components beside the diagonal.
     """
     rows = components.reshape(-1, components.shape[-1])
@@ -142,3 +136,40 @@ def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> I
         return None
     counts = {name: int(np.sum(~spd.is_spd(unpack(rows, name)))) for name in ORDERS}
     return InvalidByOrder(order, counts, len(rows))
+
+
+class Matrices(NamedTuple):
+    """The tensors of a file, along the file's axes."""
+
+    tensors: Float[np.ndarray, "*shape d d"]
+    order: str  # of their components; "matrix" if they were whole matrices
+    invalid: InvalidByOrder | None
+    of: str = ""  # what notes say of the components
+
+    def note(self, frame: str) -> str:
+        """Say how they were read."""
+        what = "whole matrices" if self.order == "matrix" else f'components in order "{self.order}"'
+        return f"{what}{self.of}, given along the {frame} axes, taken to the voxel axes"
+
+
+def matrices(name: str, components: Float[np.ndarray, "*shape n"], order: str | None, declared: str = "") -> Matrices:
+    """Return the tensors that components make: all d² entries of matrices, or the d(d+1)/2 of symmetric ones.
+
+    Raises:
+        ValueError: an unknown order; one for whole matrices; neither an order nor a `declared` one for symmetric ones.
+    """
+    n = components.shape[-1]
+    if n in (4, 9):
+        if order is not None:
+            raise ValueError(f"order: {name} holds whole matrices; leave this out")
+        return Matrices(components.reshape(*components.shape[:-1], math.isqrt(n), -1), "matrix", None)
+    used = order or declared
+    choices = ", ".join(f'"{name}" ({" ".join(components)})' for name, components in ORDERS.items())
+    if not used:
+        raise ValueError(
+            f"{name}: it has {n} components of each tensor and does not declare their order, and programs differ. "
+            f"Pass order (--order), one of {choices}"
+        )
+    if used not in ORDERS and used != declared:
+        raise ValueError(f"order: got {used!r}; expected {choices}")
+    return Matrices(unpack(components, used), used, invalid_by_order(components, used) if used in ORDERS else None)

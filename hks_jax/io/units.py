@@ -1,6 +1,7 @@
 """Units: of lengths as headers declare them, and of diffusivities, which hardly any header does."""
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal, get_args
@@ -27,28 +28,22 @@ _B_VALUES = (20.0, 1e5)
 _VOXELS = (0.005, 50.0)
 """Between which the sizes of voxels are, in mm, from microscopy to the thickest slices."""
 
-_LENGTHS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "nm": 1e-6}
-_SPELLINGS = {
-    **{
-        f"{prefix}{metre}{plural}": unit
-        for prefix, unit in (("milli", "mm"), ("centi", "cm"), ("", "m"), ("micro", "um"), ("nano", "nm"))
-        for metre in ("meter", "metre")
-        for plural in ("", "s")
-    },
-    **dict.fromkeys(("micron", "microns", "\u00b5m", "\u03bcm"), "um"),  # the micro sign, and the Greek letter
+_PREFIXES = {
+    **{"": 1e3, "centi": 10.0, "c": 10.0, "milli": 1.0, "m": 1.0, "nano": 1e-6, "n": 1e-6},
+    **dict.fromkeys(("micro", "u", "\u00b5", "\u03bc"), 1e-3),  # the micro sign, and the Greek letter
 }
-_NONE = ("", "???", "none", "unknown", "n/a")
+"""How many mm a metre is with each prefix."""
 
 
 def millimetres(where: str, text: str) -> float | None:
     """Return how many mm a header's unit of length is, such as "microns" or "µm"; None where it names none."""
-    word = text.strip().lower()
-    if word in _NONE:
+    word = re.sub(r"^microns?$", "um", text.strip().lower())
+    if word in ("", "???", "none", "unknown", "n/a"):
         return None
-    scale = _LENGTHS.get(_SPELLINGS.get(word, word))
-    if scale is None:
-        raise ValueError(f"{where}: got {text!r}; expected one of {', '.join(_LENGTHS)}. Correct the header")
-    return scale
+    prefix = re.sub(r"(m|met(er|re)s?)$", "", word)
+    if prefix == word or prefix not in _PREFIXES:
+        raise ValueError(f"{where}: got {text!r}; expected one of mm, cm, m, um, nm. Correct the header")
+    return _PREFIXES[prefix]
 
 
 def by_axis(values: Iterable[float]) -> str:
@@ -80,10 +75,7 @@ def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
 
 
 def length_question(volume: TensorVolume) -> str:
-    """Ask whether the unit of length is wrong where no scan has such voxels; the empty text where they are plausible.
-
-    Lengths that have no unit are not asked about.
-    """
+    """Ask whether lengths in mm are wrong, where no scan has such voxels; else return the empty text."""
     low, high = _VOXELS
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""
@@ -95,21 +87,14 @@ def length_question(volume: TensorVolume) -> str:
 
 
 def unit_question(volume: TensorVolume) -> str:
-    """Ask whether the unit is wrong where no living tissue has the mean diffusivity that mm²/s give.
-
-    The empty text where the median over the voxels inside is plausible, and where nothing says that the volume is one
-    of tissue: lengths without a unit.
-    """
+    """Ask whether the unit is wrong, where no living tissue has such a mean diffusivity and lengths are in mm."""
     if volume.length_unit != "mm":
         return ""
     median = median_mean_diffusivity(volume)
     if median == 0 or is_plausible(median):
         return ""
-    least, largest = LIVING_TISSUE
-    said = (
-        f"Wrong unit? The median mean diffusivity is {median:.3g} {MM2_PER_S}, and living tissue has {least:g} to "
-        f"{largest:g}"
-    )
+    said = f"Wrong unit? The median mean diffusivity is {median:.3g} {MM2_PER_S}, and living tissue has "
+    said += "{:g} to {:g}".format(*LIVING_TISSUE)
     for name, scale in UNITS.items():
         # Where a unit was told, the numbers are no longer those of the file.
         if is_plausible(median * scale) and not volume.unit:
@@ -129,13 +114,14 @@ def b_value_question(largest: float) -> str:
     low, high = _B_VALUES
     if low <= largest <= high:
         return ""
-    would = next(((name, largest / scale) for name, scale in UNITS.items() if low <= largest / scale <= high), None)
-    if would is None:
-        return ""
-    return (
-        f"the largest b-value is {largest:g}, and scans have {low:g} to {high:g} s/mm². It would be {would[1]:g} s/mm² "
-        f'if the b-values are in the reciprocal of {would[0]}: pass unit "{would[0]}", that of the tensors'
-    )
+    for name, scale in UNITS.items():
+        if low <= largest / scale <= high:
+            return (
+                f"the largest b-value is {largest:g}, and scans have {low:g} to {high:g} s/mm². It would be "
+                f"{largest / scale:g} s/mm² if the b-values are in the reciprocal of {name}: pass unit "
+                f'"{name}", that of the tensors\''
+            )
+    return ""
 
 
 def is_plausible(diffusivity: float) -> bool:

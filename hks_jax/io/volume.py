@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from hks_jax import __version__
+from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
-from hks_jax.describe import describe_array
 from hks_jax.domain.grid import Grid
-from hks_jax.io.tensor_order import InvalidByOrder
+from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
 
 AXES = "xyz"
 
@@ -31,7 +31,7 @@ class Format:
     read_image: Callable[..., tuple[np.ndarray, np.ndarray | None]] | None = None
     written: tuple[str, ...] = ()  # which of the names it writes
     # Results: of a path, an array, the volume, the array's name, more arrays, and the provenance.
-    write: Callable[[Path, np.ndarray, "TensorVolume", str, Mapping[str, Any], str], None] | None = None
+    write: Callable[[Path, np.ndarray, "TensorVolume", str, dict[str, Any], str], None] | None = None
     write_tensors: Callable[[Path, "TensorVolume", Mapping[str, Any] | None], None] | None = None
     image: str = ""  # the suffix of results beside tensors in this format; empty where an npz is enough
 
@@ -49,10 +49,10 @@ class TensorVolume:
         slice_axis: for a slice, the axis of the volume that it cuts; None for a volume.
         order: the order of components in the file, ``"matrix"`` if they were whole matrices.
         frame: the axes along which the file's components were.
-        notes: what the reader decided, in sentences.
+        notes: the reader's decisions, in sentences.
         source: the file.
         digest: the SHA-256 of the file; empty where the data are in more than one.
-        repair: what was done to tensors that are not positive definite, for reports; empty if nothing was.
+        repair: how tensors that are not positive definite were changed, for reports; empty if none were.
         invalid_by_order: how many tensors of the file are not positive definite under each order of components, where
             many are under the one in which they were read; else None.
         length_unit: ``"mm"``, which the lengths of a file that has a unit are converted to; empty where it has none.
@@ -83,27 +83,24 @@ class TensorVolume:
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
-        require_real(f"{where}tensors", self.tensors)
-        shape, d = self.tensors.shape[:-2], self.tensors.shape[-1]
-        if self.tensors.ndim not in (4, 5) or self.tensors.shape[-2:] != (len(shape),) * 2:
+        tensors, mask, covariance = self.tensors, self.mask, self.covariance
+        require_real(f"{where}tensors", tensors)
+        shape, d = tensors.shape[:-2], tensors.shape[-1]
+        if tensors.ndim not in (4, 5) or tensors.shape[-2:] != (len(shape),) * 2:
             raise ValueError(
-                f"{where}tensors: got shape {self.tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)"
+                f"{where}tensors: got shape {tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)"
             )
         for name, value in (("spacing", self.spacing), ("origin", self.origin)):
             if len(value) != d or not np.isfinite(value).all():
                 raise ValueError(f"{where}{name}: got {value}; expected {d} finite numbers, one per axis")
         if min(self.spacing) <= 0:
             raise ValueError(f"{where}spacing: got {self.spacing}; expected positive numbers")
-        if self.mask is not None and (self.mask.shape != shape or self.mask.dtype != bool):
-            raise ValueError(
-                f"{where}mask: got shape {self.mask.shape}, dtype {self.mask.dtype}; expected booleans of shape {shape}"
-            )
+        if mask is not None and (mask.shape != shape or mask.dtype != bool):
+            raise ValueError(f"{where}mask: got shape {mask.shape}, {mask.dtype}; expected booleans of shape {shape}")
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
             raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected (4, 4), finite")
-        if self.covariance is not None and self.covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):
-            raise ValueError(
-                f"{where}covariance: got shape {self.covariance.shape}; expected (*shape, m, m), m = d(d+1)/2"
-            )
+        if covariance is not None and covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):
+            raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected (*shape, m, m), m = d(d+1)/2")
 
     def __repr__(self) -> str:
         """Return one line without the arrays."""
@@ -200,6 +197,30 @@ class TensorVolume:
         return 2 if self.slice_axis is None else self.slice_axis
 
 
+def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 4"], **known: Any) -> TensorVolume:
+    """Return the tensors of a file whose voxels an affine places, taken from the axes of `frame` to the voxels'."""
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if not (np.isfinite(affine).all() and spacing.min() > 0):
+        raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
+    return TensorVolume(
+        np.ascontiguousarray(to_voxel_axes(found.tensors, frame, affine)),
+        tuple(spacing.tolist()),
+        (0.0, 0.0, 0.0),
+        affine=affine,
+        order=found.order,
+        frame=frame,
+        notes=(found.note(frame),),
+        source=name,
+        invalid_by_order=found.invalid,
+        **{"length_unit": "mm", **known},
+    )
+
+
+def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
+    """Return the indices of the voxels at the corners of a volume, with a 1 behind each, which affines map."""
+    return np.stack(np.meshgrid(*((0, n - 1) for n in shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
+
+
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
     """Return scalars (*shape,) or (n_times, *shape) as image files have them: slices one voxel thick, times last."""
     n = array.ndim - volume.dimension
@@ -224,7 +245,7 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str:
-    """Return one line of JSON: the version, the tensors' file and what was decided in reading it, and `more`."""
+    """Return one line of JSON: the version, the tensors' file, the reader's decisions, and `more`."""
     record: dict[str, Any] = {"software": f"hks-jax {__version__}"}
     if volume is not None:
         record |= {"source": volume.source, "sha256": volume.digest, "order": volume.order, "frame": volume.frame}
@@ -235,10 +256,7 @@ def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str
 
 
 def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:
-    """Return the same of tensors that are written: their order, frame, axes and units are those in the new file.
-
-    What the file had that they came from is ``source_order`` and ``source_frame``.
-    """
+    """Return the same of tensors that are written, with their order, frame, axes and units in the new file."""
     stored = {"order": order, "frame": frame, "source_order": volume.order, "source_frame": volume.frame}
     stored |= {"axes": volume.volume_affine[:3, :3].tolist(), "length_unit": volume.length_unit, "unit": volume.unit}
     return describe(volume, {**stored, **(more or {})})

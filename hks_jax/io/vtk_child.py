@@ -1,7 +1,7 @@
 """Reads a file of VTK's, as a script in a process of its own: ``vtk_child.py FILE ARRAYS.npz BYTES``.
 
-VTK follows damaged files into memory that is not its own, and ends the process where it cannot allocate what they
-declare. The script imports nothing of this package, which would take longer than the reading.
+VTK follows damaged files into memory that is not its own, and ends the process where it cannot allocate the memory
+that they declare. The script imports nothing of this package, which would take longer than the reading.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ def surface(data: Any) -> dict[str, Any]:
             np.asarray(vtk_to_numpy(array), np.int64)
             for array in (cells.GetConnectivityArray(), cells.GetOffsetsArray())
         )
-        # What lies at an index, the filter reads without a look at whether it is one.
+        # The filter reads at any index without checking it.
         if corners.size and not 0 <= corners.min() <= corners.max() < data.GetNumberOfPoints():
             raise ValueError(f"a polygon has the corner {corners.max()} of {data.GetNumberOfPoints()} points")
         if ends.size and (ends[0] != 0 or ends[-1] != corners.size or (np.diff(ends) < 3).any()):
@@ -47,7 +47,7 @@ def surface(data: Any) -> dict[str, Any]:
 
 
 def main(path: str, output: str, room: str) -> None:
-    """Write what is in a file as an npz, within so many bytes of memory."""
+    """Write the content of a file as an npz, using at most `room` bytes of memory."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
     from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader

@@ -15,8 +15,8 @@ from urllib.parse import quote
 import numpy as np
 
 from hks_jax.atomic import atomic_path
-from hks_jax.io.tensor_order import choices, invalid_by_order, nearest_rotation, to_voxel_axes, unpack
-from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
+from hks_jax.io.tensor_order import matrices, nearest_rotation
+from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors, placed
 from hks_jax.npz import load_npz
 from hks_jax.optional import optional
 from hks_jax.reading import existing, reading
@@ -73,52 +73,25 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     with reading(file, kind):
         (_check_range if xml else _check_length)(content, chosen, components)
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
-    if components.shape[-1] == 9:
-        if order is not None:
-            raise ValueError(f"order: {name} holds whole matrices; leave this out")
-        tensors, order = components.reshape(-1, 3, 3), "matrix"
-    elif order is None and not declared:
-        raise ValueError(
-            f"{name}: six components in {chosen!r}, which the file does not declare as tensors, and programs "
-            f"differ in their order. Pass order (--order), one of {choices()}"
-        )
-    else:
-        order = order or "vtk"
-        tensors = unpack(components, order)
+    found = matrices(name, components, order, "vtk" if declared else "")
     lower, upper = image["extent"].reshape(3, 2).T
     thick = upper > lower
     of_cells = thick & (place == "cell")  # a cell's value is at its centre
     shape = tuple((upper - lower + np.where(of_cells, 0, 1)).tolist())
-    steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # 0 is what has no thickness
+    steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # an axis without thickness has 0
     affine = np.eye(4)
     affine[:3, :3] = image["direction"] * steps
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    if not (np.isfinite(affine).all() and spacing.min() > 0):
-        raise ValueError(f"{name}: got spacing {image['spacing']}; expected finite numbers, none of them zero")
     affine[:3, 3] = image["origin"] + affine[:3, :3] @ (lower + np.where(of_cells, 0.5, 0.0))
-    frame = frame or "world"
-    what = "whole matrices" if order == "matrix" else f'components in order "{order}"'
-    note = f"{what} from {chosen!r} at the {place}s, given along the {frame} axes, taken to the voxel axes"
-    straight = np.array_equal(affine[:3, :3], np.diag(spacing))
     mask = image.get(f"{place}:mask")
-    volume = TensorVolume(
-        np.ascontiguousarray(to_voxel_axes(_on_grid(tensors, shape), frame, affine)),
-        tuple(spacing.tolist()),
-        tuple(affine[:3, 3].tolist()) if straight else (0.0,) * 3,
-        None if mask is None else as_mask(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape))),
-        None if straight else affine,
-        order=order,
-        frame=frame,
-        notes=(note,),
-        source=name,
-        invalid_by_order=None if order == "matrix" else invalid_by_order(components, order),
-    )
+    inside = None if mask is None else as_mask(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape)))
+    found = found._replace(tensors=_on_grid(found.tensors, shape), of=f" from {chosen!r} at the {place}s")
+    volume = placed(name, found, frame or "world", affine, mask=inside, length_unit="")
+    if np.array_equal(affine[:3, :3], np.diag(volume.spacing)):
+        volume = replace(volume, affine=None, origin=tuple(affine[:3, 3].tolist()))
     return _as_plane(volume)
 
 
-def write(
-    path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: Mapping[str, Any], record: str
-) -> None:
+def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     """Write scalars as arrays of points, one per time; see `hks_jax.io.save`."""
     _write(path, by_time(name, array, array.ndim - volume.dimension, extra), volume, record, extra)
 
@@ -132,7 +105,7 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
         tensors[..., np.ix_(keep, keep)[0], np.ix_(keep, keep)[1]] = volume.tensors
     rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
     record = describe_tensors(volume, "matrix", "world", provenance)
-    _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record)
+    _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record, {})
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -144,17 +117,8 @@ def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> d
     return dict(zip(labels, array, strict=True))
 
 
-def _write(
-    path: Path,
-    arrays: Mapping[str, np.ndarray],
-    volume: TensorVolume,
-    record: str,
-    more: Mapping[str, Any] | None = None,
-) -> None:
-    """Write point arrays over the voxels of a volume, the mask, and `more` and the provenance as field data.
-
-    Arrays are (*shape,) or (*shape, 3, 3), the latter as tensors along the axes of space.
-    """
+def _write(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, record: str, more: dict[str, Any]) -> None:
+    """Write arrays of points, (*shape, 3, 3) as tensors, the mask, and `more` and the provenance as field data."""
     optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -179,7 +143,7 @@ def _write(
             image.GetPointData().SetTensors(array)
         else:
             image.GetPointData().AddArray(array)
-    for name, values in (more or {}).items():
+    for name, values in more.items():
         array = numpy_to_vtk(np.ascontiguousarray(np.asarray(values).ravel()), deep=True)
         array.SetName(name)
         image.GetFieldData().AddArray(array)
@@ -196,7 +160,7 @@ def _write(
 
 
 def _check_pieces(content: bytes) -> None:
-    """Raise ValueError unless the pieces of an image fill its whole extent: VTK makes up what is not there."""
+    """Raise ValueError unless the pieces of an image fill its whole extent: VTK makes up values for missing pieces."""
     head = content.partition(b"<AppendedData")[0]
 
     def cells(extent: bytes) -> int:

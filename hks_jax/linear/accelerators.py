@@ -25,10 +25,7 @@ def at_hand() -> bool:
 
 
 def kernels_compile() -> bool:
-    """Return whether Pallas' kernels compile for the GPU here; False without one, as tracing them takes time.
-
-    Whether it is a CUDA device is decided where kernels are used.
-    """
+    """Return whether Pallas' kernels compile for the GPU here; False without one, as tracing them takes time."""
     if jax.default_backend() != "gpu":
         return False
     try:
@@ -39,16 +36,16 @@ def kernels_compile() -> bool:
     return capability.replace(".", "").isdigit() and float(capability) >= _CAPABILITY
 
 
+INTERPRETED = False
+"""Whether Pallas' kernels run on any device by XLA's operations instead: for tests."""
+
 _PROVED: dict[tuple[str, str], bool] = {}
 
 
 def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[Any, Any]]]) -> bool:
     """Return whether Pallas' kernels compile for the GPU here, and compute what they should, as the first use finds.
 
-    Args:
-        name: of the kernels.
-        dtype: of their numbers.
-        compare: runs each of them on a small problem, and returns its results beside those that are expected.
+    ``compare`` runs each of them on a small problem, and returns its results beside those that are expected.
 
     Warns:
         RuntimeWarning: they do not; XLA's operations take their place for the rest of the process.

@@ -30,19 +30,16 @@ random closed surfaces, the factors are then as large as where the vertices' pos
 28 % more operations."""
 
 
+Ints = Int[np.ndarray, " _"]
+
+
 class Parts(NamedTuple):
-    """A recursive bisection of a graph: part q of a level is separated into parts 2q and 2q + 1 of the next.
+    """A recursive bisection of a graph: part q of a level is separated into parts 2q and 2q + 1 of the next."""
 
-    Attributes:
-        level: (n,) at which level each vertex belongs to a separator; what is separated no further, the cells, is the
-            last level.
-        part: (n,) the part of that level which it separates.
-        depth: the number of levels.
-    """
-
+    # at which level each vertex belongs to a separator; what is separated no further, the cells, is the last level
     level: Int[np.ndarray, " n"]
-    part: Int[np.ndarray, " n"]
-    depth: int
+    part: Int[np.ndarray, " n"]  # the part of that level which it separates
+    depth: int  # the number of levels
 
 
 def bisect_graph(n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> Parts:
@@ -78,9 +75,7 @@ def bisect_graph(n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"
         counts, depth = np.bincount(side[left], minlength=2 * counts.size), depth + 1
 
 
-def _banded(
-    n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]
-) -> tuple[Int[np.ndarray, " n"], csr_matrix]:
+def _banded(n: int, rows: Ints, cols: Ints) -> tuple[Ints, csr_matrix]:
     """Return an order of the vertices in which neighbours are near each other, in memory too, and the graph in it."""
     start = np.append(0, np.cumsum(np.bincount(rows, minlength=n)))
     graph = csr_matrix((np.ones(cols.size, np.int8), cols, start), shape=(n, n))
@@ -93,8 +88,7 @@ def _banded(
 # The gaps between components are as long as these are: with longer ones, one vertex of its own would turn the principal
 # axis of all others towards it.
 def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
-    """Return distances from landmarks, one in each component; components lie one after the other on an axis of their
-    own."""
+    """Return distances from landmarks, one in each component; components follow each other on an axis of their own."""
     n = graph.shape[0]
     count, label = connected_components(graph, directed=False)
     # The first in the order is far from the last; no distance is as large.
@@ -140,11 +134,8 @@ def _distances(graph: csr_matrix, roots: Int[np.ndarray, " r"]) -> Int[np.ndarra
     return distance[:n] - 1
 
 
-def _along_axes(
-    x: Float[np.ndarray, "n c"], q: Int[np.ndarray, " n"], counts: Int[np.ndarray, " parts"]
-) -> Int[np.ndarray, " n"]:
-    """Return an order in which the vertices of each part, which lie together, follow each other along its principal
-    axis."""
+def _along_axes(x: Float[np.ndarray, "n c"], q: Ints, counts: Ints) -> Ints:
+    """Return an order in which the vertices of each part, which lie together, follow its principal axis."""
     c, parts = x.shape[1], counts.size
     mean = np.stack([np.bincount(q, column, parts) for column in x.T], axis=1) / np.maximum(counts, 1)[:, None]
     centred = np.ascontiguousarray((x - np.repeat(mean.astype(x.dtype), counts, axis=0)).T)

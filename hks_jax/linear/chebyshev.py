@@ -12,28 +12,24 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ive
 
 from hks_jax.linear import accelerators, lapack
-from hks_jax.linear.products import aligned
+from hks_jax.linear.products import aligned, matmul
+
+_FAILURE = 1e-6
+_START = 30
+"""How far from uniform the start of a Lanczos bound may be: the root of the condition of PD and more."""
+
+Scalar = Float[Array, ""]
+Columns = Float[Array, "*shape b"]
 
 
 def chebyshev_recurrence(
-    product: Callable[[Any], Any],
-    x: Any,
-    degree: int,
-    total: Any = (),
-    add: Callable[[Any, Any, Any], Any] = lambda n, y, total: total,
+    product: Callable[[Any], Any],  # y ↦ Ay, the spectrum of A within [−1, 1]
+    x: Any,  # an array, or a tree of arrays
+    degree: int,  # at least 1; static
+    total: Any = (),  # what is to be gathered on the way
+    add: Callable[[Any, Any, Any], Any] = lambda n, y, total: total,  # (n, yₙ, total) ↦ the total with the term of yₙ
 ) -> tuple[Any, Any, Any]:
-    """Go through yₙ = Tₙ(A)x for n = 0, …, degree: y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁.
-
-    Args:
-        product: y ↦ Ay, the spectrum of A within [−1, 1].
-        x: an array, or a tree of arrays.
-        degree: at least 1; static.
-        total: what is to be gathered on the way.
-        add: (n, yₙ, total) ↦ the total with the term of yₙ.
-
-    Returns:
-        y of the degree, the one before, and the total.
-    """
+    """Go through yₙ = Tₙ(A)x, n = 0, …, degree: y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁; return the last two and the total."""
 
     def step(n: Array, state: tuple) -> tuple:
         y, before, total = state
@@ -53,25 +49,17 @@ def chebyshev_recurrence(
 #
 # `chebyshev_recurrence` would overflow where ζ is far from the interval, and has p(A), not q(A).
 def chebyshev_iteration(
-    product: Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]],
-    w: Float[Array, "*shape b"],
-    low: Float[Array, ""],
-    high: Float[Array, ""],
-    value: Float[Array, "*b"] | float,
-    degree: Int[Array, ""] | int,
-) -> Float[Array, "*shape b"]:
+    product: Callable[[Columns], Columns],
+    w: Columns,
+    low: Scalar,
+    high: Scalar,
+    value: Float[Array, "*b"] | float,  # ζ, outside the interval; a number for each column, or one for all
+    degree: Int[Array, ""] | int,  # of p
+) -> Columns:
     """Return q(A)w, where q(z) = (p(z)/p(ζ) − 1)/(z − ζ) and p is the Chebyshev polynomial of [low, high].
 
-    −q(A)w is what Chebyshev iteration makes of (A − ζ)x = w for a matrix A with its spectrum in the interval: the
-    residual is p(A)w/p(ζ).
-
-    Args:
-        product: z ↦ Az.
-        w: columns.
-        low: of the interval.
-        high: likewise.
-        value: ζ, outside the interval; a number for each column, or one for all.
-        degree: of p.
+    −q(A)w is what Chebyshev iteration makes of (A − ζ)x = w for a matrix A with its spectrum in the interval, given its
+    product: the residual is p(A)w/p(ζ).
     """
     centre, half = (high + low) / 2, (high - low) / 2
     s = (value - centre) / half
@@ -101,8 +89,8 @@ def chebyshev_iteration(
 
 # exp(−tλ) on 0 ≤ λ ≤ top has the coefficients e^(−z) Iₙ(z), z = t·top/2, twice that for n > 0, with alternating signs.
 @partial(jax.jit, static_argnames="degree")
-def heat_coefficients(
-    times: Float[Array, " m"], top: Float[Array, ""] | float, degree: int
+def chebyshev_heat_coefficients(
+    times: Float[Array, " m"], top: Scalar | float, degree: int
 ) -> Float[Array, "m {degree}+1"]:
     """Return the coefficients by the cosine transform of samples, whose derivatives JAX knows."""
     samples = degree + 32 + 4 * math.isqrt(degree)  # aliasing brings in coefficients from 2·samples − degree on
@@ -110,7 +98,7 @@ def heat_coefficients(
     weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
     weights[:, 0] /= 2
     values = jnp.exp(-times[:, None] * top * jnp.asarray((1 + np.cos(angles)) / 2, times.dtype))
-    return jnp.matmul(values, jnp.asarray(weights, times.dtype), precision="highest")
+    return matmul(values, jnp.asarray(weights, times.dtype))
 
 
 def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:
@@ -129,11 +117,6 @@ def least_degree(z: float, error: float) -> int:
     return max(int(np.argmax(coefficient_tails(z) <= error)) - 1, 1)
 
 
-_FAILURE = 1e-6
-_START = 30
-"""How far from uniform the start may be: the root of the condition of PD and more."""
-
-
 @jax.jit
 def gershgorin(entries: Float[Array, "offsets *shape"], inverse: Float[Array, "*shape"]) -> Float[Array, ""]:
     """Return the bound of Gershgorin's discs, which never fails, on D⁻¹K: K's entries row by row, and D⁻¹."""
@@ -141,20 +124,17 @@ def gershgorin(entries: Float[Array, "offsets *shape"], inverse: Float[Array, "*
 
 
 def lanczos_bound(
-    apply: Callable[[Array], Array], solve: Callable[[Array], Array], sums: Float[Array, "..."], n: int, steps: int
-) -> Float[Array, ""]:
+    apply: Callable[[Array], Array],  # x ↦ Kx
+    solve: Callable[[Array], Array],  # r ↦ Pr
+    sums: Float[Array, "..."],  # D ≈ P⁻¹, a diagonal, of the shape of x; 0 where there is no degree of freedom
+    n: int,  # how many degrees of freedom there are
+    steps: int,
+) -> Scalar:
     """Return an upper bound on the eigenvalues of PK by Lanczos iteration.
 
     From a random start the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ but for a probability of
     1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2): θ/(1 − ε) is returned for the ε that
     makes this 10⁻⁶. The start is normal in the coordinates of D, not quite those of P, which is allowed for.
-
-    Args:
-        apply: x ↦ Kx.
-        solve: r ↦ Pr.
-        sums: D ≈ P⁻¹, a diagonal; 0 where there is no degree of freedom. Of the shape of x.
-        n: how many degrees of freedom there are.
-        steps: k.
     """
     r = jnp.sqrt(sums) * jax.random.normal(jax.random.key(0), sums.shape, sums.dtype)
 

@@ -13,32 +13,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.linear.accelerators import kernels_agree, padded_size
+from hks_jax.linear import accelerators
 
 LARGEST = 32
 """Columns of the widest blocks."""
-
 _SMALLEST = 8
 _NUMBERS = 1 << 13
 """Numbers of which a program keeps sums at once."""
 _PARTS, _ROWS = 256, 512
 """Parts of a sum at most, and rows of each at least."""
 
+Block = Float[Array, "n b"]
+Small = Float[Array, "b b"]
+Parts = Float[Array, "parts b b"]
+"""Parts of a small matrix, to be added up."""
 
-def parts_of_products(
-    x: Float[Array, "n b"], y: Float[Array, "n b"], interpret: bool = False
-) -> Float[Array, "parts b b"]:
-    """Return xᵀy in parts, to be added up.
 
-    Args:
-        x: columns.
-        y: as many.
-        interpret: whether to run on any device by XLA's operations instead, for tests.
-    """
+def parts_of_products(x: Block, y: Block) -> Parts:
+    """Return xᵀy."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    (n, b), size = x.shape, padded_size(x.shape[1], _SMALLEST)
+    (n, b), size = x.shape, accelerators.padded_size(x.shape[1], _SMALLEST)
     tile = max(_NUMBERS // size**2, 1)
     parts, rows = _divided(n, tile)
 
@@ -65,26 +61,15 @@ def parts_of_products(
         out_specs=pl.BlockSpec((None, size, size), lambda i: (i, 0, 0)),
         out_shape=jax.ShapeDtypeStruct((parts, b, b), x.dtype),
         compiler_params=triton.CompilerParams(num_warps=8, num_stages=1),
-        interpret=interpret,
+        interpret=accelerators.INTERPRETED,
         name="parts_of_products",
     )(x, y)
 
 
-def remainder(
-    x: Float[Array, "n b"],
-    block: Float[Array, "n b"],
-    parts: Float[Array, "parts b b"],
-    before: tuple[Float[Array, "n b"], Float[Array, "b b"]] | None = None,
-    interpret: bool = False,
-) -> tuple[Float[Array, "n b"], Float[Array, "b b"]]:
-    """Return x less the block times D, and D.
+def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] | None = None) -> tuple[Block, Small]:
+    """Return x less the block times D, and D, which comes in parts.
 
-    Args:
-        x: columns.
-        block: what they have of these is taken away.
-        parts: D in parts.
-        before: another block and its coefficients, of which x loses the product too; D is then made symmetric.
-        interpret: whether to run on any device by XLA's operations instead, for tests.
+    With another block and its coefficients ``before``, x loses their product too, and D is made symmetric.
     """
     columns, matrices = ((x, block), ()) if before is None else ((x, block, before[0]), before[1:])
 
@@ -92,26 +77,17 @@ def remainder(
         total = (total + total.T) / 2 if matrices else total
         return [[(0, None), (1, -total), *((2, -matrix) for matrix in matrices)]], total
 
-    (rest,), total = _combined(small, parts, matrices, columns, 1, interpret, "remainder")
+    (rest,), total = _combined(small, parts, matrices, columns, 1, "remainder")
     return rest, total
 
 
-def orthonormal(
-    parts: Float[Array, "parts b b"],
-    columns: tuple[Float[Array, "n b"], ...],
-    before: Float[Array, "b b"],
-    interpret: bool = False,
-) -> tuple[tuple[Float[Array, "n b"], ...], Float[Array, "b b"]]:
-    """Return columns times F⁻ᵀ, and a matrix times F, where FFᵀ = G: with G = xᵀMx the columns xF⁻ᵀ are M-orthonormal.
+def orthonormal(parts: Parts, columns: tuple[Block, ...], before: Small) -> tuple[tuple[Block, ...], Small]:
+    """Return columns times F⁻ᵀ, and a matrix times F, where FFᵀ = G, which comes in parts and has at most 32 rows.
+
+    With G = xᵀMx the columns xF⁻ᵀ are M-orthonormal.
 
     For F the columns are scaled to length one, and taken in the order of what the ones before leave of them; of those
     that depend on the ones before, to rounding, the least length that rounding tells from zero is kept.
-
-    Args:
-        parts: G in parts, at most 32 rows.
-        columns: one or several blocks.
-        before: the matrix.
-        interpret: whether to run on any device by XLA's operations instead, for tests.
     """
     b = len(before)
     floor = b * float(jnp.finfo(before.dtype).eps)
@@ -126,28 +102,28 @@ def orthonormal(
         change = inverted / norms[:, None]
         return [[(number, change)] for number in range(len(columns))], _product(before, norms[:, None] * lower)
 
-    return _combined(small, parts, (before,), columns, len(columns), interpret, "orthonormal")
+    return _combined(small, parts, (before,), columns, len(columns), "orthonormal")
 
 
-def agree(dtype: Any, interpret: bool = False) -> bool:
+def agree(dtype: Any) -> bool:
     """Return whether these kernels compute on this GPU what they should; see `accelerators.kernels_agree`."""
 
     def compare() -> list[tuple[Any, Any]]:
         rng, n, b = np.random.default_rng(0), 3 * _ROWS + 5, 7
         x, y, z = (rng.standard_normal((n, b)).astype(dtype) for _ in range(3))
         mix = rng.standard_normal((b, b)).astype(dtype)
-        parts = parts_of_products(jnp.asarray(x), jnp.asarray(y), interpret)
+        parts = parts_of_products(jnp.asarray(x), jnp.asarray(y))
         products = (x.T @ y + y.T @ x) / 2
-        rest, total = remainder(jnp.asarray(x), jnp.asarray(y), parts, (jnp.asarray(z), jnp.asarray(mix)), interpret)
+        rest, total = remainder(jnp.asarray(x), jnp.asarray(y), parts, (jnp.asarray(z), jnp.asarray(mix)))
         found = [(np.sum(np.asarray(parts), axis=0), x.T @ y), (total, products)]
         found.append((rest, x - y @ products - z @ mix))
-        squares = parts_of_products(jnp.asarray(x), jnp.asarray(x), interpret)
-        (unit,), factor = orthonormal(squares, (jnp.asarray(x),), jnp.asarray(np.eye(b, dtype=dtype)), interpret)
+        squares = parts_of_products(jnp.asarray(x), jnp.asarray(x))
+        (unit,), factor = orthonormal(squares, (jnp.asarray(x),), jnp.asarray(np.eye(b, dtype=dtype)))
         # By NumPy: on GPUs JAX multiplies matrices in single precision with three digits.
         q, r = np.asarray(unit), np.asarray(factor).T
         return [*found, (q.T @ q, np.eye(b, dtype=dtype)), (q @ r, x)]
 
-    return kernels_agree("block Lanczos", dtype, compare)
+    return accelerators.kernels_agree("block Lanczos", dtype, compare)
 
 
 _Terms = list[list[tuple[int, Array | None]]]
@@ -156,18 +132,17 @@ _Terms = list[list[tuple[int, Array | None]]]
 
 def _combined(
     small: Callable[..., tuple[_Terms, Array]],
-    parts: Float[Array, "parts b b"],
-    matrices: tuple[Float[Array, "b b"], ...],
-    columns: tuple[Float[Array, "n b"], ...],
+    parts: Parts,
+    matrices: tuple[Small, ...],
+    columns: tuple[Block, ...],
     wanted: int,
-    interpret: bool,
     name: str,
-) -> tuple[tuple[Float[Array, "n b"], ...], Float[Array, "b b"]]:
+) -> tuple[tuple[Block, ...], Small]:
     """Return combinations of blocks of columns, and a small matrix, as computed from a sum in parts and matrices."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    (n, b), size, dtype = columns[0].shape, padded_size(columns[0].shape[1], _SMALLEST), parts.dtype
+    (n, b), size, dtype = columns[0].shape, accelerators.padded_size(columns[0].shape[1], _SMALLEST), parts.dtype
     tile, several = max(_NUMBERS // size**2, 1), max(_NUMBERS // size**2 // 8, 1)
     programs, rows = _divided(n, tile)
 
@@ -215,7 +190,7 @@ def _combined(
         out_specs=[*[block] * wanted, whole],
         out_shape=[*[jax.ShapeDtypeStruct((n, b), dtype)] * wanted, jax.ShapeDtypeStruct((b, b), dtype)],
         compiler_params=triton.CompilerParams(num_warps=8, num_stages=1),
-        interpret=interpret,
+        interpret=accelerators.INTERPRETED,
         name=name,
     )(parts, *matrices, *columns)
     return tuple(results), matrix
@@ -243,9 +218,7 @@ def _product(x: Float[Array, "m s"], y: Float[Array, "s s"]) -> Float[Array, "m 
     return jnp.sum(x[:, :, None] * y[None, :, :], axis=1)
 
 
-def _pivoted_cholesky(
-    a: Float[Array, "n n"], floor: float, rank: int
-) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+def _pivoted_cholesky(a: Small, floor: float, rank: int) -> tuple[Small, Small]:
     """Return F with FFᵀ = A but for pivots that are raised to the floor, and F⁻ᵀ; the first ``rank`` columns of both.
 
     The k-th column of C = F⁻ᵀ follows from CFᵀ = I, whose column for the k-th row p chosen has no terms beyond: F[p, k]
@@ -263,10 +236,8 @@ def _pivoted_cholesky(
         before = jnp.sum(jnp.where(chosen[:, None], factor, 0), axis=0)
         its_inverse = (chosen.astype(a.dtype) - jnp.sum(inverse * before[None, :], axis=1)) / root
         is_pivot = (index == k)[None, :]
-        factor, inverse = (
-            jnp.where(is_pivot, column[:, None], factor),
-            jnp.where(is_pivot, its_inverse[:, None], inverse),
-        )
+        factor = jnp.where(is_pivot, column[:, None], factor)
+        inverse = jnp.where(is_pivot, its_inverse[:, None], inverse)
         return a - column[:, None] * column[None, :], jnp.where(chosen, 0, left), factor, inverse
 
     # What is beyond the matrix is never chosen.

@@ -7,11 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from hks_jax.linear.loops import when, while_loop
-from hks_jax.linear.products import products_with_columns, times
+from hks_jax.linear.products import matmul, products_with_columns
 
 Array = Any
 """NumPy's or JAX's, the same for all arguments and the result."""
-
 _MOST_STEPS = 200
 _RESTARTS = 3
 _KEPT, _MEMORY = 400, 4e8
@@ -19,19 +18,23 @@ _KEPT, _MEMORY = 400, 4e8
 
 
 class Solution(NamedTuple):
-    """What conjugate gradients have come to.
+    """The state of conjugate gradients for one block of columns; r and p are zero for those that are done."""
 
-    Attributes:
-        x: the solutions so far; NaN where a product is.
-        errors: estimates of their relative errors, in units of those wanted; above 1 an iteration did not converge.
-        rhs: the right-hand sides.
-        steps: how many there were.
-    """
-
-    x: Float[Array, "n b"]
-    errors: Float[Array, " b"]
-    rhs: Float[Array, "n b"]
-    steps: Int[Array, ""]
+    x: Float[Array, "n b"]  # the solutions so far; at the end NaN where a product is
+    rhs: Float[Array, "n b"]  # the right-hand sides
+    r: Float[Array, "n b"]  # their residuals
+    z: Float[Array, "n b"]  # these, preconditioned
+    p: Float[Array, "n b"]  # the next directions
+    first: Float[Array, " b"]  # rᵀz at the beginning,
+    energy: Float[Array, " b"]  # and now
+    change: Float[Array, " b"]  # the energy relative to that before
+    errors: Float[Array, " b"]  # estimates, relative, in units of those wanted; above 1 an iteration did not converge
+    going: Bool[Array, " b"]  # which columns go on
+    fresh: Bool[Array, ""]  # whether the next step is the first, or the first after a restart
+    starts: Int[Array, ""]  # how many restarts there were
+    steps: Int[Array, ""]  # how many steps; −1 before the right-hand side is known
+    # the residuals of all steps, divided by √(rᵀz), and z likewise; None where none are kept
+    kept: tuple[Float[Array, "m n"], Float[Array, "m n"]] | None
 
     @property
     def converged(self) -> Float[Array, "n b"]:
@@ -40,68 +43,27 @@ class Solution(NamedTuple):
         return xp.where(self.errors <= 1, self.x, xp.nan)
 
 
-class _Iteration(NamedTuple):
-    """The state of conjugate gradients for one block of columns; r and p are zero for those that are done.
-
-    Attributes:
-        x: the solutions so far.
-        rhs: the right-hand sides.
-        r: their residuals.
-        z: these, preconditioned.
-        p: the next directions.
-        first: rᵀz at the beginning,
-        energy: and now.
-        change: the energy relative to that before.
-        errors: see `Solution`.
-        going: which columns go on.
-        fresh: whether the next step is the first, or the first after a restart.
-        starts: how many restarts there were.
-        steps: how many steps; −1 before the right-hand side is known.
-        kept: the residuals of all steps, divided by √(rᵀz), and z likewise; None where none are kept.
-    """
-
-    x: Float[Array, "n b"]
-    rhs: Float[Array, "n b"]
-    r: Float[Array, "n b"]
-    z: Float[Array, "n b"]
-    p: Float[Array, "n b"]
-    first: Float[Array, " b"]
-    energy: Float[Array, " b"]
-    change: Float[Array, " b"]
-    errors: Float[Array, " b"]
-    going: Bool[Array, " b"]
-    fresh: Bool[Array, ""]
-    starts: Int[Array, ""]
-    steps: Int[Array, ""]
-    kept: tuple[Float[Array, "m n"], Float[Array, "m n"]] | None
-
-
 def _dot(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
     return (x * y).sum(axis=0)
 
 
 def conjugate_gradients(
-    product: Callable[..., tuple[Array, Array]],
-    precondition: Callable[[Array], Array],
+    product: Callable[..., tuple[Array, Array]],  # x ↦ Aᵢxᵢ, and the energies below which Aᵢ counts as singular
+    precondition: Callable[[Array], Array],  # r ↦ an approximation of Aᵢ⁻¹rᵢ
     rhs: Float[Array, "n b"],
-    wanted: Float[Array, " b"],
+    wanted: Float[Array, " b"],  # the error in the energy norm, relative; columns of which it is infinite stay zero
     inner: Callable[[Array, Array], Array] = _dot,
     clean: Callable[[Array], Array] | None = None,
-    most: Int[Array, ""] | int = _MOST_STEPS,
+    most: Int[Array, ""] | int = _MOST_STEPS,  # steps after which to stop all the same
     orthogonal: bool = False,
 ) -> Solution:
     """Solve Aᵢxᵢ = rhsᵢ for a block of columns.
 
     Args:
-        product: x ↦ Aᵢxᵢ, and for each column the energy xᵢᵀAᵢxᵢ below which Aᵢ counts as singular.
-        precondition: r ↦ an approximation of Aᵢ⁻¹rᵢ.
-        rhs: the right-hand sides.
-        wanted: the error in the energy norm, relative; columns of which it is infinite stay zero.
         inner: the inner products (b,) of two blocks of columns, with respect to which all Aᵢ and the preconditioner are
             symmetric and positive definite; energies are measured with it.
         clean: x ↦ its part in the subspace in which all this is so. Where rounding has led out of it, which an energy
             that is not positive tells, the iteration starts again from there.
-        most: steps after which to stop all the same.
         orthogonal: for one ill-conditioned matrix whose products are dear; b = 1, in JAX. Residuals stay orthogonal in
             spite of rounding. ``product(x, first)`` then returns the right-hand side where ``first``, so that what it
             has in common with Ax is compiled once, and of ``rhs`` the shape counts.
@@ -116,7 +78,7 @@ def conjugate_gradients(
     def relative(energy: Array, first: Array) -> Array:
         return xp.sqrt(xp.abs(energy) / xp.where(first > 0, first, 1)) / wanted
 
-    def direct(state: _Iteration) -> _Iteration:
+    def direct(state: Solution) -> Solution:
         z = precondition(state.r)
         energy, begin = inner(state.r, z), state.steps == 0
         change = xp.where(state.going & ~state.fresh, energy / state.energy, 0)
@@ -124,7 +86,7 @@ def conjugate_gradients(
         z = z if orthogonal else state.z
         return state._replace(z=z, p=p, first=xp.where(begin, energy, state.first), energy=energy, change=change)
 
-    def advance(state: _Iteration) -> tuple[_Iteration, Bool[Array, " b"]]:
+    def advance(state: Solution) -> tuple[Solution, Bool[Array, " b"]]:
         p, begin = state.p, state.steps < 0
         image, least = product(p, begin) if orthogonal else product(p)
         curvature = inner(p, image)
@@ -142,7 +104,7 @@ def conjugate_gradients(
             # first was known first.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
-            r = r - times(kept[0].T, products_with_columns(kept[1], r))
+            r = r - matmul(kept[0].T, products_with_columns(kept[1], r))
         if clean is not None:
             again = xp.any(state.going & ~regular) & ~state.fresh & (state.starts < _RESTARTS)
             x, r = when(again, restarted, (x, r))
@@ -150,7 +112,7 @@ def conjugate_gradients(
         starts = state.starts + xp.where(again, 1, 0)
         return state._replace(x=x, r=r, rhs=rhs, fresh=again, starts=starts, steps=state.steps + 1, kept=kept), regular
 
-    def step(before: _Iteration) -> _Iteration:
+    def step(before: Solution) -> Solution:
         if orthogonal:
             state, regular = advance(before)
             state = direct(state)
@@ -169,7 +131,7 @@ def conjugate_gradients(
 
     asked, one, zero = xp.isfinite(wanted), xp.ones_like(wanted), xp.zeros_like(rhs)
     room = max(min(n, _KEPT, int(_MEMORY / (2 * n * rhs.dtype.itemsize))), 1)
-    start = _Iteration(
+    start = Solution(
         x=zero,
         rhs=rhs,
         r=zero if orthogonal else xp.where(asked, rhs, 0),
@@ -187,4 +149,4 @@ def conjugate_gradients(
     )
     end = while_loop(lambda state: xp.any(state.going) & (state.steps < most), step, start)
     failed = xp.isnan(end.errors) & (most > 0)
-    return Solution(xp.where(failed, xp.nan, end.x), end.errors, end.rhs, end.steps)
+    return end._replace(x=xp.where(failed, xp.nan, end.x))

@@ -18,27 +18,23 @@ from hks_jax.linear.bisection import within_groups
 from hks_jax.linear.elimination_tree import Level, Merged, merged
 from hks_jax.linear.pattern import Pattern
 
+Ints = Int[np.ndarray, " _"]
+
 
 class Dissection(NamedTuple):
-    """The elimination tree.
+    """The elimination tree."""
 
-    Attributes:
-        levels: from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1.
-        order: (n_dof,) the place of each degree of freedom among the levels' own nodes, concatenated.
-        entries: (m,) the matrix entries, as indices into the array of entries; None: all of them, in order.
-        places: (m,) their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column,
-            unless its row is eliminated before. Out of range, where all are listed, for those that are not needed:
-            of two that are equal by symmetry one is enough.
-        padding: (p,) the places of the diagonal entries that belong to no node.
-        merged: what solves go along on accelerators; None where it is the tree itself.
-    """
-
+    # from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1
     levels: tuple[Level, ...]
-    order: Int[np.ndarray, " n_dof"]
+    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' own nodes, concatenated
+    # the matrix entries, as indices into the array of entries; None: all of them, in order
     entries: Int[np.ndarray, " m"] | None
+    # their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column, unless its row
+    # is eliminated before. Out of range, where all are listed, for those that are not needed: of two that are equal by
+    # symmetry one is enough
     places: Int[np.ndarray, " m"]
-    padding: Int[np.ndarray, " p"]
-    merged: Merged | None
+    padding: Int[np.ndarray, " p"]  # the places of the diagonal entries that belong to no node
+    merged: Merged | None  # what solves go along on accelerators; None where it is the tree itself
 
 
 def dissect(pattern: Pattern) -> Dissection:
@@ -113,9 +109,7 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     )
 
 
-def _listed(
-    entries: Int[np.ndarray, " m"], places: Int[np.ndarray, " m"], number: int, end: int
-) -> tuple[Int[np.ndarray, " m"] | None, Int[np.ndarray, " m_or_number"]]:
+def _listed(entries: Ints, places: Ints, number: int, end: int) -> tuple[Ints | None, Ints]:
     """Return entries and their places, or the places of all: whichever takes less memory; ``end`` is out of range."""
     others = number - entries.size
     if others > entries.size or end + others > np.iinfo(np.int32).max:
@@ -126,7 +120,7 @@ def _listed(
     return None, of_all
 
 
-def _own_nodes(level: np.ndarray, front: np.ndarray, depth: int) -> tuple[list[np.ndarray], np.ndarray]:
+def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], Ints]:
     """Return for each level the nodes of its fronts, (fronts, s), and the place of every node in its front."""
     n, own, slot = level.size, [], np.zeros(level.size, np.int32)
     for number in range(depth):
@@ -139,9 +133,7 @@ def _own_nodes(level: np.ndarray, front: np.ndarray, depth: int) -> tuple[list[n
     return own, slot
 
 
-def _boundaries(
-    level: np.ndarray, front: np.ndarray, depth: int, rows: np.ndarray, cols: np.ndarray
-) -> list[np.ndarray]:
+def _boundaries(level: Ints, front: Ints, depth: int, rows: Ints, cols: Ints) -> list[Ints]:
     """Return for each level the boundary nodes of its fronts as sorted keys front·n + node.
 
     They are what the front's own nodes are coupled to above it, as rows and columns say, and what it inherits from its

@@ -29,17 +29,13 @@ class Level(NamedTuple):
     """The fronts of one level: each eliminates its own s nodes, and is coupled to r boundary nodes eliminated later.
 
     Where a front has fewer, indices are padded with the first number that is out of range.
-
-    Attributes:
-        own: (fronts, s) the degrees of freedom eliminated.
-        boundary: (fronts, r) the places of the boundary nodes among the (fronts, s + r) nodes of the level above.
-        children: (c, fronts, s + r) the places of the front's nodes among the (fronts, r) boundary nodes of the level
-            below, as often as nodes have such places: in an elimination tree those of the first child, and those of
-            the second. Empty for cells.
     """
 
-    own: Int[np.ndarray, "fronts s"]
+    own: Int[np.ndarray, "fronts s"]  # the degrees of freedom eliminated
+    # the places of the boundary nodes among the (fronts, s + r) nodes of the level above
     boundary: Int[np.ndarray, "fronts r"]
+    # the places of the front's nodes among the (fronts, r) boundary nodes of the level below, as often as nodes have
+    # such places: in an elimination tree those of the first child, and those of the second. Empty for cells
     children: Int[np.ndarray, "c fronts s_plus_r"]
 
     @property
@@ -50,20 +46,15 @@ class Level(NamedTuple):
 
 
 class Merged(NamedTuple):
-    """What solves go along in place of the elimination tree.
+    """What solves go along in place of the elimination tree."""
 
-    Attributes:
-        levels: the merged levels.
-        order: (n_dof,) the place of each degree of freedom among the levels' own nodes, concatenated.
-        rows: for each merged level, and each level of the tree merged in it, where its own nodes (fronts, s) are among
-            those of the merged level; out of range for padding.
-        places: for each merged level, where its own nodes (fronts, s) are among those of its levels of the tree,
-            concatenated; out of range for padding.
-    """
-
-    levels: tuple[Level, ...]
-    order: Int[np.ndarray, " n_dof"]
+    levels: tuple[Level, ...]  # the merged levels
+    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' own nodes, concatenated
+    # for each merged level, and each level of the tree merged in it, where its own nodes (fronts, s) are among those of
+    # the merged level; out of range for padding
     rows: tuple[tuple[Int[np.ndarray, "_fronts _s"], ...], ...]
+    # for each merged level, where its own nodes (fronts, s) are among those of its levels of the tree, concatenated;
+    # out of range for padding
     places: tuple[Int[np.ndarray, "_fronts _s"], ...]
 
 

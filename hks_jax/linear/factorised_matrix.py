@@ -65,7 +65,6 @@ class FactorisedMatrix(eqx.Module):
     error: Float[Array, ""]
 
     def __repr__(self) -> str:
-        """Return one line."""
         return f"FactorisedMatrix(size={self.size}, dtype={self.matrix.dtype})"
 
     @property
@@ -119,7 +118,7 @@ class FactorisedMatrix(eqx.Module):
         """
         return self._unless_replaced(_inverse_diagonal)
 
-    def _unless_replaced(self, function: Callable[[PatternedOperator, Factorisation], Array]) -> Array:
+    def _unless_replaced(self, function: Callable[[Array, Factorisation], Array]) -> Array:
         if not is_traced(self.error) and self.sound:
             if jnp.isinf(self.error):
                 raise ValueError(
@@ -131,7 +130,7 @@ class FactorisedMatrix(eqx.Module):
                     f"matrix: rounding in {self.matrix.dtype} leaves an error of about {float(self.error):.1g} in "
                     "log|det A|, and relative in the inverse. Use float64, or shift A a little"
                 )
-        return _nan_unless(jnp.isfinite(self.error), function(self.matrix, jax.lax.stop_gradient(self.factor)))
+        return _nan_unless(jnp.isfinite(self.error), function(self.matrix.flat(), jax.lax.stop_gradient(self.factor)))
 
 
 def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -140,14 +139,10 @@ def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Arra
 
 
 def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMatrix:
-    """Factorise a symmetric matrix.
-
-    Args:
-        matrix: A; only the lower or upper of two entries that are equal by symmetry is read.
-        name: what errors call it.
+    """Factorise a symmetric matrix A, of which only the lower or upper of two entries equal by symmetry is read.
 
     Raises:
-        ValueError: A, concrete, is not finite or singular, with its null vectors.
+        ValueError: A, concrete, is not finite or singular, with its null vectors; by the name given.
     """
     ones = jnp.ones(matrix.size, matrix.dtype)
     pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))
@@ -198,7 +193,7 @@ def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
     size = min(_SEARCHED, pencil.size)
     x = np.random.default_rng(0).standard_normal((pencil.size, size)).astype(entries.dtype)
     for _ in range(_TURNS):
-        x = np.linalg.qr(np.nan_to_num(np.asarray(x - factor.solve_columns(product(jnp.asarray(x))))))[0]
+        x = np.linalg.qr(np.nan_to_num(np.asarray(x - factor.solve(product(jnp.asarray(x))))))[0]
     sizes = np.linalg.svd(np.asarray(product(jnp.asarray(x))), compute_uv=False) / norm
     null = sizes <= _NULL * np.finfo(entries.dtype).eps
     if not null.any():
@@ -243,14 +238,14 @@ def _refined(
 
     def again(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         x, rest, error, _ = state
-        new = measured(x + factor.solve_columns(rest))
+        new = measured(x + factor.solve(rest))
         x, rest, least = (jnp.where(new[2] < error, *both) for both in zip(new, state[:3], strict=True))
         return x, rest, least, least < error / 2
 
     def goes_on(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
         return (state[2] > _BACKWARD * finfo.eps) & state[3]
 
-    return jax.lax.while_loop(goes_on, again, (*measured(factor.solve_columns(b)), jnp.ones((), bool)))[0]
+    return jax.lax.while_loop(goes_on, again, (*measured(factor.solve(b)), jnp.ones((), bool)))[0]
 
 
 def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated:
@@ -298,11 +293,5 @@ def _log_of_pivots_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return _log_of_pivots(matrix, factor), jnp.vdot(slope, listed)
 
 
-@jax.jit
-def _log_determinant(matrix: PatternedOperator, factor: Factorisation) -> Float[Array, ""]:
-    return _log_of_pivots(matrix.flat(), factor)
-
-
-@jax.jit
-def _inverse_diagonal(matrix: PatternedOperator, factor: Factorisation) -> Float[Array, " n"]:
-    return _inverse(True, matrix.flat(), factor)
+_log_determinant = jax.jit(_log_of_pivots)
+_inverse_diagonal = jax.jit(partial(_inverse, True))

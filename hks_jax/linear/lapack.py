@@ -15,66 +15,70 @@ computation of this package calls LAPACK through this file, matrix by matrix, an
 threads that do its work.
 """
 
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Inexact
 
-from hks_jax.linear.batches import one_by_one
+from hks_jax.linear.loops import one_by_one
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
+def _matrix_by_matrix(function: Callable[P, T]) -> Callable[P, T]:
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        return one_by_one(function, (), *args)
+
+    return call
+
+
+@_matrix_by_matrix
 def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Return the eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors in columns.
 
     Only the lower triangle is read. Not differentiable, as is nothing here: `hks_jax.linear.dense_eigh` has the rule.
     """
-    return one_by_one(_eigh, (), a)
-
-
-def _eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False)
     return values, vectors
 
 
+@_matrix_by_matrix
 def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return the lower triangular L of A = LLᵀ, computed from A's lower triangle; NaN where A is not definite."""
-    return one_by_one(_cholesky, (), a)
-
-
-def _cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jax.lax.linalg.cholesky(a, symmetrize_input=False)
 
 
-def triangular_solve(
-    factor: Float[Array, "n n"], columns: Float[Array, "n m"], transpose: bool = False
-) -> Float[Array, "n m"]:
-    """Return L⁻¹, or L⁻ᵀ, times the columns, L lower triangular."""
-    return one_by_one(_triangular_solve, (transpose,), factor, columns)
+@_matrix_by_matrix
+def triangular_solve(factor: Float[Array, "n n"], columns: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """Return L⁻¹ times the columns, L lower triangular."""
+    return jax.lax.linalg.triangular_solve(factor, columns, left_side=True, lower=True)
 
 
-def _triangular_solve(
-    transpose: bool, factor: Float[Array, "n n"], columns: Float[Array, "n m"]
-) -> Float[Array, "n m"]:
-    return jax.lax.linalg.triangular_solve(factor, columns, left_side=True, lower=True, transpose_a=transpose)
+@_matrix_by_matrix
+def transposed_solve(factor: Float[Array, "n n"], columns: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """Return L⁻ᵀ times the columns, L lower triangular."""
+    return jax.lax.linalg.triangular_solve(factor, columns, left_side=True, lower=True, transpose_a=True)
 
 
+@_matrix_by_matrix
 def inverse_cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return L⁻¹ of A = LLᵀ; NaN where A is not definite."""
-    return one_by_one(_inverse_cholesky, (), a)
+    factor = jax.lax.linalg.cholesky(a, symmetrize_input=False)
+    return jax.lax.linalg.triangular_solve(factor, jnp.eye(len(a), dtype=a.dtype), left_side=True, lower=True)
 
 
-def _inverse_cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    return _triangular_solve(False, _cholesky(a), jnp.eye(len(a), dtype=a.dtype))
-
-
+@_matrix_by_matrix
 def inverse(a: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
     """Return A⁻¹, A real or complex."""
-    return one_by_one(jnp.linalg.inv, (), a)
+    return jnp.linalg.inv(a)
 
 
+@_matrix_by_matrix
 def orthonormal_columns(a: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Return Q of A = QR, n ≥ m."""
-    return one_by_one(_orthonormal_columns, (), a)
-
-
-def _orthonormal_columns(a: Float[Array, "n m"]) -> Float[Array, "n m"]:
     return jnp.linalg.qr(a)[0]

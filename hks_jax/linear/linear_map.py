@@ -1,8 +1,11 @@
-"""Linear maps within rules of derivatives, which have such rules themselves: for second derivatives in any order."""
+"""What rules of derivatives are made of: linear maps with rules of their own, for second derivatives in any order.
+
+And guards where differentiating a rule once more would give wrong numbers.
+"""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +14,7 @@ LinearMap = Callable[[Any, Any, Any], Any]
 """f(at, constants, x), linear in x; all are pytrees of arrays."""
 Derivative = Callable[[Any, Any, Any, Any], Any]
 """f(at, change of at, constants, x), bilinear in the change and in x."""
+Tree = TypeVar("Tree")
 
 
 # In reverse mode JAX replaces a function that has a custom rule by its body, as soon as the function is linear in an
@@ -35,13 +39,10 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
 
 
 def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any], x: Any, at: Any = ()) -> Any:
-    """Return ``forward(x)``, linear in x, whose transpose is ``backward``; JAX itself transposes neither.
+    """Return y = ``forward(x)``, linear in x, whose transpose is ``backward``; JAX itself transposes neither.
 
-    Args:
-        forward: maps x to y, pytrees of floating point arrays.
-        backward: maps y to x.
-        x: its argument.
-        at: other arguments of the two, by which they are differentiated in rules of their own.
+    Both x and y are pytrees of floating point arrays. By other arguments of the two, ``at``, they are differentiated in
+    rules of their own.
     """
 
     # JAX transposes a solve all of whose right-hand side depends on what is linearised: x, or `at`.
@@ -93,3 +94,32 @@ def _backward_jvp(function: LinearMap, derivative: Derivative, primals: tuple, t
     (of_function,) = jax.linear_transpose(partial(function, at, constants), like)(d_y)
     tangent = jax.tree.map(jnp.add, of_derivative, of_function)
     return _backward(function, derivative, at, constants, like, y), tangent
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def not_differentiable(message: str, tree: Tree) -> Tree:
+    """Return ``tree`` unchanged; differentiating it raises NotImplementedError with this message."""
+    return tree
+
+
+@not_differentiable.defjvp
+def _refuse(message: str, primals: tuple, tangents: tuple) -> NoReturn:
+    raise NotImplementedError(message)
+
+
+_MESSAGE = (
+    "second derivatives of eigenpairs and of their signatures with respect to the tensors, the vertices or the "
+    "pencil are not implemented. First derivatives are, and their derivatives with respect to times and other "
+    "parameters of the filter (in the other order, with jax.jvp for the inner one). For a Hessian use Gauss-Newton "
+    "products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
+)
+
+
+def first_order_only(tree: Tree) -> Tree:
+    """Return ``tree`` unchanged; differentiating it raises NotImplementedError.
+
+    The rules for eigenpairs and spectral functions hold at eigenpairs. Along a path their ingredients would have to
+    rotate within multiple eigenvalues in a way that first derivatives do not know, so that differentiating the rules
+    gives wrong numbers there. An error is better.
+    """
+    return not_differentiable(_MESSAGE, tree)

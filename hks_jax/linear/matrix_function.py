@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.linear import lapack
-from hks_jax.linear.linear_map import linear_map
-from hks_jax.linear.not_differentiable import not_differentiable
-from hks_jax.linear.standard_form import checked_standard_form, transposed_solve
+from hks_jax.linear.dense_eigh import checked_standard_form, transposed_solve
+from hks_jax.linear.linear_map import linear_map, not_differentiable
+from hks_jax.linear.products import matmul
 from hks_jax.signatures.filters import divided_difference, second_divided_difference
 
 Matrix = Float[Array, "n n"]
@@ -118,14 +118,14 @@ def _first(f: Function, at: Any, constants: Any, change: Any) -> Matrix:
     (parameters, _), (others, values, vectors, table) = not_differentiable(_THIRD, at), constants
     d_parameters, d_a = change
     along = _along(f, parameters, others, d_parameters)
-    return _compose(vectors, table * _into(vectors, d_a) + jnp.diag(along(values)))
+    return _compose(vectors, table * matmul(vectors.T, d_a, vectors) + jnp.diag(along(values)))
 
 
 def _second(f: Function, at: Any, one: Any, constants: Any, two: Any) -> Matrix:
     """Return the second derivative of f(A) along two changes of (parameters, A)."""
     (parameters, _), (others, values, vectors, table) = not_differentiable(_THIRD, at), constants
     (d_one, a_one), (d_two, a_two) = one, two
-    g, h = _into(vectors, a_one), _into(vectors, a_two)
+    g, h = matmul(vectors.T, a_one, vectors), matmul(vectors.T, a_two, vectors)
     along_one, along_two = (_table_along(f, parameters, others, values, d) for d in (d_one, d_two))
     both = jax.jvp(lambda p: _along(f, p, others, d_one)(values), (parameters,), (d_two,))[1]
     inner = along_one * h + along_two * g + jnp.diag(both)
@@ -158,12 +158,7 @@ def _mixed(f: Callable[[Array], Array], values: Float[Array, " n"], table: Matri
     return jax.lax.scan(add, jnp.zeros_like(g), jnp.arange(n))[0]
 
 
-def _into(vectors: Matrix, a: Matrix) -> Matrix:
-    """Return VᵀAV."""
-    return jnp.matmul(jnp.matmul(vectors.T, a, precision="highest"), vectors, precision="highest")
-
-
 def _compose(vectors: Matrix, inner: Matrix) -> Matrix:
     """Return the symmetric part of V X Vᵀ."""
-    full = jnp.matmul(jnp.matmul(vectors, inner, precision="highest"), vectors.T, precision="highest")
+    full = matmul(vectors, inner, vectors.T)
     return (full + full.T) / 2

@@ -7,7 +7,7 @@ in 2D, O(N log N) to solve, O(log N) steps one after another; the same code on e
 import math
 from collections.abc import Callable
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,11 +20,14 @@ from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.elimination_tree import Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import batched, batched_with_columns, gram, times, transposed
+from hks_jax.linear.products import batched_with_columns, gram, matmul, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
 """The greatest spectral radius of a factorisation's relative error at which its inertia is trusted."""
+
+Blocks = tuple[Array, ...]
+"""A batch of dense blocks for each level."""
 
 
 class Factorisation(eqx.Module):
@@ -32,18 +35,14 @@ class Factorisation(eqx.Module):
 
     A front with its own block A and the coupling B to its boundary leaves there the Schur complement C − BA⁻¹Bᵀ. A
     stack of them, for several σ, has one more axis in front.
-
-    Attributes:
-        dissection: the elimination tree.
-        downward: A⁻¹ above BA⁻¹ for each level, of the tree or merged, (fronts, s + r, s).
-        upward: (BA⁻¹)ᵀ, (fronts, s, r).
-        pivots: numbers whose product is the determinant, as many of them negative as eigenvalues; others than those of
-            degrees of freedom are 1.
     """
 
-    dissection: Dissection
+    dissection: Dissection  # the elimination tree
+    # A⁻¹ above BA⁻¹ for each level, of the tree or merged, (fronts, s + r, s)
     downward: tuple[Float[Array, "... _fronts _s_plus_r _s"], ...]
-    upward: tuple[Float[Array, "... _fronts _s _r"], ...]
+    upward: tuple[Float[Array, "... _fronts _s _r"], ...]  # (BA⁻¹)ᵀ, (fronts, s, r)
+    # numbers whose product is the determinant, as many of them negative as eigenvalues; others than those of degrees of
+    # freedom are 1
     pivots: Float[Array, "... pivots"]
 
     @property
@@ -51,28 +50,23 @@ class Factorisation(eqx.Module):
         """How many eigenvalues are negative: by Sylvester's law of inertia, those of the pencil that are below σ."""
         return jnp.sum(self.pivots < 0, axis=-1)
 
-    def solve(self, rhs: Float[Array, "b n_dof"]) -> Float[Array, "b n_dof"]:
-        """Solve (K − σM) x = rhs for each row."""
-        return _solve(self, rhs.T).T
-
-    def solve_columns(self, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+    @jax.jit
+    def solve(self, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
         """Solve (K − σM) x = rhs for each column."""
-        return _solve(self, rhs)
+        tree = self.dissection.merged or self.dissection
+        x, _ = _substituted(tree.levels, self.downward, self.upward, rhs)
+        return taken(x, tree.order)
 
 
 class Trial(NamedTuple):
-    """What a factorisation is good for.
+    """What a factorisation is good for."""
 
-    Attributes:
-        sound: whether its inertia is that of K − σM.
-        rate: ‖b − (K − σM)x‖/‖b‖ of its solutions x for random b: by how much a step of iterative refinement reduces
-            the error, about.
-        error: the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x: what the residuals of eigenpairs near σ
-            computed with it cannot go below. Measured, these are 1 to 15 times as large, rarely up to 40.
-    """
-
-    sound: Bool[Array, ""]
+    sound: Bool[Array, ""]  # whether its inertia is that of K − σM
+    # ‖b − (K − σM)x‖/‖b‖ of its solutions x for random b: by how much a step of iterative refinement reduces the error,
+    # about
     rate: Float[Array, ""]
+    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x: what the residuals of eigenpairs near σ computed
+    # with it cannot go below. Measured, these are 1 to 15 times as large, rarely up to 40
     error: Float[Array, ""]
 
 
@@ -86,10 +80,8 @@ def factorise(
 ) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting from one front to the next; what it is good for, `try_out` tells.
 
-    Args:
-        dissection: the elimination tree.
-        matrix: its entries at the places of the pattern: `SymmetricPencil.shifted`.
-        least: the least pivot allowed, relative to the entries; smaller ones are replaced by it.
+    The matrix is given by its entries at the places of the pattern: `SymmetricPencil.shifted`. Pivots below the least
+    allowed, relative to the entries, are replaced by it.
     """
     # Where no pivot is replaced, the sizes of the fronts' entries are not needed.
     least_or_none = None if isinstance(least, float) and least == 0 else jnp.asarray(least, matrix.dtype)
@@ -109,13 +101,13 @@ def try_out(
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     tiny = CONTRACTION / math.sqrt(len(b))
 
-    def in_doubt(state: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+    def in_doubt(state: Any) -> Bool[Array, ""]:
         turn, rates, _, _ = state
         return (turn == 0) | ((turn == 1) & (rates[0] >= tiny) & (rates[0] < CONTRACTION))
 
-    def solve(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def solve(state: Any) -> tuple[Array, Array, Array, Array]:
         turn, rates, error, b = state
-        x = factor.solve_columns(b)
+        x = factor.solve(b)
         image = mass(x)
         residual = b - (stiffness(x) - shift * image)
         rates = rates.at[turn].set(jnp.linalg.norm(residual) / jnp.linalg.norm(b))
@@ -134,14 +126,14 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
     norms = jnp.sqrt(jnp.diagonal(products))
     # Of a matrix this small the inverse is as good, and a long triangular solve is slow.
     inverse = lapack.inverse_cholesky(products / norms[None] / norms[:, None]) / norms[None]
-    residuals, images = (jnp.linalg.norm(times(y, inverse.T), axis=0) for y in (residual, image))
+    residuals, images = (jnp.linalg.norm(matmul(y, inverse.T), axis=0) for y in (residual, image))
     return jnp.max(residuals / images)
 
 
 @jit_quickly()
 def _eliminate(
     dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | None
-) -> tuple[tuple[Array, ...], tuple[Array, ...], Float[Array, " pivots"]]:
+) -> tuple[Blocks, Blocks, Float[Array, " pivots"]]:
     """Return the matrices downward and upward, and the pivots."""
     pivots = []
 
@@ -158,9 +150,7 @@ def _eliminate(
     return downward, upward, jnp.concatenate(pivots)
 
 
-def _merged(
-    levels: tuple[Level, ...], merged: Merged, downward: tuple[Array, ...], upward: tuple[Array, ...]
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward: Blocks) -> tuple[Blocks, Blocks]:
     """Return the matrices of merged levels: what substitution along the levels in them makes of the identity."""
     inverses, couplings, first = [], [], 0
     for rows, places in zip(merged.rows, merged.places, strict=True):
@@ -184,15 +174,9 @@ def eliminate(
 ) -> list[tuple[Inexact[Array, "fronts s s"], Inexact[Array, "fronts r s"]]]:
     """Eliminate a symmetric matrix, real or complex, from the cells up to the first separator.
 
-    Args:
-        dissection: the elimination tree.
-        matrix: the entries at the places of the pattern.
-        invert: returns the inverses of symmetric blocks (fronts, s, s), given also the greatest modulus of each front's
-            entries, (fronts,).
-
-    Returns:
-        (A⁻¹, BA⁻¹) of each level's fronts, in the order of the levels: A is what the Schur complements of the fronts
-        below have made of a front's own block, and B its coupling to its boundary.
+    Given how to invert symmetric blocks (fronts, s, s), with the greatest modulus of each front's entries, it returns
+    (A⁻¹, BA⁻¹) of each level's fronts, in the order of the levels: A is what the Schur complements of the fronts below
+    have made of a front's own block, and B its coupling to its boundary.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
     entries = jnp.zeros(start[-1], matrix.dtype)
@@ -211,27 +195,16 @@ def eliminate(
             added = first + second
             blocks, beyond = blocks + added[:, :, :s], added[:, s:, s:]
         inverse = invert(blocks[:, :s], sizes)
-        coupling = batched(blocks[:, s:], inverse)
-        schur = beyond - batched(coupling, transposed(blocks[:, s:]))
+        coupling = matmul(blocks[:, s:], inverse)
+        schur = beyond - matmul(coupling, transposed(blocks[:, s:]))
         eliminated.append((inverse, coupling))
     return eliminated[::-1]
 
 
-@jax.jit
-def _solve(factor: Factorisation, rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
-    tree = factor.dissection.merged or factor.dissection
-    x, _ = _substituted(tree.levels, factor.downward, factor.upward, rhs)
-    return taken(x, tree.order)
-
-
 def _substituted(
-    levels: tuple[Level, ...], downward: tuple[Array, ...], upward: tuple[Array, ...], rhs: Float[Array, "n b"]
+    levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along some levels: zero at the boundary of the first of them.
-
-    Returns:
-        The solution at the own nodes of the levels, concatenated, and what it leaves to the boundary.
-    """
+    """Solve along levels, zero at the boundary of the first: return x at their own nodes, and what is left to that."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None

@@ -3,12 +3,13 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact, Int
+from jaxtyping import Array, Float, Inexact
 from scipy.sparse import coo_matrix, csc_matrix
 
 from hks_jax.compilation import jit_quickly
@@ -82,12 +83,7 @@ class Operator(eqx.Module):
 
 
 @partial(jax.jit, static_argnames="shape")
-def _scattered(
-    data: Float[Array, " nnz"],
-    rows: Int[np.ndarray | Array, " nnz"],
-    cols: Int[np.ndarray | Array, " nnz"],
-    shape: tuple[int, int],
-) -> Float[Array, "rows cols"]:
+def _scattered(data: Float[Array, " nnz"], rows: Any, cols: Any, shape: tuple[int, int]) -> Float[Array, "rows cols"]:
     return jnp.zeros(shape, data.dtype).at[rows, cols].add(data)
 
 
@@ -234,9 +230,7 @@ def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, 
     return entries.at[stiffness.pattern.diagonal()].add(change, unique_indices=True)
 
 
-def require_symmetric(
-    name: str, values: Float[Array | np.ndarray, " m"], places: Places, size: int, remedy: str
-) -> None:
+def require_symmetric(name: str, values: Any, places: Places, size: int, remedy: str) -> None:
     """Raise ValueError unless entries, of which those at one place add up, are finite and symmetric up to rounding."""
     data, (rows, cols) = np.asarray(values), places
     wrong = int((~np.isfinite(data)).sum())

@@ -8,20 +8,15 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int
 
+from hks_jax.arrays import StaticArray
 from hks_jax.linear.bisection import Parts, bisect_graph
-from hks_jax.static_array import StaticArray
 
 
 class Pattern:
-    """The places at which a symmetric matrix may have entries. Static and hashable.
+    """The places at which a symmetric matrix may have entries. Static and hashable."""
 
-    Attributes:
-        size: the number of rows.
-        n_entries: the size of the array of entries.
-    """
-
-    size: int
-    n_entries: int
+    size: int  # the number of rows
+    n_entries: int  # the size of the array of entries
 
     @abstractmethod
     def places(self) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
@@ -37,23 +32,14 @@ class Pattern:
 
 
 class Ellpack(NamedTuple):
-    """The places of a matrix in a table of columns that are as long as it has rows, and those beyond its width.
+    """The places of a matrix in a table of columns that are as long as it has rows, and those beyond its width."""
 
-    Attributes:
-        entries: (width, n) indices into the entries; out of range where a row has fewer.
-        cols: (width, n) their columns.
-        others: (m,) the places of the entries that are left,
-        other_rows: (m,) their rows,
-        other_cols: (m,) and their columns.
-        diagonal: (n,) the places of the diagonal entries.
-    """
-
-    entries: Int[np.ndarray | Array, "width n"]
-    cols: Int[np.ndarray | Array, "width n"]
-    others: Int[np.ndarray | Array, " m"]
-    other_rows: Int[np.ndarray | Array, " m"]
-    other_cols: Int[np.ndarray | Array, " m"]
-    diagonal: Int[np.ndarray | Array, " n"]
+    entries: Int[np.ndarray | Array, "width n"]  # indices into the entries; out of range where a row has fewer
+    cols: Int[np.ndarray | Array, "width n"]  # their columns
+    others: Int[np.ndarray | Array, " m"]  # the places of the entries that are left,
+    other_rows: Int[np.ndarray | Array, " m"]  # their rows,
+    other_cols: Int[np.ndarray | Array, " m"]  # and their columns
+    diagonal: Int[np.ndarray | Array, " n"]  # the places of the diagonal entries
 
 
 _SCATTERED = 3

@@ -1,7 +1,7 @@
 """Products of blocks of vectors, as XLA computes them fastest, and quadratic forms in many of them."""
 
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 
 import jax
@@ -16,7 +16,6 @@ from hks_jax.linear.linear_map import with_transpose
 _MANY, _TERMS = 512, 40
 """For how many matrices, of how many columns at most, products on a CPU are written out: others take longer to compile
 than they gain."""
-
 _ROWS, _LARGE = (4, 5, 3, 7, 2), 1 << 18
 """How many rows of an array of so many numbers are multiplied at a time, which stay in the cache: the first of these by
 which their number can be divided, as what were left over would have to be copied."""
@@ -28,7 +27,7 @@ def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c
     XLA's CPU kernels for a long contraction are many times faster with the large factor on the left: the barrier keeps
     XLA from turning the product round.
     """
-    return jax.lax.optimization_barrier(jnp.matmul(basis, columns, precision="highest"))
+    return jax.lax.optimization_barrier(matmul(basis, columns))
 
 
 def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
@@ -38,14 +37,9 @@ def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Fl
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
 
 
-def combine(mix: Float[Array, "q m"], basis: Float[Array, "m n"]) -> Float[Array, "q n"]:
-    """Return linear combinations of the basis."""
-    return jnp.matmul(mix, basis, precision="highest")
-
-
-def batched(x: Inexact[Array, "m i j"], y: Inexact[Array, "m j k"]) -> Inexact[Array, "m i k"]:
-    """Return the products of two batches of matrices."""
-    return jnp.matmul(x, y, precision="highest")
+def matmul(*factors: Inexact[Array, "*batch _ _"]) -> Inexact[Array, "*batch _ _"]:
+    """Return the product of matrices, or of batches of them, in the precision of their entries on every device."""
+    return reduce(partial(jnp.matmul, precision="highest"), factors)
 
 
 def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
@@ -55,10 +49,10 @@ def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, 
     written out term by term, which is dealt out to all threads.
     """
     if accelerators.at_hand() or len(matrices) < _MANY or matrices.shape[2] > _TERMS:
-        return batched(matrices, columns)
+        return matmul(matrices, columns)
     # Computed as part of the loop, the columns would be computed anew for each row. A condition XLA computes apart from
     # what comes before it; both ways are right.
-    return jax.lax.cond(jnp.isfinite(columns[0, 0, 0]), _written_out, batched, matrices, columns)
+    return jax.lax.cond(jnp.isfinite(columns[0, 0, 0]), _written_out, matmul, matrices, columns)
 
 
 def _written_out(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
@@ -93,12 +87,7 @@ def of_each_row(
 
 def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
     """Return the inner products of columns."""
-    return jnp.matmul(x.T, y, precision="highest")
-
-
-def times(x: Float[Array, "n b"], mix: Float[Array, "b c"]) -> Float[Array, "n c"]:
-    """Return linear combinations of columns."""
-    return jnp.matmul(x, mix, precision="highest")
+    return matmul(x.T, y)
 
 
 def even_size(count: int, most: int) -> int:
@@ -109,10 +98,7 @@ def even_size(count: int, most: int) -> int:
 def row_blocks(
     count: int, size: int
 ) -> tuple[Int[np.ndarray, " blocks"], tuple[Int[np.ndarray, " count"], Int[np.ndarray, " count"]]]:
-    """Return the first rows of blocks of one size, and where in them to find each row: (block, row within it).
-
-    The last block may overlap the one before.
-    """
+    """Return the first rows of blocks, the last of which may overlap, and where each row is: (block, row within)."""
     starts = np.minimum(np.arange(0, count, size), count - size)
     block = np.arange(count) // size
     return starts, (block, np.arange(count) - starts[block])
@@ -137,10 +123,7 @@ def quadratic_forms(
 ) -> Float[Array, "m n"]:
     """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each C; not differentiable with respect to φ.
 
-    Args:
-        matrices: C; of its entries between functions that do not matter some may be taken for zero.
-        vectors: φ.
-        matters: which functions matter, for each C.
+    Of C's entries between functions that do not matter for it some may be taken for zero.
     """
     (m, k), n = matters.shape, vectors.shape[1]
     size, width = min(max(_OF_MATRIX, -(-k // _BLOCKS)), k), min(_POINTS, n)
@@ -161,7 +144,7 @@ def quadratic_forms(
 
                 def add(turn: Array, total: Array, block: Array = block, right: Array = some[i:]) -> Array:
                     one = order[turn]
-                    return total.at[one].add(jnp.sum(right[: block.shape[1]] * combine(block[one], right), axis=0))
+                    return total.at[one].add(jnp.sum(right[: block.shape[1]] * matmul(block[one], right), axis=0))
 
                 total = jax.lax.fori_loop(0, count, add, total)
             return jax.lax.dynamic_update_slice_in_dim(values, total, start, axis=1)
@@ -179,7 +162,7 @@ def quadratic_forms(
                 def add(turn: Array, block: Array, right: Array = some[i:]) -> Array:
                     one = order[turn]
                     weighted = right[: block.shape[2]] * own[one][None]
-                    return block.at[one].add(jnp.matmul(right, weighted.T, precision="highest"))
+                    return block.at[one].add(matmul(right, weighted.T))
 
                 results.append(jax.lax.fori_loop(0, count, add, block))
             return results

@@ -20,36 +20,24 @@ from jaxtyping import Array, Inexact
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import eliminate, gather_symmetric, taken
-from hks_jax.linear.products import batched, transposed
+from hks_jax.linear.products import matmul, transposed
 
 Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts _r _s"]]]
 """(A⁻¹, BA⁻¹) of each level's fronts."""
 
 
 class Cost(NamedTuple):
-    """What selected inversion of one matrix takes.
+    """What selected inversion of one matrix takes."""
 
-    Attributes:
-        operations: floating-point operations in complex arithmetic.
-        entries: how many numbers are kept at once: the factors, and the inverse on two levels.
-    """
-
-    operations: float
-    entries: float
+    operations: float  # floating-point operations in complex arithmetic
+    entries: float  # how many numbers are kept at once: the factors, and the inverse on two levels
 
 
 def diagonal_of_inverse(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Inexact[Array, " n_dof"]:
     """Return the diagonal of the inverse of a symmetric matrix, real or complex (not Hermitian).
 
     There is no pivoting from one front to the next: for matrices whose real or imaginary part is definite, of which no
-    Schur complement is singular.
-
-    Args:
-        dissection: the elimination tree.
-        matrix: the entries at the places of the pattern.
-
-    Returns:
-        The diagonal. Differentiable in both modes: what is kept for the transpose are some copies of the factors.
+    Schur complement is singular. Differentiable in both modes; for the transpose some copies of the factors are kept.
     """
     return selected(dissection, eliminated_differentiably(dissection, matrix), diagonal=True)
 
@@ -67,12 +55,12 @@ def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> 
         boundary = jnp.zeros((1, 0, 0), inverse.dtype)
         if known is not None:
             boundary = gather_symmetric(known, jnp.asarray(level.boundary)[None])[0]
-        beside = -batched(boundary, coupling)
+        beside = -matmul(boundary, coupling)
         last = number == len(dissection.levels) - 1
         if diagonal and last:  # of the cells, nothing else is wanted
             own = jnp.diagonal(inverse, axis1=1, axis2=2) - jnp.sum(coupling * beside, axis=1)
         else:
-            block = inverse - batched(transposed(coupling), beside)
+            block = inverse - matmul(transposed(coupling), beside)
             if not last:
                 known = jnp.block([[block, transposed(beside)], [beside, boundary]])
             own = jnp.diagonal(block, axis1=1, axis2=2) if diagonal else jnp.concatenate([block, beside], axis=1)
@@ -102,4 +90,4 @@ def _inverses(matrices: Inexact[Array, "m n n"]) -> Inexact[Array, "m n n"]:
 def _inverses_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # d(A⁻¹) = −A⁻¹ dA A⁻¹: nothing but the inverse is kept for the transpose.
     inverse = _inverses(*primals)
-    return inverse, -batched(batched(inverse, *tangents), inverse)
+    return inverse, -matmul(inverse, *tangents, inverse)

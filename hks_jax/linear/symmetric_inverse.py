@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.linear import accelerators, lapack
-from hks_jax.linear.products import batched, even_size, transposed
+from hks_jax.linear.products import even_size, matmul, transposed
 
-Inverses = tuple[Float[Array, "m n n"], Float[Array, "m n"]]
+Matrices = Float[Array, "m n n"]
+Pivots = Float[Array, " m"]
+Inverses = tuple[Matrices, Float[Array, "m n"]]
 
 _BLOCK, _BLOCKS, _LARGE = 48, 4, 2048
 """On CPUs, matrices up to the first size are inverted by their eigenvalues, and of those up to the last about so many
@@ -20,15 +22,11 @@ _ROWS = 32
 """The largest blocks that are swept row by row."""
 _MANY = 128
 """Fronts of a level from which on all of them are definite as a rule: the shift is below their eigenvalues."""
+_LARGEST, _SMALLEST = 64, 16
+"""Rows of the largest matrix of a kernel: 4 warps, 32 numbers in each thread; and of the smallest, padded."""
 
 
-_LARGEST = 64
-"""Rows of the largest matrix: 4 warps, 32 numbers in each thread."""
-
-_SMALLEST = 16
-
-
-def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"] | None = None) -> Inverses:
+def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inverses:
     """Return the inverses, and for each matrix its pivots: as many are negative as eigenvalues, their product is det A.
 
     Pivots smaller than ``least`` are replaced by it, with their sign; without it the inverse of a singular matrix is
@@ -42,33 +40,30 @@ def symmetric_inverses(matrices: Float[Array, "m n n"], least: Float[Array, " m"
     return jax.lax.platform_dependent(matrices, none, **ways, default=by_elimination)
 
 
-def _kernel_agrees(dtype: Any, interpret: bool = False) -> bool:
+def _kernel_agrees(dtype: Any) -> bool:
     def compare() -> list[tuple[Any, Any]]:
         frames = np.linalg.qr(np.random.default_rng(0).standard_normal((5, 20, 20)))[0]
         values = np.linspace(-2, 3, 20)  # none near zero
         matrices = np.einsum("mij,j,mkj->mik", frames, values, frames).astype(dtype)
-        inverses, pivots = invert_in_registers(jnp.asarray(matrices), jnp.zeros(5, dtype), interpret=interpret)
+        inverses, pivots = invert_in_registers(jnp.asarray(matrices), jnp.zeros(5, dtype))
         negative = np.sum(np.linalg.eigvalsh(matrices) < 0, axis=1)
         return [(inverses, np.linalg.inv(matrices)), (np.sum(np.asarray(pivots) < 0, axis=1), negative)]
 
     return accelerators.kernels_agree("inverses", dtype, compare)
 
 
-def by_cholesky_factors(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
-    """Invert the Cholesky factors L, whose pivots are positive; by eigenvalues unless all are, and none is too small.
-
-    That takes a third of the time.
-    """
+def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
+    """Invert the Cholesky factors, in a third of the time; by eigenvalues unless all are definite, no pivot small."""
     inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
         jnp.all(pivots > least[:, None]),  # they are NaN where a matrix is not definite
-        lambda: (batched(transposed(inverses), inverses), pivots),
+        lambda: (matmul(transposed(inverses), inverses), pivots),
         lambda: by_eigenvalues(matrices, least),
     )
 
 
-def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     """Invert the eigenvalues: of small matrices their own, of others those of the blocks that are swept.
 
     Large matrices are swept in large blocks, these in turn in small ones, so that there are few passes over them. Of
@@ -78,48 +73,47 @@ def by_eigenvalues(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -
     if n <= _BLOCK:
         values, vectors = jax.vmap(lapack.eigh)(matrices)
         values = _away_from_zero(values, least[:, None])
-        return batched(vectors / values[:, None, :], transposed(vectors)), values
+        return matmul(vectors / values[:, None, :], transposed(vectors)), values
     if n <= _LARGE:
         size = even_size(n, max(_BLOCK, n // _BLOCKS))
         return _by_blocks(by_eigenvalues, size, matrices, least)
     half = n // 2
     first, values = by_eigenvalues(matrices[:, :half, :half], least)
-    coupling = batched(matrices[:, half:, :half], first)
-    schur = matrices[:, half:, half:] - batched(coupling, matrices[:, :half, half:])
+    coupling = matmul(matrices[:, half:, :half], first)
+    schur = matrices[:, half:, half:] - matmul(coupling, matrices[:, :half, half:])
     last, others = by_eigenvalues((schur + transposed(schur)) / 2, least)
-    beside = -batched(last, coupling)
-    first = first - batched(transposed(coupling), beside)
+    beside = -matmul(last, coupling)
+    first = first - matmul(transposed(coupling), beside)
     whole = jnp.block([[first, transposed(beside)], [beside, last]])
     return whole, jnp.concatenate([values, others], axis=1)
 
 
-def by_kernels(matrices: Float[Array, "m n n"], least: Float[Array, " m"], interpret: bool = False) -> Inverses:
-    """Sweep the matrices block by block, these in one launch of a kernel each; ``interpret`` is for tests."""
+def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
+    """Sweep the matrices block by block, these in one launch of a kernel each."""
     n, size = matrices.shape[1], _LARGEST
     if n <= size:
-        return invert_in_registers(matrices, least, interpret=interpret)
+        return invert_in_registers(matrices, least)
     a, pivots = matrices, []
     # Written out, as a turn of XLA's loops is three launches more; behind the barrier, so that XLA compiles one kernel
     # for all blocks, and not one for each.
     for start in range(0, n, size):
         at, rows = jax.lax.optimization_barrier(jnp.int32(start)), min(size, n - start)
-        inverses, of_block = invert_in_registers(a, least, at, rows, interpret)
+        inverses, of_block = invert_in_registers(a, least, at, rows)
         a = _swept(a, jax.lax.dynamic_slice_in_dim(a, at, rows, axis=1), inverses, at)
         pivots.append(of_block)
     return -a, jnp.concatenate(pivots, axis=1)
 
 
-def by_elimination(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
+def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
     """Sweep the matrices block by block, and these row by row."""
-    return _by_blocks(sweep_rows, min(matrices.shape[1], _ROWS), matrices, least)
+
+    def by_rows(blocks: Matrices, least: Pivots) -> Inverses:
+        return jax.vmap(_sweep)(blocks, least[:, None])
+
+    return _by_blocks(by_rows, min(matrices.shape[1], _ROWS), matrices, least)
 
 
-def _by_blocks(
-    invert: Callable[[Array, Array], Inverses],
-    size: int,
-    matrices: Float[Array, "m n n"],
-    least: Float[Array, " m"],
-) -> Inverses:
+def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: Matrices, least: Pivots) -> Inverses:
     """Sweep the matrices in blocks of one size, given how to invert these."""
     m, n, _ = matrices.shape
     whole = -(-n // size) * size
@@ -142,23 +136,16 @@ def _by_blocks(
 # has become −A⁻¹. By Sylvester's law of inertia as many of the pivots are negative as eigenvalues of A. With R the rows
 # of P, and U what they are with −I in place of P, the swept matrix is A − UᵀP⁻¹U, in A zeros for the rows and columns
 # of P: two products, and one pass over A.
-def _swept(
-    a: Float[Array, "m n n"], rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]
-) -> Float[Array, "m n n"]:
+def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]) -> Matrices:
     """Sweep the block whose rows begin with number ``at``, given its inverse."""
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
     inside = (index >= at) & (index < at + rows.shape[1])
     rows = jnp.where(inside, -(index[None] == own[:, None]).astype(a.dtype), rows)
-    change = batched(transposed(rows), batched(inverses, rows))
+    change = matmul(transposed(rows), matmul(inverses, rows))
     return jnp.where(inside, 0, jnp.where(inside[:, None], 0, a)) - change
 
 
-def sweep_rows(matrices: Float[Array, "m n n"], least: Float[Array, " m"]) -> Inverses:
-    """Sweep one row at a time, always the one with the largest diagonal entry left; return with them the pivots."""
-    return jax.vmap(_sweep)(matrices, least[:, None])
-
-
-def _away_from_zero(pivots: Float[Array, "*m"], least: Float[Array, "*#m"]) -> Float[Array, "*m"]:
+def _away_from_zero(pivots: Float[Array, "..."], least: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the pivots, of which none is smaller than the least allowed."""
     return jnp.where(jnp.abs(pivots) < least, jnp.where(pivots < 0, -least, least), pivots)
 
@@ -166,20 +153,11 @@ def _away_from_zero(pivots: Float[Array, "*m"], least: Float[Array, "*#m"]) -> F
 # Written with XLA's operations, each of the n pivots of a matrix is half a dozen launches, of some 4 µs each whatever
 # they do. Here a matrix is one program, which keeps it in registers from the first pivot to the last.
 def invert_in_registers(
-    matrices: Float[Array, "m n n"],
-    least: Float[Array, " m"],
-    at: Int[Array, ""] | None = None,
-    rows: int | None = None,
-    interpret: bool = False,
+    matrices: Matrices, least: Pivots, at: Int[Array, ""] | None = None, rows: int | None = None
 ) -> tuple[Float[Array, "m s s"], Float[Array, "m s"]]:
-    """Return the inverses of blocks on the diagonal, and their pivots, as `sweep_rows` does.
+    """Return the inverses of blocks on the diagonal, and their pivots; see `_sweep`.
 
-    Args:
-        matrices: symmetric.
-        least: smaller pivots are replaced by it, with their sign.
-        at: the first row of the blocks, an int32; None is 0.
-        rows: how many rows they have, at most `_LARGEST`; None is all of them.
-        interpret: whether to run on any device by XLA's operations instead, for tests.
+    The blocks begin at the first row or at ``at``, an int32, and have all rows or as many as given, at most `_LARGEST`.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -215,13 +193,13 @@ def invert_in_registers(
             jax.ShapeDtypeStruct((m, rows), matrices.dtype),
         ],
         compiler_params=triton.CompilerParams(num_warps=max(size * size // 1024, 1), num_stages=1),
-        interpret=interpret,
+        interpret=accelerators.INTERPRETED,
         name="symmetric_inverses",
     )(at[None], matrices, least[:, None])
 
 
 def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Return the inverse of one matrix, and the pivots."""
+    """Return the inverse of one matrix, and the pivots: of all rows left, the one with the largest is swept next."""
     n = a.shape[0]
     index = jax.lax.broadcasted_iota(jnp.int32, (n,), 0)
 
@@ -229,8 +207,7 @@ def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Arr
         a, diagonal, left, pivots_so_far = state
         chosen = index == jax.lax.argmax(jnp.where(left > 0, jnp.abs(diagonal), -1), 0, jnp.int32)
         column = jnp.sum(jnp.where(chosen[None, :], a, 0), axis=1)
-        pivot = jnp.sum(jnp.where(chosen, diagonal, 0), axis=0)
-        pivot = jnp.where(jnp.abs(pivot) < least, jnp.where(pivot < 0, -least, least), pivot)
+        pivot = _away_from_zero(jnp.sum(jnp.where(chosen, diagonal, 0), axis=0), least)
         row = jnp.where(chosen, -1, column) / pivot
         a = a - jnp.where(chosen, 0, column)[:, None] * row[None, :]
         a = jnp.where(chosen[:, None], row[None, :], jnp.where(chosen[None, :], row[:, None], a))
@@ -238,7 +215,6 @@ def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Arr
         return a, diagonal, jnp.where(chosen, 0, left), jnp.where(chosen, pivot, pivots_so_far)
 
     diagonal = jnp.sum(jnp.where(index[:, None] == index[None, :], a, 0), axis=1)
-    a, _, _, pivots_so_far = jax.lax.fori_loop(
-        0, n, sweep, (a, diagonal, jnp.ones_like(diagonal), jnp.zeros_like(diagonal))
-    )
+    start = a, diagonal, jnp.ones_like(diagonal), jnp.zeros_like(diagonal)
+    a, _, _, pivots_so_far = jax.lax.fori_loop(0, n, sweep, start)
     return -a, pivots_so_far

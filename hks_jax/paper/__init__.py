@@ -12,13 +12,19 @@ from matplotlib.figure import Figure
 
 from hks_jax import plot
 from hks_jax.atomic import atomic_path
-from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, table1, triangles
+from hks_jax.paper import fields, figure1, figure2, figure6, table1, triangles
 
 Echo = Callable[[str], None]
 
-_MODULES = (table1, figure1, figure2, figure3, figure4, figure5, figure6, triangles)
 ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
-    module.__name__.rpartition(".")[2]: module.make for module in _MODULES
+    "table1": table1.make,
+    "figure1": figure1.make,
+    "figure2": figure2.make,
+    "figure3": fields.figure3,
+    "figure4": fields.figure4,
+    "figure5": fields.figure5,
+    "figure6": figure6.make,
+    "triangles": triangles.make,
 }
 """What makes each: a picture, or texts by the names of their files."""
 
@@ -44,7 +50,7 @@ def run(output: Path, full: bool = False, only: list[str] | None = None, echo: E
     written = []
     for number, name in enumerate(names, 1):
 
-        def say(text: str, place: str = f"[{number}/{len(names)}]") -> None:
+        def say(text: str, place: str = f"[{number}/{len(names)}] {name}:") -> None:
             echo(f"{place} {text}")
 
         start = time.perf_counter()
@@ -57,6 +63,6 @@ def run(output: Path, full: bool = False, only: list[str] | None = None, echo: E
                 with atomic_path(path) as temporary:
                     temporary.write_text(text, encoding="utf-8")
         seconds = time.perf_counter() - start
-        say(f"{name}: {', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
+        say(f"{', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
         written += paths
     return written

@@ -24,7 +24,7 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
     """Return the figure."""
     n, k = FULL if full else QUICK
     field, mesh = bumpy_torus_field(n), bumpy_torus_mesh(n)
-    echo(f"figure1: {k} eigenpairs of the surface with {n}² vertices, and of its metric")
+    echo(f"{k} eigenpairs of the surface with {n}² vertices, and of its metric")
     (on_surface,) = signature(mesh, [TIME], k)
     (on_domain,) = signature(field, [TIME], k, boundary="periodic")
     low, high = min(on_surface.min(), on_domain.min()), max(on_surface.max(), on_domain.max())
@@ -55,7 +55,11 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
     angle_axes(ellipses, np.arange(2, 7))
     angle_axes(domain_hks, np.arange(0, 8, 2))
     fig.colorbar(mappable, ax=[surface_hks, domain_hks], label=f"HKS at $t$ = {TIME:g}", shrink=0.6, aspect=30)
-    arrow(fig, surface, ellipses, (0.5, 0.0), (0.5, 1.12), "pull back")
+    fractions = "axes fraction"
+    patch = ConnectionPatch((0.5, 0.0), (0.5, 1.12), fractions, fractions, axesA=surface, axesB=ellipses)
+    patch.set(arrowstyle="-|>", mutation_scale=14, color="black")
+    fig.add_artist(patch)
+    ellipses.text(0.52, 1.14, "pull back", transform=ellipses.transAxes, va="bottom")
     fig.suptitle("The heat kernel signature belongs to the metric, not to the embedding")
     return fig
 
@@ -67,20 +71,3 @@ def angle_axes(ax: Axes, quarters: np.ndarray) -> None:
     ax.set_yticks(ticks, names)
     ax.set_xlabel("$u$")
     ax.set_ylabel("$v$")
-
-
-def arrow(fig: Figure, start: Axes, end: Axes, tail: tuple[float, float], head: tuple[float, float], text: str) -> None:
-    """Draw an arrow from one panel to another, the ends in axes fractions."""
-    patch = ConnectionPatch(
-        tail,
-        head,
-        "axes fraction",
-        "axes fraction",
-        axesA=start,
-        axesB=end,
-        arrowstyle="-|>",
-        mutation_scale=14,
-        color="black",
-    )
-    fig.add_artist(patch)
-    end.text(head[0] + 0.02, head[1] + 0.02, text, transform=end.transAxes, va="bottom")

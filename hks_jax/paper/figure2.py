@@ -6,7 +6,6 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -41,7 +40,7 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
     rows = fig.subplots(2, 5, width_ratios=(1, 1, 1, 1, 1.25))
     for row, (name, metric) in zip(rows, {"flat metric": flat, "curved metric": bump}.items(), strict=True):
         field = TensorField.from_function(metric, grid)
-        echo(f"figure2: {name}, {n}² nodes, three boundaries")
+        echo(f"{name}, {n}² nodes, three boundaries")
         _row(row, field, name)
     for ax, title in zip(rows[0], TITLES, strict=True):
         ax.set_title(title)
@@ -65,18 +64,9 @@ def _row(panels: np.ndarray, field: TensorField, name: str) -> None:
         ax.set_xlabel("$u_1$")
     panels[1].add_patch(Rectangle((0, 0), 1, 1, fill=False, color="white", linestyle="--"))
     panels[0].set_ylabel(f"{name}\n$u_2$")
-    _profiles(panels[4], grid, images, expansion)
-
-
-def _profiles(ax: Axes, grid: Grid, images: dict[str, np.ndarray], expansion: np.ndarray) -> None:
-    middle = grid.shape[1] // 2
-    styles = {"natural": ("#440154", "-"), "strip": ("#21918c", "-"), "mirror": ("#f28e2b", "--")}
-    for name, values in images.items():
-        colour, line = styles[name]
-        ax.plot(grid.axes[0], values[:, middle], color=colour, linestyle=line, label=name)
-    ax.plot(grid.axes[0], expansion[:, middle], color="0.5", linestyle=":", label="expansion")
-    ax.set_xlim(0, 1)
-    ax.set_xlabel("$u_1$")
-    ax.set_ylabel(r"$4\pi t\,\mathrm{HKS}(t)$")
+    ax, styles = panels[4], (("#440154", "-"), ("#21918c", "-"), ("#f28e2b", "--"), ("0.5", ":"))
+    for (label, values), (colour, line) in zip((images | {"expansion": expansion}).items(), styles, strict=True):
+        ax.plot(grid.axes[0], values[:, grid.shape[1] // 2], color=colour, linestyle=line, label=label)
+    ax.set(xlim=(0, 1), xlabel="$u_1$", ylabel=r"$4\pi t\,\mathrm{HKS}(t)$")
     ax.legend(fontsize="small", frameon=False)
     ax.grid(visible=True, linewidth=0.4, alpha=0.5)

@@ -9,10 +9,12 @@ from scipy.ndimage import distance_transform_edt
 
 from hks_jax import plot
 from hks_jax.domain.examples import phantom
+from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
 from hks_jax.paper.signature import enough_pairs, signature
+from hks_jax.plot.signature import bounding_box, placed
 
 LENGTHS = (5.0, 10.0, 20.0, 40.0)  # mm: how far heat goes, √(t / mean diffusivity or its inverse)
 SLICE = 0
@@ -24,11 +26,13 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
     if volume is None:
         tensors, mask, spacing = phantom()
         volume, name = TensorVolume(tensors, spacing, (0.0, 0.0), mask), "phantom"
-    volume = _cropped(volume)
-    grid = volume.grid("largest")
-    orientation = None if volume.affine is None else plot.Orientation.of(volume.affine, 2)
+    assert volume.mask is not None
+    box = bounding_box(volume.mask)
+    orientation = placed(volume, box, "neurological")
+    tensors = volume.tensors[box]
+    grid = Grid(tensors.shape[:2], volume.spacing, mask=volume.mask[box], components="largest")
     depth = distance_transform_edt(np.pad(grid.inside, 1), sampling=grid.spacing)[1:-1, 1:-1]
-    diffusivity = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
+    diffusivity = np.trace(tensors, axis1=-2, axis2=-1) / 2
     typical = float(np.median(diffusivity[grid.inside]))
     rows: dict[MetricChoice, tuple[str, float, str]] = {
         "tensor": ("$T = D$, as in the paper", typical, "mm⁴/s"),
@@ -40,15 +44,15 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
     panels = fig.subplots(2, 5, sharex=True, sharey=True)
     plot.scalar_image(panels[0, 0], 1e3 * diffusivity, grid, quantiles=(0.01, 0.99), orientation=orientation)
     panels[0, 0].set_title("mean diffusivity\nin $10^{-3}$ mm²/s", fontsize="medium")
-    eigenvalues = np.linalg.eigvalsh(volume.tensors)
+    eigenvalues = np.linalg.eigvalsh(tensors)
     anisotropy = np.ptp(eigenvalues, axis=-1) / np.maximum(eigenvalues.sum(axis=-1), 1e-12)
     plot.scalar_image(panels[1, 0], anisotropy, grid, quantiles=(0.01, 0.99), orientation=orientation)
     panels[1, 0].set_title("anisotropy\n$(λ_1 - λ_2)/(λ_1 + λ_2)$", fontsize="medium")
     for row, (metric, (label, area, unit)) in zip(panels, rows.items(), strict=True):
-        field = TensorField.from_diffusion(grid, volume.tensors, metric=metric)
+        field = TensorField.from_diffusion(grid, tensors, metric=metric)
         times = [length**2 * area for length in LENGTHS]
         k = enough_pairs(field, times[0], exponent=10.0 if full else 6.0)
-        echo(f"figure6: {name}, {label}, {int(grid.inside.sum())} nodes, {k} eigenpairs")
+        echo(f"{name}, {label}, {int(grid.inside.sum())} nodes, {k} eigenpairs")
         values = signature(field, times, k)
         for ax, image, t, length in zip(row[1:], values, times, LENGTHS, strict=True):
             # The natural boundary raises the HKS at the rim up to fourfold: let the tissue have the colours.
@@ -65,28 +69,15 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
     return fig
 
 
-def _cropped(volume: TensorVolume) -> TensorVolume:
-    """Cut a slice down to its mask and a small margin."""
-    assert volume.mask is not None
-    inside = np.argwhere(volume.mask)
-    low, high = np.maximum(inside.min(axis=0) - 2, 0), inside.max(axis=0) + 3
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    affine = volume.affine
-    if affine is not None:
-        affine = affine.copy()
-        affine[:, 3] += affine @ [*low, 0, 0]
-    return TensorVolume(volume.tensors[box], volume.spacing, (0.0, 0.0), volume.mask[box], affine)
-
-
 def _brain(echo: Callable[[str], None]) -> TensorVolume | None:
     brain = find_example_brain()
     if brain is None:
-        echo("figure6: no brain here (the wheel mdt==1.2.7 carries one); drawing a phantom")
+        echo("no brain here (the wheel mdt==1.2.7 carries one); drawing a phantom")
         return None
     try:
         volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=1100)
     except ImportError as error:
-        echo(f"figure6: {error}; drawing a phantom")
+        echo(f"{error}; drawing a phantom")
         return None
     assert volume.mask is not None
     return volume.with_mask(erode(volume.mask, 2)).slice("z", SLICE)

@@ -14,7 +14,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.weyl import weyl_number
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.signatures.hks import Normalisation, hks_of_pairs
+from hks_jax.signatures.hks import Normalisation, hks
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
 
 SMALL = 10_000
@@ -34,7 +34,7 @@ def signature(
         # exp(−λₖt) makes the last pairs invisible.
         warnings.filterwarnings("ignore", "k = .* cuts a multiple eigenvalue", AccuracyWarning)
         pairs = eigenpairs(domain, k, boundary)
-    return np.asarray(hks_of_pairs(pairs, np.asarray(times), normalisation))
+    return np.asarray(hks(pairs, np.asarray(times), normalisation))
 
 
 def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0) -> int:

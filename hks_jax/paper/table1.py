@@ -41,13 +41,13 @@ def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
     """Return the table as Markdown and as comma-separated values, by the names of their files."""
     k = REFERENCE_PAIRS if full else QUICK_PAIRS
     if full:
-        echo(f"table1: {REFERENCE_PAIRS} eigenpairs of the surface with {REFERENCE_SIZE}² vertices")
+        echo(f"{REFERENCE_PAIRS} eigenpairs of the surface with {REFERENCE_SIZE}² vertices")
         reference = computed_reference()
     else:
         reference = stored_reference()
     rows = []
     for n in PAPER if full else (50, 100, 200):
-        echo(f"table1: {k} eigenpairs of the metric on {n}² nodes")
+        echo(f"{k} eigenpairs of the metric on {n}² nodes")
         rows.append(row(n, k, reference))
     lines = [",".join(map(str, each)) + "\n" for each in (Row._fields, *rows)]
     return {"table1.md": markdown(rows, computed=full), "table1.csv": "".join(lines)}

@@ -14,7 +14,7 @@ from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, f
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.paper.figure5 import INDICES
+from hks_jax.paper.fields import INDICES
 
 QUICK, FULL = ((51,), (50, 100)), ((201,), (50, 100, 200, 400))  # nodes per axis of the figures' fields, of the torus
 COARSE = 11
@@ -98,7 +98,7 @@ def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
 
 def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
     """Return a table in Markdown, by the name of its file."""
-    echo("triangles: edge lengths in the metric, on the paper's fields")
+    echo("edge lengths in the metric, on the paper's fields")
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",
         "",

@@ -16,11 +16,11 @@ from hks_jax.plot.fit import fit_panels as fit_panels
 from hks_jax.plot.glyphs import degenerate_points as degenerate_points
 from hks_jax.plot.glyphs import ellipses as ellipses
 from hks_jax.plot.glyphs import sensitivity as sensitivity
-from hks_jax.plot.images import hks_panels as hks_panels
+from hks_jax.plot.images import influence_map as influence_map
 from hks_jax.plot.images import scalar_image as scalar_image
 from hks_jax.plot.orientation import Orientation as Orientation
-from hks_jax.plot.rows import influence_map as influence_map
-from hks_jax.plot.rows import time_rows as time_rows
+from hks_jax.plot.panels import hks_panels as hks_panels
+from hks_jax.plot.panels import time_rows as time_rows
 from hks_jax.plot.signature import signature_panels as signature_panels
 from hks_jax.plot.surfaces import isosurfaces as isosurfaces
 from hks_jax.plot.surfaces import surface as surface

@@ -19,6 +19,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.weyl import weyl_count
 from hks_jax.plot.figure import SMALL, number_text
+from hks_jax.plot.panels import checked_times
 
 
 def hks_curves(
@@ -56,13 +57,9 @@ def hks_curves(
     Raises:
         ValueError: shapes that do not agree, or a point whose nearest node is outside the mask.
     """
-    t = np.asarray(times, dtype=np.float64)
+    t = checked_times(times, grid, values=values, expansion=expansion)
     curves = np.asarray(values, dtype=np.float64)
-    if curves.shape != (t.size, *grid.shape):
-        raise ValueError(f"values: got shape {curves.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}")
     series = None if expansion is None else np.asarray(expansion, dtype=np.float64)
-    if series is not None and series.shape != curves.shape:
-        raise ValueError(f"expansion: got shape {series.shape}; expected that of values, {curves.shape}")
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)
     if labels is None:
         labels = ["(" + ", ".join(f"{c:.3g}" for c in grid.nodes[node]) + ")" for node in nodes]
@@ -101,23 +98,21 @@ def _nearest_nodes(points: np.ndarray, grid: Grid) -> list[tuple[int, ...]]:
     if points.ndim != 2 or points.shape[1] != grid.dimension or len(points) == 0:
         raise ValueError(f"points: got shape {points.shape}; expected (n, {grid.dimension}), one point per row")
     index = np.rint((points - grid.origin) / grid.spacing).astype(int)
-    beyond = np.any((index < 0) | (index >= np.array(grid.shape)), axis=1)
-    nodes = [tuple(int(i) for i in row) for row in index]
-    for point, node, out in zip(points, nodes, beyond, strict=True):
-        if out or not grid.inside[node]:
+    on_grid = np.all((index >= 0) & (index < grid.shape), axis=1)
+    for point, node, on in zip(points, index, on_grid, strict=True):
+        if not (on and grid.inside[tuple(node)]):
             raise ValueError(f"points: {tuple(point.tolist())} lies outside the grid or its mask; choose one inside")
-    return nodes
+    return [tuple(node) for node in index.tolist()]
 
 
 def _logarithmic(ax: Axes, name: str, values: np.ndarray) -> None:
     """Make an axis logarithmic over the positive values, with few labels and a small margin."""
     positive = values[values > 0]
     low, high = (float(positive.min()), float(positive.max())) if positive.size else (0.1, 1.0)
-    short = high < 50 * low
     margin = max(high / low, 1.1) ** 0.04
     ax.set(**{f"{name}scale": "log", f"{name}lim": (low / margin, high * margin)})
     axis = ax.xaxis if name == "x" else ax.yaxis
-    if short:
+    if high < 50 * low:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: number_text(value)))
     axis.set_minor_formatter(NullFormatter())

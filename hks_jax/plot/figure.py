@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -92,32 +94,34 @@ def frame(ax: Axes, grid: Grid) -> None:
     ax.tick_params(labelsize=SMALL)
 
 
-def side_in_inches(ax: Axes, extent: tuple[float, float]) -> float:
-    """Return how long the longer side of an extent will be, in equal aspect on the axes as they are before layout."""
-    scale = min(room / size for room, size in zip(_inches(ax), extent, strict=True))
-    return scale * max(extent)
-
-
-def _inches(ax: Axes) -> tuple[float, float]:
+def figure_of(ax: Axes) -> Figure:
+    """Return the figure that axes are in."""
     figure = ax.get_figure(root=True)
     assert figure is not None
-    width, height = ax.get_position().size * figure.get_size_inches()
-    return float(width), float(height)
+    return figure
+
+
+def inches(ax: Axes) -> Float[np.ndarray, "2"]:
+    """Return width and height of axes as they are before layout."""
+    return np.multiply(ax.get_position().size, figure_of(ax).get_size_inches())
+
+
+def side_in_inches(ax: Axes, extent: Sequence[float]) -> float:
+    """Return how long the longer side of an extent will be, in equal aspect on the axes as they are before layout."""
+    return float(np.min(inches(ax) / extent) * np.max(extent))
 
 
 def legend_below(ax: Axes, handles: Sequence[Artist], title: str = "") -> None:
     """Add a legend below the axes, where it hides nothing."""
-    figure = ax.get_figure(root=True)
-    assert figure is not None
     ax.legend(
         handles=handles,
         title=title,
         title_fontsize=SMALL,
         fontsize=SMALL,
-        ncols=min(len(handles), 4, max(1, int(1.5 * _inches(ax)[0]))),
+        ncols=min(len(handles), 4, max(1, int(1.5 * inches(ax)[0]))),
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
-        bbox_transform=ax.transAxes + ScaledTranslation(0, -LABELS / 72, figure.dpi_scale_trans),
+        bbox_transform=ax.transAxes + ScaledTranslation(0, -LABELS / 72, figure_of(ax).dpi_scale_trans),
         frameon=False,
         columnspacing=1.2,
     )
@@ -129,9 +133,14 @@ def colour_bar(ax: Axes, mappable: ScalarMappable, label: str = "", **kwargs: An
     return colour_bar_in(ax.inset_axes((1.03, 0.0, 0.045, 1.0)), mappable, label, **kwargs)
 
 
-def colour_bar_in(bar_axes: Axes, mappable: ScalarMappable, label: str = "", **kwargs: Any) -> Colorbar:
-    """Draw a colour bar in axes of its own, with few ticks and powers of ten."""
-    bar = bar_axes.get_figure().colorbar(mappable, cax=bar_axes, **kwargs)  # type: ignore[union-attr]
+def colour_bar_in(
+    bar_axes: Axes, mappable: ScalarMappable, label: str = "", values: np.ma.MaskedArray | None = None, **kwargs: Any
+) -> Colorbar:
+    """Draw a colour bar in axes of its own, with few ticks, powers of ten, and arrows where values lie beyond it."""
+    low, high = mappable.get_clim()
+    drawn: Any = mappable.get_array() if values is None else values
+    extend = ("neither", "min", "max", "both")[(drawn.min() < low) + 2 * (drawn.max() > high)]
+    bar = figure_of(bar_axes).colorbar(mappable, cax=bar_axes, extend=extend, **kwargs)
     formatter = ScalarFormatter(useOffset=False, useMathText=True)
     formatter.set_powerlimits((-3, 4))
     if "format" not in kwargs and "ticks" not in kwargs:

@@ -13,8 +13,9 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.glyphs import ellipses
-from hks_jax.plot.images import scalar_image
+from hks_jax.plot.images import masked, scalar_image, shared_colours
 from hks_jax.plot.orientation import Orientation
+from hks_jax.plot.panels import checked_times
 
 if TYPE_CHECKING:  # slow to import
     from hks_jax.inverse.metric_fit import MetricFit, Step
@@ -57,25 +58,18 @@ def fit_panels(
         raise ValueError("times: got None, and the fit has none; expected one number per image of the target")
     if max_times < 1:
         raise ValueError(f"max_times: got {max_times}; expected at least 1")
-    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
-    for name, array in (("target", wanted), ("fit.hks", fitted)):
-        if array.shape != (t.size, *grid.shape):
-            raise ValueError(
-                f"{name}: got shape {array.shape}; expected (n_times, *grid.shape) = {(t.size, *grid.shape)}"
-            )
-    field = fit.field
-    if orientation is not None:
-        wanted, fitted, grid = orientation.array(wanted), orientation.array(fitted), orientation.grid(grid)
-        field = TensorField(grid, orientation.tensors(field.tensors), field.interpolation)
+    t = checked_times(times, grid, **{"target": wanted, "fit.hks": fitted})
     with np.errstate(divide="ignore", invalid="ignore"):
         difference = np.where(wanted != 0, (fitted - wanted) / np.abs(wanted), np.nan)
-
     rows = np.unique(np.linspace(0, t.size - 1, max_times).round().astype(int))
     drawn = np.abs(difference[rows][:, grid.inside])
     limit = max(float(np.max(drawn[np.isfinite(drawn)], initial=0.0)), LEAST_DIFFERENCE)
 
-    width, height = panel_size(grid, 2.5)
+    field = fit.field
+    if orientation is not None:
+        field = TensorField(orientation.grid(grid), orientation.tensors(field.tensors), field.interpolation)
+    width, height = panel_size(field.grid, 2.5)
     # The lowest row is no lower than a curve needs.
     heights = [height] * len(rows) + [max(height, 1.8)]
     figure = new_figure(3 * (width + 0.9) + 0.4, sum(heights) + 0.3 * len(heights) + 0.6 + 0.3 * bool(title))
@@ -84,21 +78,17 @@ def fit_panels(
     panels, last = halves[0].subgridspec(len(rows), 3), halves[1].subgridspec(1, 2, width_ratios=(1, 1.7))
     symbol = fit.problem.observation.signature.symbol or "t"
     for row, index in enumerate(rows):
-        first, second, third = (figure.add_subplot(panels[row, column]) for column in range(3))
-        both = np.stack([wanted[index], fitted[index]])[:, grid.inside]
-        both = both[np.isfinite(both)]
-        low, high = (float(both.min()), float(both.max())) if np.ptp(both) > 1e-6 * np.abs(both).max() else (None, None)
-        for ax, values in ((first, wanted[index]), (second, fitted[index])):
-            scalar_image(ax, values, grid, vmin=low, vmax=high)
-        scalar_image(third, difference[index], grid, cmap="RdBu_r", vmin=-limit, vmax=limit)
-        first.set_ylabel(f"${symbol}$ = {number_text(t[index])}")
-        if orientation is not None:
-            for ax in (first, second, third):
-                orientation.letter(ax)
-        for ax, text in ((first, "target"), (second, "fitted"), (third, "fitted / target − 1")):
-            ax.tick_params(labelleft=ax is first, labelbottom=row == len(rows) - 1)
+        pair = masked("target", wanted[index], grid), masked("fit.hks", fitted[index], grid)
+        images = {"target": pair[0], "fitted": pair[1], "fitted / target − 1": difference[index]}
+        colours = [shared_colours(pair, {})] * 2 + [{"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}]
+        for column, (text, values) in enumerate(images.items()):
+            ax = figure.add_subplot(panels[row, column])
+            scalar_image(ax, values, grid, orientation=orientation, **colours[column])
+            ax.tick_params(labelleft=column == 0, labelbottom=row == len(rows) - 1)
             if row == 0:
                 ax.set_title(text, fontsize="medium")
+            if column == 0:
+                ax.set_ylabel(f"${symbol}$ = {number_text(t[index])}")
     ax = figure.add_subplot(last[0])
     ellipses(ax, field)
     if orientation is not None:
@@ -111,8 +101,15 @@ def fit_panels(
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
     """Draw the loss over the steps, and the data's part of it where there are penalties."""
     starts = sorted({step.start for step in fit.history})
+    # A stage, a start or a resumed fit counts its steps from 0 again.
+    pieces: list[list[Step]] = []
+    for step in fit.history:
+        last = pieces[-1][-1] if pieces else None
+        if last is None or step.step <= last.step or (step.start, step.stage) != (last.start, last.stage):
+            pieces.append([])
+        pieces[-1].append(step)
     offset, before = 0, None
-    for piece in _pieces(fit.history):
+    for piece in pieces:
         if before is not None:
             offset = offset + before.step if before.start == piece[0].start else 0
         before = piece[-1]
@@ -135,14 +132,3 @@ def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
     ax.set_title(fit.result, fontsize="medium")
     if len(starts) > 1 or fit.problem.regularisers:
         ax.legend(fontsize=SMALL)
-
-
-def _pieces(history: Sequence["Step"]) -> list[list["Step"]]:
-    """Return the runs of steps that follow one another: a stage, a start or a resumed fit counts from 0 again."""
-    pieces: list[list[Step]] = []
-    for step in history:
-        last = pieces[-1][-1] if pieces else None
-        if last is None or step.step <= last.step or (step.start, step.stage) != (last.start, last.stage):
-            pieces.append([])
-        pieces[-1].append(step)
-    return pieces

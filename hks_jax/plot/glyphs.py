@@ -1,6 +1,7 @@
 """Ellipses of a tensor field, its degenerate points, and crosses of tensors of either sign, such as derivatives."""
 
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import Any, Literal
 
 import numpy as np
@@ -8,6 +9,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from matplotlib.lines import Line2D
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
@@ -90,22 +92,19 @@ def ellipses(
         **{"linewidths": 0.3, "edgecolors": "black", **kwargs},
     )
     frame(ax, grid)
-    if color == "anisotropy":
-        collection.set_array((eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues.sum(axis=1))
-        collection.set_cmap(cmap or "viridis")
-        collection.set_clim(0.0, 1.0)
-        label, ticks = "anisotropy", [0, 0.25, 0.5, 0.75, 1]
-    elif color == "orientation":
-        collection.set_array(angles)
-        collection.set_cmap(cmap or "twilight")
-        collection.set_clim(0.0, 180.0)
-        label, ticks = "orientation in degrees", [0, 45, 90, 135, 180]
-    else:
-        collection.set_facecolor(color)
-        colorbar = False
     ax.add_collection(collection, autolim=False)
+    anisotropies = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues.sum(axis=1)
+    coloured = {
+        "anisotropy": (anisotropies, "viridis", 1, "anisotropy"),
+        "orientation": (angles, "twilight", 180, "orientation in degrees"),
+    }
+    if color not in coloured:
+        collection.set_facecolor(color)
+        return collection
+    values, own, largest, label = coloured[color]
+    collection.set(array=values, cmap=cmap or own, clim=(0, largest))
     if colorbar:
-        colour_bar(ax, collection, label, ticks=ticks)
+        colour_bar(ax, collection, label, ticks=largest * np.linspace(0, 1, 5))
     return collection
 
 
@@ -223,7 +222,10 @@ def degenerate_points(
         radii = np.minimum(radii, 0.48 * nearest)
     limit = max(1.5, np.abs(indices).max(initial=0))
     colours = {index: colormaps[cmap](0.5 - 0.5 * index / limit) for index in np.unique(indices)}
-    marks = [r * _outline(index) + x for x, index, r in zip(positions, indices, radii, strict=True)]
+    outlines = {
+        i: np.asarray(Path.unit_regular_polygon(32 if i == 0.5 else _corners(i)).vertices)[:-1] for i in colours
+    }
+    marks = [r * outlines[index] + x for x, index, r in zip(positions, indices, radii, strict=True)]
     collection = PolyCollection(
         marks,
         **{
@@ -237,40 +239,16 @@ def degenerate_points(
     )
     frame(ax, field.grid)
     ax.add_collection(collection, autolim=False)
-    if legend and len(indices):
-        _add_legend(ax, indices, colours)
+    handles = []
+    for index, colour in colours.items():
+        marker = "o" if index == 0.5 else (_corners(index), 0, 0)
+        name = ("−" if index < 0 else "") + ("½" if abs(index) == 0.5 else str(Fraction(abs(index))))
+        style = {"linestyle": "", "color": colour, "markeredgecolor": "black", "marker": marker}
+        handles.append(Line2D([], [], label=f"{name}  ({np.sum(indices == index)})", **style))
+    if legend and handles:
+        legend_below(ax, handles, "index (how many)")
     return collection
-
-
-def _add_legend(ax: Axes, indices: np.ndarray, colours: dict[float, Any]) -> None:
-    """Say which mark is which index."""
-    handles = [
-        Line2D(
-            [],
-            [],
-            linestyle="",
-            color=colour,
-            markeredgecolor="black",
-            marker="o" if index == 0.5 else (_corners(index), 0, 0),
-            label=f"{_half_text(index)}  ({np.sum(indices == index)})",
-        )
-        for index, colour in colours.items()
-    ]
-    legend_below(ax, handles, "index (how many)")
-
-
-def _outline(index: float) -> np.ndarray:
-    """Return a polygon of radius 1: a disc for ½, else as many corners as `_corners` says."""
-    corners = 32 if index == 0.5 else _corners(index)
-    angle = np.pi / 2 + 2 * np.pi * np.arange(corners) / corners
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _corners(index: float) -> int:
     return round(abs(2 * index)) + 2
-
-
-def _half_text(index: float) -> str:
-    """Write a multiple of ½."""
-    sign, twice = "−" if index < 0 else "", round(abs(2 * index))
-    return f"{sign}{twice // 2}" if twice % 2 == 0 else f"{sign}{twice}/2" if twice > 1 else f"{sign}½"

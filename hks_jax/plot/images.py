@@ -1,29 +1,17 @@
-"""Images of scalars on grids, and panels of the HKS over time."""
+"""Images of scalars on grids."""
 
-import math
-import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Real
+from jaxtyping import Real
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
-from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import (
-    cell_extent,
-    colour_bar,
-    finished,
-    frame,
-    new_figure,
-    number_text,
-    panel_size,
-    require_plane,
-)
+from hks_jax.plot.figure import cell_extent, colour_bar, frame, require_plane
 from hks_jax.plot.orientation import Orientation
 
 FADED = 2.0
@@ -98,85 +86,44 @@ def scalar_image(
     if orientation is not None:
         orientation.letter(ax)
     if colorbar:
-        colour_bar(ax, image, label, extend=beyond(array, low, high))
+        colour_bar(ax, image, label)
     return image
 
 
-def hks_panels(
-    values: Real[ArrayLike, "n_times nx ny"],
-    times: Sequence[float] | Real[ArrayLike, " n_times"],
+def influence_map(
+    ax: Axes,
+    influence: Real[ArrayLike, "nx ny"],
     grid: Grid,
     *,
-    titles: Sequence[str] | None = None,
-    unit: str = "",
-    shared_range: bool = False,
-    path: str | os.PathLike[str] | None = None,
-    suptitle: str = "",
-    orientation: Orientation | None = None,
-    z: Real[ArrayLike, "n_times nx ny"] | None = None,
+    levels: Sequence[float] = (0.01, 0.1),
+    cmap: str | Colormap = "cividis",
+    label: str = "boundary's influence",
     **kwargs: Any,
-) -> Figure:
-    """Return a figure with one image of the HKS per time, each with its own colour map unless `shared_range`.
+) -> AxesImage:
+    """Draw what part of the HKS the boundary decides at one time, with lines at a few levels.
 
     Args:
-        values: (n_times, *shape), as `hks_jax.hks` returns them.
-        times: (n_times,).
+        ax: the axes to draw on.
+        influence: (*shape), one time of `hks_jax.boundary_influence`.
         grid: the 2D grid of the values.
-        titles: one per time; None: “t = …”.
-        unit: the unit of t, written after it.
-        shared_range: whether all images use the colours of one range.
-        path: where to save the figure; None: nowhere.
-        suptitle: the figure's title.
-        orientation: as for `scalar_image`.
-        z: (n_times, *shape), as for `scalar_image`: what noise could make fades.
-        **kwargs: passed to `scalar_image`, for all images, such as its cmap, vmin, vmax, centre, quantiles, least_range
-            and label.
+        levels: ascending, between 0 and 1.
+        cmap: colour map, from 0 to 1.
+        label: the colour bar's label.
+        **kwargs: passed to `scalar_image`.
+
+    Returns:
+        The image.
 
     Raises:
-        ValueError: shapes that do not agree; no time at all.
+        ValueError: a 3D grid, or values that are not of its shape.
     """
-    require_plane("grid", grid)
-    t, titles = panel_titles(values, times, grid, titles, unit)
-    images = [masked("values", v, grid) for v in np.asarray(values)]
-    if shared_range:
-        kwargs = shared_colours(np.concatenate([image.compressed() for image in images]), kwargs)
-
-    rows, columns = _layout(t.size)
-    width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
-    fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
-    panels = fig.subplots(rows, columns, squeeze=False)
-    for index, ax in enumerate(panels.flat):
-        if index >= t.size:
-            ax.remove()
-            continue
-        faded = None if z is None else np.asarray(z)[index]
-        scalar_image(ax, images[index], grid, orientation=orientation, z=faded, **kwargs)
-        ax.set_title(titles[index], fontsize="medium")
-        ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
-    return finished(fig, suptitle, path)
-
-
-def panel_titles(
-    values: Any, times: Any, grid: Grid, titles: Sequence[str] | None, unit: str, name: str = "values"
-) -> tuple[Float[np.ndarray, " n_times"], Sequence[str]]:
-    """Return the times and a title for each; raise ValueError if they, the values and the grid do not agree."""
-    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    if np.shape(values) != (t.size, *grid.shape) or t.ndim != 1 or t.size == 0:
-        raise ValueError(
-            f"{name}: got shape {np.shape(values)} and times of shape {t.shape}; expected "
-            f"(n_times, *grid.shape) = {(t.size, *grid.shape)} and at least one time"
-        )
-    if titles is None:
-        titles = [f"$t$ = {number_text(s)}{' ' * bool(unit)}{unit}" for s in t]
-    elif len(titles) != t.size:
-        raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
-    return t, titles
-
-
-def beyond(values: np.ma.MaskedArray, low: float, high: float) -> str:
-    """Return at which ends of a colour bar values lie beyond it, in matplotlib's words."""
-    ends = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-    return ends[bool(values.min() < low), bool(values.max() > high)]
+    values = masked("influence", influence, grid)
+    image = scalar_image(ax, values, grid, cmap=cmap, vmin=0.0, vmax=1.0, label=label, **kwargs)
+    reached = [level for level in levels if values.min() < level < values.max()]
+    if reached:
+        lines = ax.contour(*grid.axes, values.T, levels=reached, colors="white", linewidths=1.0)
+        ax.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize="x-small")
+    return image
 
 
 def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
@@ -222,16 +169,9 @@ def colours_of(
     return Colours(low if vmin is None else vmin, high if vmax is None else vmax, cmap)
 
 
-def shared_colours(values: np.ndarray, kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments of `scalar_image` by which images of parts of the values have the colours of all."""
+def shared_colours(images: Sequence[np.ma.MaskedArray], kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments of `scalar_image` by which all of these have the same colours for the same values."""
+    values = np.concatenate([image.compressed() for image in images])
     names = ("quantiles", "least_range", "centre", "vmin", "vmax")
     low, high, own = colours_of(values, **{name: kwargs[name] for name in names if name in kwargs})
     return {**kwargs, "vmin": low, "vmax": high, "cmap": kwargs.get("cmap") or own}
-
-
-def _layout(n: int) -> tuple[int, int]:
-    """Return rows and columns for n panels: up to four in a row, rows evenly filled."""
-    if n <= 4:
-        return 1, n
-    columns = min(range(3, 6), key=lambda c: (-n % c, math.ceil(n / c)))
-    return math.ceil(n / columns), columns

@@ -13,9 +13,10 @@ from hks_jax import Grid
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
-from hks_jax.plot.figure import new_figure, number_text, save_figure
+from hks_jax.plot.figure import finished, new_figure
 from hks_jax.plot.images import Colours, colours_of, scalar_image
 from hks_jax.plot.orientation import Orientation, View
+from hks_jax.plot.panels import axes_in_rows, panel_titles
 from hks_jax.plot.volumes import volume_panels
 
 SPAN = (0.002, 0.998)
@@ -67,12 +68,15 @@ def signature_panels(
     z = None if z is None else z[:, *box]
     colours = _colours(result, inside)
     if volume.dimension == 3:
-        node = None if through is None else _nearest(inside, through)
+        node = None
+        if through is not None:  # the mask's thinnest parts are no part of the domain
+            nodes, corner = np.argwhere(inside[box]), [part.start for part in box]
+            node = nodes[np.argmin(np.sum((nodes + corner - through) ** 2, axis=1))].tolist()
         return volume_panels(
             values,
             result.times,
             grid,
-            node=node and [i - part.start for i, part in zip(node, box, strict=True)],
+            node=node,
             limits=[each[:2] for each in colours],
             cmap=[each.cmap for each in colours],
             length_unit="mm" if volume.affine is not None else "",
@@ -82,28 +86,21 @@ def signature_panels(
             path=path,
         )
     inside = inside[box]
-    titles = titles or [f"$t$ = {number_text(t)} {result.unit}".rstrip() for t in result.times]
-    faded = [None] * len(values) if z is None else list(z)
-    panels = list(zip(titles, values, colours, faded, strict=True))
+    titles = panel_titles(result.times, titles or None, result.unit)
+    panels = list(zip(titles, values, colours, [None] * len(values) if z is None else z, strict=True))
     if first is not None:
         grey = first[1][box]
         panels.insert(0, (first[0], grey, colours_of(grey[inside], (0.01, 0.96))._replace(cmap="gray"), None))
     rows = math.ceil(len(panels) / 4)
     columns = math.ceil(len(panels) / rows)
     figure = new_figure(columns * 3.3, rows * (2.4 * proportion(grid, orientation) + 0.4) + 0.4 * bool(title))
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, (text, image, (low, high, cmap), noise) in zip(axes, panels, strict=False):
+    axes = axes_in_rows(figure, len(panels), columns)
+    for ax, (text, image, (low, high, cmap), noise) in zip(axes, panels, strict=True):
         image = np.where(inside, image, np.nan)
         scalar_image(ax, image, grid, cmap=cmap, vmin=low, vmax=high, orientation=orientation, z=noise)
         ax.set_title(text, fontsize="medium")
         ax.set_axis_off()
-    for ax in axes[len(panels) :]:
-        ax.remove()
-    if title:
-        figure.suptitle(title)
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+    return finished(figure, title, path)
 
 
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
@@ -114,12 +111,6 @@ def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours
     span = (0.01, 0.99) if "mean" in rim else SPAN
     centre = 1.0 if result.settings["normalisation"] == "flat" else None
     return [colours_of(values[deep], span, LEAST_RANGE, centre) for values in result.values]
-
-
-def _nearest(inside: Bool[np.ndarray, "nx ny nz"], voxel: tuple[int, int, int]) -> tuple[int, ...]:
-    """Return the voxel inside that is nearest: the mask's thinnest parts are no part of the domain."""
-    voxels = np.argwhere(inside)
-    return tuple(voxels[np.argmin(np.sum((voxels - voxel) ** 2, axis=1))].tolist())
 
 
 def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> tuple[Grid, tuple[slice, ...]]:

@@ -17,9 +17,9 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from hks_jax.domain.components import active_elements
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh
-from hks_jax.domain.tet_mesh import TetMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.optional import optional
+from hks_jax.plot.figure import inches
 from hks_jax.plot.images import colours_of, masked
 from hks_jax.plot.volumes import require_volume
 
@@ -140,9 +140,8 @@ def isosurfaces(
     if not np.isfinite(view).all() or np.hypot(view[0], view[1]) == 0:
         raise ValueError(f"view: got {view}; expected a direction that is not along z")
     pyvista = optional("pyvista")
-    inches = ax.get_figure().get_size_inches() * ax.get_position().size  # type: ignore[union-attr]
     with _quiet_about_displays():
-        size = tuple(max(round(resolution * side), 64) for side in inches)
+        size = tuple(max(round(resolution * side), 64) for side in inches(ax))
         plotter = pyvista.Plotter(off_screen=True, window_size=size)
         try:
             domain = _domain(pyvista, array, grid)

@@ -178,13 +178,7 @@ def _both_ways(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Trace from each seed forwards and backwards; both halves begin with the seed, if it has a direction."""
     start = direction(seeds)
-    halves = _march(direction, np.concatenate([seeds, seeds]), np.concatenate([start, -start]), step, n_steps)
-    return halves[: len(seeds)], halves[len(seeds) :]
-
-
-def _march(
-    direction: DirectionField, points: np.ndarray, heading: np.ndarray, step: float, n_steps: int
-) -> list[np.ndarray]:
+    points, heading = np.concatenate([seeds, seeds]), np.concatenate([start, -start])
     alive = np.flatnonzero(np.isfinite(heading[:, 0]))
     track = np.full((n_steps + 1, *points.shape), np.nan)
     x, d = points[alive], heading[alive]
@@ -202,7 +196,8 @@ def _march(
             break
         track[n, alive] = x
     lengths = np.isfinite(track[..., 0]).sum(axis=0)
-    return [track[:m, i] for i, m in enumerate(lengths)]
+    halves = [track[:m, i] for i, m in enumerate(lengths)]
+    return halves[: len(seeds)], halves[len(seeds) :]
 
 
 def _lengths(field: TensorField, step: float | None, max_length: float | None) -> tuple[float, int]:

@@ -15,12 +15,13 @@ from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
-from hks_jax.plot.images import beyond, colours_of, masked, panel_titles, scalar_image, shared_colours
+from hks_jax.plot.images import colours_of, masked, scalar_image, shared_colours
 from hks_jax.plot.orientation import Orientation
+from hks_jax.plot.panels import checked_times, panel_titles
 
 AXES = "xyz"
-NORMALS = (2, 1, 0)
-"""The axes that the three slices are orthogonal to, from the first slice to the last: planes xy, xz, yz."""
+PLANES = ((0, 1), (0, 2), (1, 2))
+"""The axes of the three slices: horizontal, vertical."""
 _COLUMN, _COLUMNS = 2.3, 6
 """The width of a column of slices, in inches, and how many are side by side."""
 
@@ -68,8 +69,9 @@ def orthogonal_slices(
     """
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
-    array, grid, node = _turned(_volume(values, grid), grid, node, orientation)
-    kwargs = shared_colours(array.compressed(), kwargs)
+    require_volume(grid)
+    array, grid, node = _turned(masked("values", values, grid), grid, node, orientation)
+    kwargs = shared_colours([array], kwargs)
     return _slices(axes, array, grid, node, orientation, cross=cross, **kwargs)
 
 
@@ -77,7 +79,7 @@ def _slices(
     axes: Sequence[Axes] | np.ndarray,
     array: np.ma.MaskedArray,
     grid: Grid,
-    chosen: tuple[int, int, int],
+    chosen: tuple[int, ...],
     orientation: Orientation | None,
     *,
     cross: bool = True,
@@ -85,12 +87,12 @@ def _slices(
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the slices of values that are turned already, and return the last image."""
-    for ax, normal in zip(axes, NORMALS, strict=True):
-        first, second = keep = [a for a in range(3) if a != normal]
-        shape, spacing, origin = (np.take(of, keep).tolist() for of in (grid.shape, grid.spacing, grid.origin))
+    for ax, (first, second) in zip(axes, PLANES, strict=True):
+        normal = 3 - first - second
+        plane = (np.take(of, (first, second)).tolist() for of in (grid.shape, grid.spacing, grid.origin))
         slab = np.take(array, chosen[normal], axis=normal)
         faded = None if z is None else np.take(z, chosen[normal], axis=normal)
-        image = scalar_image(ax, slab, Grid(shape, spacing, origin), colorbar=False, z=faded, **kwargs)
+        image = scalar_image(ax, slab, Grid(*plane), colorbar=False, z=faded, **kwargs)
         if orientation is not None:
             orientation.letter(ax, (first, second))
         if cross:
@@ -141,9 +143,10 @@ def volume_panels(
         ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
     """
     require_volume(grid)
-    t, titles = panel_titles(values, times, grid, titles, unit)
-    volumes = [_volume(v, grid) for v in np.asarray(values)]
-    noise = None if z is None else [masked("z", each, grid) for each in np.asarray(z)]
+    t = checked_times(times, grid, values=values)
+    titles = panel_titles(t, titles, unit)
+    volumes = [masked("values", each, grid) for each in np.asarray(values)]
+    noise = [None] * t.size if z is None else [masked("z", each, grid) for each in np.asarray(z)]
     if limits is None:
         limits = [colours_of(volume.compressed(), quantiles)[:2] for volume in volumes]
     elif len(limits) != t.size:
@@ -154,7 +157,7 @@ def volume_panels(
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
     if orientation is not None:
         volumes = [orientation.array(volume) for volume in volumes]
-        noise = None if noise is None else [orientation.array(each) for each in noise]
+        noise = [None if each is None else orientation.array(each) for each in noise]
 
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
@@ -172,13 +175,20 @@ def volume_panels(
                     ax.remove()
                 continue
             low, high = limits[index]
-            colours: dict[str, Any] = {"cmap": cmaps[index], "vmin": low, "vmax": high}
-            faded = None if noise is None else noise[index]
-            image = _slices(panels[:3, column], volumes[index], shown, chosen, orientation, z=faded, **colours)
+            image = _slices(
+                panels[:3, column],
+                volumes[index],
+                shown,
+                chosen,
+                orientation,
+                z=noise[index],
+                cmap=cmaps[index],
+                vmin=low,
+                vmax=high,
+            )
             panels[0, column].set_title(titles[index], fontsize="medium")
             _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
-            extend = beyond(volumes[index], low, high)
-            colour_bar_in(panels[3, column], image, label, orientation="horizontal", extend=extend)
+            colour_bar_in(panels[3, column], image, label, values=volumes[index], orientation="horizontal")
     return finished(fig, suptitle, path)
 
 
@@ -186,26 +196,20 @@ def _label_slices(
     axes: Sequence[Axes] | np.ndarray, grid: Grid, node: tuple[int, ...], unit: str, leftmost: bool
 ) -> None:
     suffix = f" ({unit})" if unit else ""
-    for ax, normal in zip(axes, NORMALS, strict=True):
-        first, second = (a for a in range(3) if a != normal)
+    for ax, (first, second) in zip(axes, PLANES, strict=True):
         ax.set_xlabel(AXES[first] + suffix, fontsize=SMALL, labelpad=1)
         ax.tick_params(labelleft=leftmost)
         if leftmost:
-            place = f"{AXES[normal]} = {grid.axes[normal][node[normal]]:.4g}{' ' * bool(unit)}{unit}"
+            normal = 3 - first - second
+            place = f"{AXES[normal]} = {grid.axes[normal][node[normal]]:.4g} {unit}".rstrip()
             ax.set_ylabel(f"{place}\n{AXES[second]}{suffix}", fontsize=SMALL)
 
 
 def _heights(grid: Grid) -> list[float]:
     """Return the slices' heights in inches, when the widest of them is as wide as a column."""
-    planes = [[a for a in range(3) if a != normal] for normal in NORMALS]
     sizes = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
     scale = _COLUMN / max(sizes[0], sizes[1])
-    return [min(max(scale * sizes[second], 0.25), 3 * _COLUMN) for _, second in planes]
-
-
-def _volume(values: Any, grid: Grid) -> np.ma.MaskedArray:
-    require_volume(grid)
-    return masked("values", values, grid)
+    return [min(max(scale * sizes[second], 0.25), 3 * _COLUMN) for _, second in PLANES]
 
 
 def require_volume(grid: Grid) -> None:
@@ -218,25 +222,18 @@ def require_volume(grid: Grid) -> None:
 
 def _turned(
     array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
-) -> tuple[np.ma.MaskedArray, Grid, tuple[int, int, int]]:
+) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
     """Return values, grid and node as the picture has them, the node being one with a value."""
-    if orientation is None:
-        return array, grid, _checked_node(node, array, grid)
-    chosen = None if node is None else orientation.node(_checked_node(node, array, grid), grid.shape)
-    array, grid = orientation.array(array), orientation.grid(grid)
+    if node is not None:
+        inside, node = ~np.ma.getmaskarray(array), tuple(int(i) for i in node)
+        if len(node) != 3 or not all(0 <= i < n for i, n in zip(node, grid.shape, strict=True)):
+            raise ValueError(f"node: got {node}; expected three indices within the grid's shape {grid.shape}")
+        if not inside[node]:
+            raise ValueError(
+                f"node: {node} has no value; the one nearest to the middle that has is {middle_node(inside)}"
+            )
+    if orientation is not None:
+        node = None if node is None else orientation.node(node, grid.shape)
+        array, grid = orientation.array(array), orientation.grid(grid)
     # One in the middle is sought in the picture: of two that are as near, the order of storage chooses none.
-    return array, grid, _checked_node(chosen, array, grid)
-
-
-def _checked_node(node: Sequence[int] | None, array: np.ma.MaskedArray, grid: Grid) -> tuple[int, int, int]:
-    inside = ~np.ma.getmaskarray(array)
-    if node is None:
-        return middle_node(inside)
-    chosen = tuple(int(i) for i in node)
-    if len(chosen) != 3 or not all(0 <= i < n for i, n in zip(chosen, grid.shape, strict=True)):
-        raise ValueError(f"node: got {tuple(node)}; expected three indices within the grid's shape {grid.shape}")
-    if not inside[chosen]:
-        raise ValueError(
-            f"node: {chosen} has no value; the one nearest to the middle that has is {middle_node(inside)}"
-        )
-    return chosen
+    return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else node

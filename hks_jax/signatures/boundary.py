@@ -5,20 +5,18 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hks_jax.checks import checked_times
+from hks_jax.arrays import nan_is_meant
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
-from hks_jax.fem.boundary import BoundarySpec, Sides, normalise_boundary
-from hks_jax.nan_outside import nan_is_meant
+from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.signatures.filters import Heat
-from hks_jax.signatures.hks import hks_of_pairs
+from hks_jax.signatures.hks import hks
 from hks_jax.signatures.spectral_functions import spectral_diagonal
-from hks_jax.signatures.times import require_pairs
-from hks_jax.signatures.truncation import warn_if_truncated
+from hks_jax.signatures.truncation import resolved_times
 
 
 @nan_is_meant
@@ -61,31 +59,28 @@ def boundary_influence(
             raise ValueError("k, boundary: eigenpairs have them already; leave them out")
         if len(domain.pencil.parts) != 2:
             raise ValueError('domain: got eigenpairs of another boundary than "mean"; compute them with that')
-        times = checked_times("times", times, require_pairs(domain).eigenvalues.dtype)
-        warn_if_truncated(domain, times)
+        times = resolved_times(domain, times)
         free, zero = (spectral_diagonal(domain.of_part(i), Heat(times)) for i in range(2))
     else:
         if k is None:
             raise ValueError("k: got None; say how many eigenpairs of either problem to compute")
         pencil = assemble(domain, _glued(domain, boundary))
         pairs = (eigenpairs(part, k, solver=solver, multiplet="complete") for part in pencil.parts)
-        free, zero = (hks_of_pairs(each, times) for each in pairs)
+        free, zero = (hks(each, times) for each in pairs)
     # Rounding where both are equal, and truncation where both are small, may leave the interval.
     return jnp.clip((free - zero) / (free + zero), 0, 1)
 
 
 def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:
     """Return the boundary that has the mean on all of the rim."""
-    allowed = ("neumann", "mean", "periodic")
     if isinstance(domain, SimplicialMesh):
-        if boundary not in allowed[:2]:
+        if boundary not in ("neumann", "mean"):
             raise ValueError(f'boundary: got {boundary!r}; a mesh takes "neumann" here')
         return "mean"
     sides = normalise_boundary(boundary, domain.grid.dimension)
-    if any(condition not in allowed for pair in sides for condition in pair):
+    if not {condition for pair in sides for condition in pair} <= {"neumann", "mean", "periodic"}:
         raise ValueError(
             f'boundary: got {boundary!r}; expected "neumann" or "periodic" for each axis: natural and Dirichlet '
             "conditions on all sides that are not periodic are compared"
         )
-    mean: Sides = ("mean", "mean")
-    return tuple(pair if pair == ("periodic", "periodic") else mean for pair in sides)
+    return tuple("periodic" if pair == ("periodic", "periodic") else "mean" for pair in sides)

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.products import quadratic_forms
-from hks_jax.static_array import StaticArray
 
 
 class Contraction(eqx.Module):
@@ -41,28 +41,50 @@ class Diagonal(Contraction):
         return quadratic_forms(matrices, vectors, matters)
 
 
-class _FromSources(Contraction):
-    space: FunctionSpace = eqx.field(static=True)
-    sources: StaticArray = eqx.field(static=True)
+class _Bilinear(Contraction):
+    """Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x), for coefficients a (s, k) that are linear in the functions."""
 
-    def at_sources(self, vectors: Float[Array, "k n"]) -> Float[Array, "k s"]:
-        """Return the functions' values at the source nodes (flat node indices): 0 at Dirichlet nodes."""
-        degrees = self.space.degrees_of_freedom[self.sources.value]
-        return jnp.where(degrees >= 0, vectors[:, degrees], 0)
-
-
-class Columns(_FromSources):
-    """(Φ C Φᵀ)(x_s, x) for source nodes x_s."""
+    @abstractmethod
+    def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
+        """Return a."""
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
-        """Return Σᵢ cᵢ φᵢ(x_s) φᵢ(x)."""
-        return _matmul(weights[:, None, :] * self.at_sources(vectors).T[None], vectors)
+        """Return Σᵢ cᵢ aᵢ φᵢ(x)."""
+        return _matmul(weights[:, None, :] * self.coefficients(vectors), vectors)
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
     ) -> Float[Array, "m s n"]:
-        """Return Σᵢⱼ Cᵢⱼ φᵢ(x_s) φⱼ(x)."""
-        return _matmul(_matmul(self.at_sources(vectors).T, matrices), vectors)
+        """Return Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x)."""
+        return _matmul(_matmul(self.coefficients(vectors), matrices), vectors)
+
+
+class Applied(_Bilinear):
+    """Φ C Φᵀ w for functionals w.
+
+    Attributes:
+        functionals: (s, n).
+    """
+
+    functionals: Float[Array, "s n"]
+
+    def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
+        """Return φᵢ·w."""
+        return _matmul(self.functionals, vectors.T)
+
+
+class _FromSources(Contraction):
+    space: FunctionSpace = eqx.field(static=True)
+    sources: StaticArray = eqx.field(static=True)
+
+    def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
+        """Return φᵢ(x_s) at the source nodes (flat node indices): 0 at Dirichlet nodes."""
+        degrees = self.space.degrees_of_freedom[self.sources.value]
+        return jnp.where(degrees >= 0, vectors[:, degrees], 0).T
+
+
+class Columns(_FromSources, _Bilinear):
+    """(Φ C Φᵀ)(x_s, x) for source nodes x_s."""
 
 
 class SquaredDistances(_FromSources):
@@ -87,28 +109,8 @@ class SquaredDistances(_FromSources):
 
     def _map(self, vectors: Float[Array, "k n"], reading: Callable[[Array], Array]) -> Float[Array, "m s nodes"]:
         nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], self.space.free.size)
-        readings = jax.lax.map(lambda source: reading(nodal - source[:, None]), self.at_sources(vectors).T)
+        readings = jax.lax.map(lambda source: reading(nodal - source[:, None]), self.coefficients(vectors))
         return jnp.moveaxis(readings, 0, 1)
-
-
-class Applied(Contraction):
-    """Φ C Φᵀ w for functionals w.
-
-    Attributes:
-        functionals: (s, n).
-    """
-
-    functionals: Float[Array, "s n"]
-
-    def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
-        """Return Σᵢ cᵢ (φᵢ·w) φᵢ(x)."""
-        return _matmul(weights[:, None, :] * _matmul(self.functionals, vectors.T), vectors)
-
-    def mixed(
-        self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
-    ) -> Float[Array, "m s n"]:
-        """Return Σᵢⱼ Cᵢⱼ (φᵢ·w) φⱼ(x)."""
-        return _matmul(_matmul(_matmul(self.functionals, vectors.T), matrices), vectors)
 
 
 def _matmul(a: Array, b: Array) -> Array:

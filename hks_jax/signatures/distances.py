@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import checked_times
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral_functions import (
     source_indices,
@@ -19,8 +18,8 @@ from hks_jax.signatures.spectral_functions import (
     spectral_diagonal,
     spectral_squared_distances,
 )
-from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
-from hks_jax.signatures.truncation import truncation, warn_if_truncated
+from hks_jax.signatures.times import dimension_of, positive_range, times_of, volume_of
+from hks_jax.signatures.truncation import resolved_times, truncation
 from hks_jax.traced import is_traced
 
 
@@ -35,9 +34,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     Returns:
         (n_times, n_sources, *shape) in 1/(metric length)^(d/2); NaN outside the mask.
     """
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, 2 * times)
-    return _distance(pairs, Heat(2 * times), sources)
+    return _distance(pairs, Heat(resolved_times(pairs, 2 * times_of(pairs, times))), sources)
 
 
 @nan_is_meant
@@ -110,13 +107,13 @@ def varadhan_distance(
 
     Varadhan 1967; Zobel, Reininghaus and Hotz, section 2. At a positive t the kernel is (4πt)^(−n/2) exp(−d²/4t)
     (u₀ + O(t)) in n dimensions. Divided by its diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), it has no power of t
-    before it and is at most 1: the error of d² is −4t log u₀ + O(t²), none on a flat domain away from its sides. The
-    formula as it stands errs by 2nt log 4πt besides.
+    before it: the error of d² is −4t log u₀ + O(t²), none on a flat domain away from its sides. The formula as it
+    stands errs by 2nt log 4πt besides.
 
-    Small times need fine grids and many pairs. At the distance d linear elements err by d²h²/48t² of d² (h: the
-    distance of neighbours), so that t must be about d·h or more; and exp(−d²/4t) must stand out from what lies beyond k
-    and from rounding. Where the kernel's estimated error exceeds a tenth of it, or the grid's error of d² a tenth, the
-    result is NaN, not a guess. Larger times reach further, at the cost of an error that grows with t.
+    Small times need fine grids and many pairs: linear elements with neighbours at the distance h err by d²h²/48t² of
+    d², and exp(−d²/4t) must stand out from the part beyond k and from rounding. Where the kernel's estimated error
+    exceeds a tenth of it, or the grid's error of d² a tenth, the result is NaN. Larger times reach further, at the cost
+    of an error that grows with t.
 
     Args:
         pairs: from `eigenpairs`; more of them reach further. Distances are those within the domain: around holes of its
@@ -137,8 +134,7 @@ def varadhan_distance(
         AccuracyWarning: how many distances are NaN, and what limits them; and as `hks`, times too small for k or
             for the grid.
     """
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, times)
+    times = resolved_times(pairs, times)
     nodes, space = source_indices(pairs, sources), pairs.space
     if not space.free.ravel()[nodes].all():
         raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is zero; choose others")

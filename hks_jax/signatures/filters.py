@@ -40,17 +40,10 @@ def second_divided_difference(
     above: Float[Array, "*n"],
     scale: Float[Array, ""],
 ) -> Float[Array, "*n"]:
-    """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where they are equal.
+    """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where they are equal, given f[a, b] and f[b, c].
 
-    Args:
-        f: elementwise.
-        low: a.
-        middle: b.
-        high: c.
-        below: f[a, b].
-        above: f[b, c].
-        scale: the largest magnitude of f' or [f], to whose rounding the result is accurate: where f' is much smaller
-            it may still have errors of that size, 1 − tanh² for example.
+    The scale is the largest magnitude of f' or [f]. The result is accurate to its rounding: where f' is much smaller,
+    it may still have errors of that size, 1 − tanh² for example.
     """
     curvature = _derivative(_derivative(f))
 
@@ -75,12 +68,7 @@ def _mean_or_quotient(
 ) -> Float[Array, "*n"]:
     """Return the mean where two quadrature rules for it and the quotient agree as far as each can; else the quotient.
 
-    Args:
-        coarse: the mean, by a quadrature rule.
-        fine: the mean, by a more accurate one.
-        gap: the denominator of the quotient, not negative.
-        change: the numerator of the quotient.
-        size: the magnitude of the two terms whose difference the numerator is.
+    The quotient is the change, the difference of two terms of a given size, over the gap.
     """
     eps = jnp.finfo(gap.dtype).eps
     apart = gap > 0

@@ -10,12 +10,12 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import checked_times, require_real
+from hks_jax.checks import require_real
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_flow
-from hks_jax.signatures.times import require_pairs
+from hks_jax.signatures.times import times_of
 from hks_jax.signatures.truncation import TAIL_LIMIT
 from hks_jax.traced import is_traced
 
@@ -41,10 +41,9 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
     Warns:
         AccuracyWarning: the part of a function beyond the k pairs has not decayed at some time to 1 % of its norm.
     """
-    dtype = require_pairs(pairs).eigenvalues.dtype
-    times, shape = checked_times("times", times, dtype), pairs.space.node_shape
+    times, shape = times_of(pairs, times), pairs.space.node_shape
     require_real("functions", functions)
-    u = jnp.asarray(functions, dtype)
+    u = jnp.asarray(functions, times.dtype)
     if u.shape[u.ndim - len(shape) :] != shape:
         raise ValueError(f"functions: got shape {u.shape}; expected {shape}, or more axes before it")
     if not is_traced(u):
@@ -115,9 +114,8 @@ def gaussian_scale_space(
 ) -> Float[np.ndarray, "n_times *functions_and_shape"]:
     """Blur functions by Gaussians, the same in all directions and everywhere, as far as heat spreads on average.
 
-    Heat that diffuses for the time t in a flat metric s·I has the standard deviation √(2t/s) in coordinates; here s is
-    the mean of |T|^(1/d) over the domain. Masks are kept by dividing by the blurred mask, and reflection continues the
-    functions beyond the sides of the grid: a constant stays what it is.
+    In coordinates the standard deviation is √(2t/s), s the mean of |T|^(1/d) over the domain. Masks are kept: we divide
+    by the blurred mask, and reflection continues functions beyond the sides of the grid: constants stay as they are.
 
     Args:
         field: the metric, for its scale, its grid and its mask.

@@ -11,14 +11,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
-from hks_jax.checks import checked_times, require_number
+from hks_jax.arrays import nan_is_meant
+from hks_jax.checks import require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.pencil import AnyPencil
-from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import dimension_of, require_pairs, volume_of
-from hks_jax.signatures.truncation import truncation, warn_if_truncated
+from hks_jax.signatures.times import dimension_of, times_of, volume_of
+from hks_jax.signatures.truncation import resolved_times, truncation
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
 from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, work
 from hks_jax.traced import is_traced
@@ -56,17 +55,15 @@ class AutomaticHKS(eqx.Module):
         times, spectral = np.asarray(self.times), np.asarray(self.spectral)
         lines = []
         for name, which in (("eigenpairs", spectral), (self.method, ~spectral)):
-            if which.any():
-                lines.append(f"{int(which.sum())} of {times.size} times by {name}: {_listed(times[which])}")
+            some = [f"{t:.4g}" for t in times[which]]
+            if some:
+                listed = ", ".join(some[:8]) + (" …" if len(some) > 8 else "")
+                lines.append(f"{len(some)} of {times.size} times by {name}: {listed}")
         if math.isfinite(float(self.overlap_time)):
             lines.append(
                 f"both at t = {float(self.overlap_time):.4g}: they differ by {float(self.overlap_difference):.1e}"
             )
         return "\n".join(lines)
-
-
-def _listed(times: np.ndarray) -> str:
-    return ", ".join(f"{t:.4g}" for t in times[:8]) + (" …" if times.size > 8 else "")
 
 
 def hks(
@@ -102,16 +99,18 @@ def hks(
         AccuracyWarning: times too small for the number of pairs or for the grid (see `truncation`).
     """
     if method == "spectral":
-        return hks_of_pairs(pairs, times, normalisation)
+        times = resolved_times(pairs, times)
+        scale = None if normalisation == "raw" else normaliser(pairs, times, normalisation)
+        return spectral_diagonal(pairs, Heat(times), scale)
     if method == "auto":
         return hks_auto(pairs, times, normalisation, tolerance).values
     if method != "spectrum-free":
         raise ValueError(f'method: got {method!r}; expected "spectral", "spectrum-free" or "auto"')
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    times = times_of(pairs, times)
     require_number("tolerance", tolerance, 1)
     if not pairs.lowest:
         raise ValueError('method: got "spectrum-free" for pairs in an interval; expected "spectral"')
-    return _scaled(pairs, times, normalisation, _without(pairs.pencil, times, tolerance))
+    return _scaled(pairs, times, normalisation, hks_spectrum_free(pairs.pencil, times, tolerance=tolerance))
 
 
 @nan_is_meant
@@ -140,7 +139,7 @@ def hks_auto(
         AccuracyWarning: the two differ by more than ten times the tolerance, or times too small for the grid.
     """
     require_number("tolerance", tolerance, 1)
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
+    times = times_of(pairs, times)
     known_pairs, known_times = jax.lax.stop_gradient((pairs, times))
     if is_traced((known_pairs.eigenvalues, known_times)):
         raise ValueError(
@@ -151,20 +150,22 @@ def hks_auto(
     spectral = np.asarray(estimate.tail) <= tolerance
     nan = jnp.asarray(np.nan, times.dtype)
     if spectral.all():
-        values = hks_of_pairs(pairs, times, normalisation)
+        values = hks(pairs, times, normalisation)
         return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, "none", nan, nan)
     small = np.flatnonzero(~spectral)
     pencil = pairs.pencil
     settings = choose_method(pencil, times[small], "auto", tolerance)
-    raw = _without(pencil, times[small], tolerance, settings or "selected-inversion")
+    raw = hks_spectrum_free(pencil, times[small], method=settings or "selected-inversion", tolerance=tolerance)
     others = _scaled(pairs, times[small], normalisation, raw)
-    for message in _coarse(estimate, small):
+    # That k is too small is no matter here; the grid may be.
+    some = jax.tree.map(lambda leaf: leaf[small] if leaf.ndim else leaf, estimate)
+    for message in eqx.tree_at(lambda e: e.tail, some, jnp.zeros(small.size)).messages():
         warn_of_accuracy(message)
     values = jnp.zeros((times.size, *others.shape[1:]), others.dtype).at[small].set(others)
     overlap = difference = nan
     if spectral.any():
         large = np.flatnonzero(spectral)
-        of_pairs = hks_of_pairs(pairs, times[large], normalisation)
+        of_pairs = hks(pairs, times[large], normalisation)
         values = values.at[large].set(of_pairs)
         overlap = jnp.min(known_times[large])
         least = work(settings, pencil, times[small])
@@ -179,35 +180,12 @@ def hks_auto(
     return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, name, overlap, difference)
 
 
-def _without(
-    pencil: AnyPencil, times: Float[Array, " m"], tolerance: float, method: Any = "auto"
-) -> Float[Array, "m *shape"]:
-    return hks_spectrum_free(pencil, times, method=method, tolerance=tolerance)
-
-
 def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, values: Array) -> Array:
-    """Normalise a raw signature."""
     if normalisation == "heat-trace":
         raise ValueError(
             'normalisation: "heat-trace" needs the whole spectrum; use "raw", "volume" or "flat", or method="spectral"'
         )
     return values * normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
-
-
-def _coarse(estimate: Any, small: np.ndarray) -> list[str]:
-    """Return what `truncation` has to say of the grid at some of its times; that k is too small is no matter there."""
-    some = eqx.tree_at(
-        lambda e: (e.times, e.tail, e.resolution_bias, e.lasting_bias, e.coarse_fraction),
-        estimate,
-        (
-            estimate.times[small],
-            jnp.zeros(small.size),
-            estimate.resolution_bias[small],
-            estimate.lasting_bias[small],
-            estimate.coarse_fraction[small],
-        ),
-    )
-    return some.messages()
 
 
 def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
@@ -216,7 +194,6 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
     NaN where that would take more work than is allowed, or rounding does not allow the tolerance.
     """
     pencil = pairs.pencil
-    assert isinstance(pencil, AnyPencil)
     try:
         settings = least_work(pencil, times, tolerance)
     except Unattainable:
@@ -225,17 +202,9 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
         return jnp.asarray(np.nan, times.dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)
-        spectral = hks_of_pairs(pairs, times)
-    gap = jnp.abs(spectral - _without(pencil, times, tolerance, settings or "selected-inversion"))
-    return jnp.nanmax(gap) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)
-
-
-def hks_of_pairs(pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw") -> Float[Array, "n_times *shape"]:
-    """Compute the heat kernel signature as a sum over eigenpairs: `hks_jax.hks` with its method ``"spectral"``."""
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, times)
-    scale = None if normalisation == "raw" else normaliser(pairs, times, normalisation)
-    return spectral_diagonal(pairs, Heat(times), scale)
+        spectral = hks(pairs, times)
+    other = hks_spectrum_free(pencil, times, method=settings or "selected-inversion", tolerance=tolerance)
+    return jnp.nanmax(jnp.abs(spectral - other)) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)
 
 
 def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:

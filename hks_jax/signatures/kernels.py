@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import checked_times, require_number, require_real
+from hks_jax.checks import require_number, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
 from hks_jax.signatures.spectral_functions import source_indices, spectral_columns, spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import default_energies, positive_range, require_pairs
-from hks_jax.signatures.truncation import warn_if_truncated
+from hks_jax.signatures.truncation import resolved_times
 from hks_jax.traced import is_traced
 
 
@@ -27,9 +27,7 @@ def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:
     Warns:
         AccuracyWarning: times too small for the number of pairs or for the grid.
     """
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, times)
-    return spectral_trace(pairs, Heat(times))
+    return spectral_trace(pairs, Heat(resolved_times(pairs, times)))
 
 
 def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_times n_sources *shape"]:
@@ -46,9 +44,7 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
     Raises:
         ValueError: bad times, or sources out of range or outside the mask.
     """
-    times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-    warn_if_truncated(pairs, times)
-    return spectral_columns(pairs, Heat(times), source_indices(pairs, sources))
+    return spectral_columns(pairs, Heat(resolved_times(pairs, times)), source_indices(pairs, sources))
 
 
 def scale_invariant_hks(
@@ -57,14 +53,13 @@ def scale_invariant_hks(
     """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT| of d/dτ log HKS(exp τ, x), low frequencies.
 
     Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant; the derivative drops the constant, the
-    modulus of the Fourier transform the shift. The default times follow the spectrum (log-spaced from 4 ln10/λ_last to
-    4 ln10/λ₁), which makes the invariance exact; give ``times`` (log-spaced) to compare shapes at absolute scales.
+    modulus of the Fourier transform the shift. The default times follow the spectrum, which makes the invariance exact.
 
     Args:
         pairs: from `eigenpairs`.
         n_frequencies: how many Fourier moduli, from frequency 0.
         n_times: how many samples of τ.
-        times: (n,) log-spaced times instead of the default.
+        times: (n,) log-spaced times, to compare shapes at absolute scales; None: from 4 ln10/λ_last to 4 ln10/λ₁.
 
     Returns:
         (n_frequencies, *shape), without unit; NaN outside the mask and at Dirichlet nodes.
@@ -73,8 +68,7 @@ def scale_invariant_hks(
         first, last = positive_range(pairs)
         times = 4 * math.log(10.0) / jnp.geomspace(last, first, n_times)
     else:
-        times = checked_times("times", times, require_pairs(pairs).eigenvalues.dtype)
-        warn_if_truncated(pairs, times)
+        times = resolved_times(pairs, times)
     if not 1 <= n_frequencies <= times.size // 2 + 1:
         raise ValueError(
             f"n_frequencies: got {n_frequencies}; {times.size} times have 1 … {times.size // 2 + 1} frequencies"

@@ -10,19 +10,18 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.arrays import StaticArray, nan_outside
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.all_nodes import on_all_nodes
+from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.not_differentiable import first_order_only
+from hks_jax.linear.linear_map import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
-from hks_jax.nan_outside import nan_outside
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter
 from hks_jax.signatures.mixing import like, mixing, on_host, weights_of
-from hks_jax.static_array import StaticArray
 from hks_jax.traced import is_traced
 
 _ROWS = 128

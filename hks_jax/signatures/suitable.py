@@ -31,11 +31,7 @@ def default_k(dimension: int, unknowns: int) -> int:
 def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> dict[str, float]:
     """Return the times and k that suit a metric on a grid; see `suitable_times`.
 
-    Args:
-        metric: (n, d, d) at nodes of the domain, or at some of them that stand for all.
-        spacing: (d,) of the grid.
-        inside: (*shape) the nodes of the domain.
-        boundary: under which the mean's two problems share the pairs.
+    The metric (n, d, d) is that at the nodes inside the domain, or at some of them that stand for all.
     """
     metric, spacing = np.asarray(metric), np.asarray(spacing)
     d, share = len(spacing), inside.sum() / len(metric)
@@ -53,13 +49,8 @@ def suitable_times(
 ) -> dict[str, float]:
     """Return the least time that the spacing allows, what k it takes, what the default k allows, and the largest.
 
-    Args:
-        dimension: of the domain.
-        volume: its area or volume in the metric.
-        width2: the square of the distance between neighbouring nodes.
-        size: the domain's length.
-        nodes: their number.
-        problems: how many eigenproblems share the eigenpairs.
+    `width2` is the square of the distance between neighbouring nodes, `size` the domain's length. Under the mean and
+    with mirrors several problems share the eigenpairs.
     """
     least, unknowns = COARSE * width2, problems * nodes
     k = default_k(dimension, unknowns)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.checks import checked_times
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.traced import is_traced
@@ -24,25 +25,28 @@ def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
     return pairs
 
 
+def times_of(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
+    """Return times as an array in the precision of the pairs; raise TypeError or ValueError for anything else."""
+    return checked_times(times, require_pairs(pairs).eigenvalues.dtype)
+
+
 def dimension_of(pairs: Eigenpairs, purpose: str) -> int:
     """Return the dimension of the manifold; raise ValueError where it is not known."""
-    if pairs.space.dimension is None:
-        raise ValueError(
-            f"pairs: {purpose} needs the dimension of the manifold, which matrices do not say; give "
-            "`sparse_pencil(K, M, dimension=…)`"
-        )
-    return pairs.space.dimension
+    return _stated(pairs.space.dimension, "dimension", "manifold", purpose)
 
 
 def volume_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
     """Return the area or volume of the domain; raise ValueError where it is not known."""
-    volume = pairs.pencil.volume
-    if volume is None:
+    return _stated(pairs.pencil.volume, "volume", "domain", purpose)
+
+
+def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
+    if value is None:
         raise ValueError(
-            f"pairs: {purpose} needs the volume of the domain, which matrices do not say; give "
-            "`sparse_pencil(K, M, volume=…)`"
+            f"pairs: {purpose} needs the {name} of the {of}, which matrices do not say; give "
+            f"`sparse_pencil(K, M, {name}=…)`"
         )
-    return volume
+    return value
 
 
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:

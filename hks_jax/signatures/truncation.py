@@ -14,15 +14,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import checked_times
+from hks_jax.arrays import nan_is_meant
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import mask_for
 from hks_jax.linear.loops import for_each
-from hks_jax.nan_outside import nan_is_meant
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal
-from hks_jax.signatures.times import dimension_of, require_pairs
+from hks_jax.signatures.times import dimension_of, times_of
 from hks_jax.traced import is_traced
 
 TAIL_LIMIT = 0.01
@@ -94,24 +93,19 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     Weyl's law N(λ) = k (λ/Λ)^(d/2), whose constant is taken from the spectrum itself (Λ is the first eigenvalue beyond
     the k), gives the part of the heat trace beyond Λ: a mean over the domain. `truncation_map` has single nodes.
 
-    The error by the spacing h has two parts. One is that of a constant metric, d h²/48t where its axes are the grid's,
-    more where they are not. The other does not fall as t grows: where tensors turn or stretch from node to node,
-    elements are too stiff, and the interpolated tensors have another volume, to whose inverse the signature tends. Both
-    are of leading order in h. On fields whose tensors turn, in 2D and 3D, with either interpolation, the median error
-    was a third of the estimate to three times it, where k was enough for t; at eigenvalue ratios of 30 on coarse grids
-    (errors above 10 %) down to a quarter. On meshes only the first part is estimated. Of matrices from elsewhere the
-    spacing is not known, and its error NaN.
+    The error by the spacing h has two parts, both of leading order in h. One is that of a constant metric, d h²/48t
+    where its axes are the grid's, more where they are not. The other does not fall as t grows: where tensors turn or
+    stretch from node to node, elements are too stiff, and the interpolated tensors have another volume. Where k was
+    enough for t, the median error on such fields was a third of the estimate to three times it; a quarter at eigenvalue
+    ratios of 30 on coarse grids. On meshes only the first part is estimated.
 
-    A potential changes both. Where nothing is known of the null space, the exponent is the one that the mean of the
-    pairs' eigenvalues tells, if it is more than d/2, and the error by the spacing is NaN.
+    With a potential, or where nothing is known of the null space, the exponent is the one that the mean of the pairs'
+    eigenvalues tells, if it is more than d/2. The error by the spacing is then NaN, as that of matrices from elsewhere.
 
     Raises:
         ValueError: times that are not positive and finite; pairs in an interval; matrices whose dimension is not known.
     """
-    dtype = require_pairs(pairs).eigenvalues.dtype
-    if not pairs.lowest:
-        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
-    pairs, at = jax.lax.stop_gradient((pairs, checked_times("times", times, dtype)))
+    pairs, at = _estimated(pairs, times)
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
     dimension, resolution = dimension_of(pairs, "an estimate of the truncation"), pairs.pencil.resolution
     by_weyl, errors, order = pairs.null_space_known, None, 1
@@ -199,17 +193,26 @@ def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
     return xp.where(xp.any(xp.isnan(x), axis=1), xp.nan, median)
 
 
-def warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n"]) -> None:
-    """Warn (AccuracyWarning) of times that k or the spacing does not resolve, where values are concrete.
+def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, " n"]]:
+    """Return pairs and times, constant to derivatives; raise ValueError for pairs of which nothing is estimated."""
+    at = times_of(pairs, times)
+    if not pairs.lowest:
+        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
+    return jax.lax.stop_gradient((pairs, at))
 
-    Nothing is said of pairs in an interval, whose sums are meant to be those of a band, nor where the dimension of the
-    manifold is not known.
+
+def resolved_times(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
+    """Return times as `times_of` does; warn (AccuracyWarning) of those that k or the spacing does not resolve.
+
+    Nothing is said where values are traced, of pairs in an interval, whose sums are meant to be those of a band, nor
+    where the dimension of the manifold is not known.
     """
-    pairs, times = jax.lax.stop_gradient((pairs, times))
-    if is_traced((pairs.eigenvalues, pairs.pencil, times)) or not pairs.lowest or pairs.space.dimension is None:
-        return
-    for message in truncation(pairs, times).messages():
-        warn_of_accuracy(message)
+    times = times_of(pairs, times)
+    known, at = jax.lax.stop_gradient((pairs, times))
+    if not is_traced((known.eigenvalues, known.pencil, at)) and pairs.lowest and pairs.space.dimension is not None:
+        for message in truncation(known, at).messages():
+            warn_of_accuracy(message)
+    return times
 
 
 _EXPONENTS = np.geomspace(0.5, 8, 33)
@@ -274,10 +277,8 @@ def truncation_map(
     N(Λ, x) and the exponent a(x) come from the pairs, the latter from the mean of λ at the node, which is Λ a/(a + 1):
     about d/2 inside and at natural sides, d/2 + 1 at a Dirichlet side.
 
-    An estimate, not a bound. Against all pairs of small grids (2D and 3D, flat, smooth and rough tensors, every
-    boundary, from 28 pairs to a third of all) the largest share of a node was 0.25 to 2 times the largest estimate
-    where the mean was above 0.1 %, and up to 3 times at a mean of 1e-6. Where the mean was 1 % the largest share was
-    1.1 to 6 times that without Dirichlet sides, and 3 to 20 times beside them.
+    An estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the largest estimate
+    where the mean was above 0.1 %, and up to 3 times at a mean of 1e-6.
 
     Args:
         pairs: from `eigenpairs`.
@@ -290,10 +291,7 @@ def truncation_map(
     Raises:
         ValueError: times that are not positive and finite; pairs in an interval.
     """
-    dtype = require_pairs(pairs).eigenvalues.dtype
-    if not pairs.lowest:
-        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
-    return _map(*jax.lax.stop_gradient((pairs, checked_times("times", times, dtype))))
+    return _map(*_estimated(pairs, times))
 
 
 @jax.jit

@@ -2,15 +2,16 @@
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.fem.space import GridSpace, axis_colours
 from hks_jax.linear.chebyshev import coefficient_tails, least_degree
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
-from hks_jax.static_array import StaticArray
 
 _STEEPEST = 0.9
 """How much of the steepest decay of M⁻¹ is made use of: near all of it the bound has a large factor before it."""
@@ -34,10 +35,8 @@ class Colouring:
         across: per axis what `Bounds.across` was.
         error: per time what the error stays below, relative to the smaller of (4πt)^(−d/2) and the largest value a
             node can have, rounding included. With a lumped mass a bound (but for a probability of 10⁻⁶ that `top` is
-            too small). With a consistent mass the polynomial for M⁻¹ is bounded to first order, and what sources of one
-            colour add to each other is bounded as t → 0 and for a constant metric; for varying ones it is not proven.
-            Measured against all pairs, log-determinants jumping by σ = 0 … 6 from node to node: never exceeded, and
-            fifty times too large or more.
+            too small). With a consistent mass it is proven to first order in the polynomial for M⁻¹, as t → 0 and for a
+            constant metric; for varying ones it was never exceeded, and fifty times too large or more.
     """
 
     spacing: tuple[int, ...]
@@ -90,66 +89,59 @@ def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> An
     return np.exp(-alpha * s + reach_time * growth) / (low * (1 - across * growth))
 
 
-def kernel_scale(time: float, limits: Bounds, dimension: int) -> float:
-    """Return what errors are relative to: the flat kernel's diagonal, or 1/D where time is below the resolution."""
-    return min((4 * math.pi * time) ** (-dimension / 2), 1 / float(limits.greatest_mass))
+def _unit(time: float, limits: Bounds, dimension: int) -> float:
+    """Return the unit of errors, times the least entry of D.
+
+    The unit is the flat kernel's diagonal, or the largest 1/D where time is below the resolution.
+    """
+    return limits.least_mass * min((4 * math.pi * time) ** (-dimension / 2), 1 / limits.greatest_mass)
 
 
 def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Bounds, space: GridSpace) -> float:
-    """Bound the error at one time, relative to `kernel_scale`.
+    """Bound the error at one time, relative to the unit of errors.
 
     Two parts: the expansion's tail, and what other sources of the colour add. The latter is the kernel at their
     distance, and no more than the tail beyond as many terms as there are nodes between, for a polynomial of lower
     degree does not reach there (lumped mass).
     """
-    lumped = float(limits.low) == 1
-    tails = coefficient_tails(time * float(limits.top) / 2)
+    low, d = limits.low, space.dimension
+    tails = coefficient_tails(time * limits.top / 2)
     beyond = float(tails[min(degree + 1, tails.size - 1)])
-    d = space.dimension
-    steps = [_steps(n, s, wraps) for n, s, wraps in zip(space.node_shape, spacing, space.periodic, strict=True)]
-    decay = np.stack(
-        np.meshgrid(
-            *[
-                reach_bound(np.arange(k) * s, time * float(kappa), float(limits.low), float(beta))
-                for k, s, kappa, beta in zip(steps, spacing, limits.reach, limits.across, strict=True)
-            ],
-            indexing="ij",
-        )
-    ).min(axis=0)
-    decay = decay + beyond
-    copies = np.stack(np.meshgrid(*[np.where(np.arange(k) == 0, 1, 2) for k in steps], indexing="ij")).prod(axis=0)
-    if lumped:
-        away = np.stack(
-            np.meshgrid(*[np.arange(k) * s for k, s in zip(steps, spacing, strict=True)], indexing="ij")
-        ).max(axis=0)
-        within = np.where(away <= degree, tails[np.minimum(away, tails.size - 1)], 0)
-        decay = np.minimum(decay, within)
+    # The sources of one colour, by how many spacings they are away along each axis; all but the first are there twice.
+    steps = [np.arange(_steps(*of_axis)) for of_axis in zip(space.node_shape, spacing, space.periodic, strict=True)]
+    distances = [s * along for s, along in zip(spacing, steps, strict=True)]
+    of_axes = zip(distances, time * limits.reach, limits.across, strict=True)
+    bounds = [reach_bound(along, reach_time, low, across) for along, reach_time, across in of_axes]
+    decay = reduce(np.minimum.outer, bounds) + beyond
+    if low == 1:
+        away = reduce(np.maximum.outer, distances)
+        decay = np.minimum(decay, np.where(away <= degree, tails[np.minimum(away, tails.size - 1)], 0))
     decay[(0,) * d] = 0
-    total = beyond / float(limits.low) + float(np.sum(copies * decay))
-    return total / float(limits.least_mass) / kernel_scale(time, limits, d)
+    copies = reduce(np.multiply.outer, [np.where(along == 0, 1, 2) for along in steps])
+    return float(beyond / low + np.sum(copies * decay)) / _unit(time, limits, d)
 
 
 def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) -> float:
-    """Bound the error of taking P for M⁻¹, relative to `kernel_scale`, to first order in ε = max |1 − μ p(μ)|.
+    """Bound the error of taking P for M⁻¹, relative to the unit of errors, to first order in ε = max |1 − μ p(μ)|.
 
     With w = M^(−½)e_x, S = M^(−½)KM^(−½) and P = M^(−½)(1 − E)M^(−½), ‖E‖ ≤ ε, Duhamel's formula and an integration by
     parts where the solution is not smooth yet bound the error by 4.5 ε ‖w‖ ‖exp(−St/4)w‖, that is, by
     4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)). Neither of these is more than 1/(low D).
     """
-    low = float(limits.low)
+    low = limits.low
     if low == 1:
         return 0.0
     epsilon = 1 / math.cosh(mass_degree * math.acosh((1 + low) / (1 - low)))
-    return 4.5 * epsilon / (low * float(limits.least_mass) * kernel_scale(time, limits, dimension))
+    return 4.5 * epsilon / (low * _unit(time, limits, dimension))
 
 
 def rounding_error(time: float, limits: Bounds, dimension: int, eps: float) -> float:
-    """Return what rounding leaves of the signature, relative to `kernel_scale`.
+    """Return what rounding leaves of the signature, relative to the unit of errors.
 
     The vectors of the recurrence are as large as M⁻¹ at their source, up to 1/(low D), and D itself is rounded; what
     rounding leaves of them does not grow with the degree as far as measured, and was 0.05 to 0.7 of this in float32.
     """
-    return eps * (1 + 1 / float(limits.low)) / (float(limits.least_mass) * kernel_scale(time, limits, dimension))
+    return eps * (1 + 1 / limits.low) / _unit(time, limits, dimension)
 
 
 def _steps(n: int, spacing: int, wraps: bool) -> int:
@@ -162,7 +154,7 @@ def _steps(n: int, spacing: int, wraps: bool) -> int:
 def least_mass_degree(times: Float[np.ndarray, " m"], limits: Bounds, dimension: int, tolerance: float) -> int:
     """Return how many steps invert the mass to the tolerance at all times; 1 if it is lumped."""
     degree = 1
-    while max(mass_error(degree, float(time), limits, dimension) for time in times) > tolerance:
+    while max(mass_error(degree, time, limits, dimension) for time in times) > tolerance:
         degree += 1
     return degree
 
@@ -177,56 +169,36 @@ def choose(
     eps: float,
 ) -> Colouring:
     """Choose the least spacing and degree whose bound is below the tolerance at all times."""
-    d, lumped = space.dimension, float(limits.low) == 1
-    degree, spacing = 1, np.ones(d, int)
-    of_mass = [mass_error(mass_degree, float(time), limits, d) for time in times]
-    of_rounding = [rounding_error(float(time), limits, d, eps) for time in times]
-    tolerance -= max(of_mass) + max(of_rounding)
+    d, shape, low = space.dimension, space.node_shape, limits.low
+    others = [mass_error(mass_degree, time, limits, d) + rounding_error(time, limits, d, eps) for time in times]
+    tolerance -= max(others)
+
+    def least(time: float, share: float) -> int:
+        return least_degree(time * limits.top / 2, share * tolerance * _unit(time, limits, d))
+
+    # It counts once at every source that the expansion reaches: the node itself and its neighbours of one colour.
+    degree = max(1, *(least(time, 0.05 * low / 3**d) for time in times))
+    spacing = (1,) * d
     for time in times:
-        allowed = tolerance * kernel_scale(time, limits, d) * float(limits.least_mass) / 2
-        # It counts once at every source that the expansion reaches: the node itself and its neighbours of one colour.
-        error = 0.1 / 3**d * allowed * float(limits.low)
-        degree = max(degree, least_degree(time * float(limits.top) / 2, error))
-    for time in times:
-        allowed = tolerance * kernel_scale(time, limits, d) * float(limits.least_mass) / 2
+        allowed = tolerance * _unit(time, limits, d) / 2
         while True:
-            trial = tuple(
-                _least_spacing(n, time * float(kappa), allowed, float(limits.low), float(beta))
-                for n, kappa, beta in zip(space.node_shape, limits.reach, limits.across, strict=True)
-            )
-            if error_bound(trial, degree, time, limits, space) <= tolerance or all(
-                s >= n for s, n in zip(trial, space.node_shape, strict=True)
-            ):
+            of_axes = zip(shape, time * limits.reach, limits.across, strict=True)
+            trial = tuple(_least_spacing(n, reach_time, allowed, low, across) for n, reach_time, across in of_axes)
+            if trial == shape or error_bound(trial, degree, time, limits, space) <= tolerance:
                 break
             allowed /= 2
-        spacing = np.maximum(spacing, trial)
-    chosen = tuple(int(min(s, n)) for s, n in zip(spacing, space.node_shape, strict=True))
-    if lumped:
+        spacing = tuple(map(max, spacing, trial))
+    if low == 1:
         # Or else no wider than the expansion reaches: then nothing comes from other sources.
-        shortest = max(_least_degree(float(time), limits, space, tolerance) for time in times)
-        apart = tuple(min(shortest + 1, n) for n in space.node_shape)
-        if math.prod(apart) <= math.prod(chosen):
-            chosen, degree = apart, shortest
-    errors = tuple(
-        error_bound(chosen, degree, float(time), limits, space) + mass + rounding
-        for time, mass, rounding in zip(times, of_mass, of_rounding, strict=True)
+        shortest = max(least(time, 1.0) for time in times)
+        apart = tuple(min(shortest + 1, n) for n in shape)
+        if math.prod(apart) <= math.prod(spacing):
+            spacing, degree = apart, shortest
+    errors = [error_bound(spacing, degree, time, limits, space) for time in times]
+    reach, across, error = (
+        tuple(x.tolist()) for x in (times.max() * limits.reach, limits.across, np.add(errors, others))
     )
-    return Colouring(
-        chosen,
-        degree,
-        mass_degree,
-        columns,
-        float(limits.top),
-        float(limits.low),
-        tuple(float(kappa) * float(times.max()) for kappa in limits.reach),
-        tuple(float(beta) for beta in limits.across),
-        errors,
-    )
-
-
-def _least_degree(time: float, limits: Bounds, space: GridSpace, tolerance: float) -> int:
-    allowed = tolerance * kernel_scale(time, limits, space.dimension) * float(limits.least_mass)
-    return least_degree(time * float(limits.top) / 2, allowed)
+    return Colouring(spacing, degree, mass_degree, columns, float(limits.top), float(low), reach, across, error)
 
 
 def _least_spacing(n: int, reach_time: float, allowed: float, low: float, across: float) -> int:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.checks import checked_times, require_number
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -16,9 +17,8 @@ from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.pencil import AnyPencil, Pencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.sparse_input import pencil_of
-from hks_jax.linear.chebyshev import heat_coefficients
+from hks_jax.linear.chebyshev import chebyshev_heat_coefficients
 from hks_jax.linear.dissection import dissect
-from hks_jax.nan_outside import nan_is_meant, nan_outside
 from hks_jax.spectrum_free.colours import Colouring
 from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_fewer_vectors, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal
@@ -66,7 +66,7 @@ def hks_spectrum_free(
         TypeError: colouring on a mesh.
     """
     pencil, origin = from_lower_bound(_read_as_unknowns(pencil_of(domain, boundary, mass)))
-    times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
+    times = checked_times(times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     settings = choose_method(pencil, times, method, tolerance)
     scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
@@ -84,14 +84,9 @@ def colouring(
     memory: float = 2e9,
     slack: float = 1.0,
 ) -> Colouring:
-    """Choose spacing and degree for `hks_spectrum_free` from the error bound; needs concrete values.
+    """Choose spacing and degree for `hks_spectrum_free`, with its arguments, from the error bound; no traced values.
 
     Args:
-        domain: as there.
-        times: as there.
-        boundary: as there.
-        mass: as there.
-        tolerance: as there.
         memory: bytes that the working vectors may take; fewer vectors at once where it is short.
         slack: ≥ 1: be prepared for a spectrum and a reach so many times as large, as fields have that are still to
             come (in a fit, say).
@@ -106,7 +101,7 @@ def colouring(
     """
     pencil = _read_as_unknowns(pencil_of(domain, boundary, mass))
     require_grid(pencil)
-    times = checked_times("times", times, pencil.parts[0].stiffness.dtype)
+    times = checked_times(times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     require_number("memory", memory)
     require_number("slack", slack, above=1, inclusive=True)
@@ -144,7 +139,7 @@ def _diagonal(
 @partial(jax.jit, static_argnums=0)
 def _by_colours(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     assert isinstance(part.space, GridSpace)
-    coefficients = heat_coefficients(times, settings.top, settings.degree)
+    coefficients = chebyshev_heat_coefficients(times, settings.top, settings.degree)
     return coloured_diagonal(settings, settings.colours(part.space), nodal_pencil(part), coefficients)
 
 

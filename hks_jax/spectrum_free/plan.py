@@ -78,20 +78,21 @@ def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -
         ValueError: traced values there.
     """
     of_inversion = work(None, pencil, times)
+    affordable = math.isfinite(of_inversion)
     if not isinstance(pencil.space, GridSpace):
-        if math.isinf(of_inversion):
+        if not affordable:
             raise Unattainable(
                 f"domain: got a mesh of {pencil.space.n_dof} free vertices, for which selected inversion takes more "
                 f"than {_MEMORY / 1e9:g} GB. Use eigenpairs; or, with enough memory, "
                 'hks_spectrum_free(…, method="selected-inversion")'
             )
         return None
-    if math.isfinite(of_inversion) and is_traced(jax.lax.stop_gradient((pencil, times))):
+    if affordable and is_traced(jax.lax.stop_gradient((pencil, times))):
         return None
     try:
         settings = plan(pencil, times, tolerance)
     except Unattainable:
-        if math.isfinite(of_inversion):
+        if affordable:
             return None
         raise
     return None if of_inversion < work(settings, pencil, times) else settings
@@ -102,11 +103,7 @@ class Unattainable(ValueError):
 
 
 def plan(
-    pencil: AnyPencil,
-    times: Float[Array, " m"],
-    tolerance: float,
-    memory: float = 2e9,
-    slack: float = 1.0,
+    pencil: AnyPencil, times: Float[Array, " m"], tolerance: float, memory: float = 2e9, slack: float = 1.0
 ) -> Colouring:
     """Choose a colouring that serves all parts of a pencil.
 
@@ -126,7 +123,7 @@ def plan(
     mass_degree, eps = 1, float(jnp.finfo(times.dtype).eps)
     while True:
         limits = _widest([bounds(part, low, mass_degree) for part in pencil.parts], slack)
-        rounding = max(rounding_error(float(t), limits, space.dimension, eps) for t in concrete)
+        rounding = max(rounding_error(t, limits, space.dimension, eps) for t in concrete)
         if rounding > 0.8 * tolerance:
             raise Unattainable(
                 f"tolerance: got {tolerance:g}; in {times.dtype} rounding alone leaves about {rounding:.1e} at "
@@ -143,16 +140,10 @@ def plan(
 
 
 def _widest(limits: Sequence[Bounds], slack: float) -> Bounds:
-    """Return bounds that hold for all parts."""
-    stacked = Bounds(*(jnp.stack(values) for values in zip(*limits, strict=True)))
-    return Bounds(
-        slack * jnp.max(stacked.top),
-        jnp.min(stacked.low),
-        slack * jnp.max(stacked.reach, axis=0),
-        slack * jnp.max(stacked.across, axis=0),
-        jnp.min(stacked.least_mass),
-        jnp.max(stacked.greatest_mass),
-    )
+    """Return bounds that hold for all parts, on the host."""
+    stacked = Bounds(*(np.stack(values).astype(float) for values in zip(*limits, strict=True)))
+    top, reach, across = (slack * x.max(axis=0) for x in (stacked.top, stacked.reach, stacked.across))
+    return Bounds(top, stacked.low.min(), reach, across, stacked.least_mass.min(), stacked.greatest_mass.max())
 
 
 def work(settings: Colouring | None, pencil: AnyPencil, times: Float[Array, " m"]) -> float:

@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import StaticArray
 from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import chebyshev_recurrence
-from hks_jax.linear.linear_map import with_transpose
-from hks_jax.linear.not_differentiable import first_order_only
+from hks_jax.linear.linear_map import first_order_only, with_transpose
 from hks_jax.linear.products import aligned
 from hks_jax.spectrum_free.colours import Colouring
-from hks_jax.static_array import StaticArray
 
 T = TypeVar("T")
 
@@ -24,14 +23,9 @@ T = TypeVar("T")
 def coloured_diagonal(
     settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Float[Array, "m terms"]
 ) -> Float[Array, "m *shape"]:
-    """Return Σₙ cₙ Tₙ(2A/top − 1) P at the sources, for every row of coefficients; 0 at nodes without a colour.
+    """Return Σₙ cₙ Tₙ(2A/top − 1) P at the sources, A = PK, for every row of coefficients; 0 where there is no colour.
 
-    Args:
-        settings: the bound ``top`` of the spectrum of A = PK, how P ≈ M⁻¹ is made, and how many columns are worked on
-            at once.
-        colours: int (*shape), 0, 1, … or −1; the vector of a colour is 1 at all its nodes.
-        pencil: K and M.
-        coefficients: cₙ.
+    The colours (*shape) are 0, 1, … or −1; the vector of a colour is 1 at all its nodes.
     """
     stiffness, solve_mass = _products(settings, pencil)
 
@@ -103,15 +97,12 @@ def _cotangent(
     degree, top = coefficients.shape[1] - 1, settings.top
     stiffness, solve_mass = _products(settings, pencil)
 
-    def product(y: Array) -> Array:
-        return _scaled(top, solve_mass(stiffness(y)), y)
-
     def term(sources: Array, total: tuple) -> tuple:
         def product(y: Array) -> Array:
             return _scaled(top, solve_mass(stiffness(y)), y)
 
         def read(y: Array) -> Array:
-            return _contract(g, jnp.sum(sources * y, axis=-1))
+            return jnp.matmul(g.reshape(len(g), -1), jnp.sum(sources * y, axis=-1).ravel(), precision="highest")
 
         def source(n: Any) -> Array:
             return jnp.tensordot(coefficients[:, n], g, 1, precision="highest")[..., None] * sources
@@ -142,12 +133,12 @@ def _cotangent(
 
 
 def _scaled(top: float, image: Array, y: Array) -> Array:
-    """Return Ây, of PKy and y."""
+    """Return Ây, of the image PKy and y."""
     return (2 / top) * image - y
 
 
 def _products(settings: Colouring, pencil: NodalPencil) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Return the products with K and P."""
+    """Return the products with K and P ≈ M⁻¹."""
     return pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
 
 
@@ -166,7 +157,3 @@ def _sum_of_blocks(
 
 def _outer(row: Float[Array, " m"], sources: Array, y: Array) -> Float[Array, "m *shape"]:
     return jnp.multiply.outer(row, jnp.sum(sources * y, axis=-1))
-
-
-def _contract(g: Float[Array, "m *shape"], moment: Float[Array, "*shape"]) -> Float[Array, " m"]:
-    return jnp.matmul(g.reshape(g.shape[0], -1), moment.ravel(), precision="highest")

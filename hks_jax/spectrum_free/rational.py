@@ -45,11 +45,9 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
     zeros = np.roots(last)
     outside = zeros[np.abs(zeros) > 1]
     assert outside.size == degree
-    numerator = np.fft.fft(extended * np.polyval(np.poly(outside), circle)).real / _SAMPLES
-    numerator = numerator[degree::-1]
-    residues = np.array([
-        np.polyval(numerator, q) / np.prod(q - np.delete(outside, i)) for i, q in enumerate(outside)
-    ])  # fmt: skip
+    numerator = np.fft.fft(extended * np.polyval(np.poly(outside), circle)).real[degree::-1] / _SAMPLES
+    apart = [np.prod(q - np.delete(outside, i)) for i, q in enumerate(outside)]
+    residues = np.polyval(numerator, outside) / np.array(apart)
     # Back from the circle to x ≤ 0, where both q and 1/q land on one pole.
     poles = _SCALE * ((outside - 1) / (outside + 1)) ** 2
     weights = 4 * residues * poles / (outside**2 - 1)
@@ -67,14 +65,7 @@ def pole_pairs(dtype: Any) -> int:
 def selected_inversion(
     stiffness: PatternedOperator, mass: Operator, times: Float[Array, " m"], dissection: Dissection
 ) -> Float[Array, "m n_dof"]:
-    """Return the diagonal at each time.
-
-    Args:
-        stiffness: K.
-        mass: M, with no entries where K has none.
-        times: t.
-        dissection: the elimination tree of K's pattern.
-    """
+    """Return the diagonal at each time; M has no entries where K has none, whose pattern is dissected."""
     poles, weights = exponential_poles(pole_pairs(times.dtype))
     complex_type = np.result_type(times.dtype, np.complex64)
 

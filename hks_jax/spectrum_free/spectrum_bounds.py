@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ _STEPS, _MASS_STEPS = 50, 200
 
 
 class Bounds(NamedTuple):
-    """What a pencil's polynomials must be fit for.
+    """What a pencil's polynomials must be fit for: of JAX, or of NumPy in double precision where they are known.
 
     Attributes:
         top: an upper bound on the eigenvalues of PK.
@@ -32,12 +32,12 @@ class Bounds(NamedTuple):
         greatest_mass: the greatest.
     """
 
-    top: Float[Array, ""]
-    low: Float[Array, ""]
-    reach: Float[Array, " d"]
-    across: Float[Array, " d"]
-    least_mass: Float[Array, ""]
-    greatest_mass: Float[Array, ""]
+    top: Any
+    low: Any
+    reach: Float[Array | np.ndarray, " d"]
+    across: Float[Array | np.ndarray, " d"]
+    least_mass: Any
+    greatest_mass: Any
 
 
 @jax.jit

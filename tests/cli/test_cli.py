@@ -26,9 +26,9 @@ from hks_jax.cli.values import Times, parse_boundary, parse_times
 from hks_jax.eigen.solver import Status
 from hks_jax.fem.boundary import default_boundary
 from hks_jax.inverse.metric_fit import RESULTS
-from hks_jax.inverse.parametrisation import PARAMETRISATIONS
-from hks_jax.inverse.problem import pairs_for
 from hks_jax.inverse.search import OPTIMISERS
+from hks_jax.inverse.signature import pairs_for
+from hks_jax.inverse.unknowns import PARAMETRISATIONS
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.result import Result, recorded_boundary
 from hks_jax.plot import signature
@@ -673,7 +673,7 @@ def test_a_line_of_the_table_is_an_option():
 
 def test_what_fit_offers_is_what_there_is():
     offered = {option.name: option.settings.get("choices") for option in options_in(fit.OPTIONS)}
-    assert (offered["parametrisation"], offered["optimiser"]) == (tuple(PARAMETRISATIONS), OPTIMISERS)
+    assert (offered["parametrisation"], offered["optimiser"]) == (tuple(PARAMETRISATIONS), tuple(OPTIMISERS))
 
 
 def test_help_does_not_wait_for_the_optimisers():

@@ -569,7 +569,7 @@ def test_a_killed_study_is_resumed_with_the_same_result(study):
 @pytest.mark.slow
 @pytest.mark.skipif(not (BRAINS / "brain_tensor.nii.gz").exists(), reason=f"no brain data in {BRAINS}")
 def test_tissues_of_a_real_brain_differ_as_the_documentation_says(tmp_path):
-    spec = importlib.util.spec_from_file_location("brain_study", ROOT / "docs" / "brain_study.py")
+    spec = importlib.util.spec_from_file_location("brain_study", ROOT / "notebooks" / "brains" / "brain_study.py")
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     subjects, means = script.write_study(BRAINS, tmp_path), {}

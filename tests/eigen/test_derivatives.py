@@ -14,7 +14,7 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.eigen.complement.adjoint import attainable
-from hks_jax.eigen.complement.factorised_adjoint import group_blocks
+from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
 from hks_jax.linear.dissection import dissect
 
 SHAPE = (10, 10)
@@ -554,10 +554,9 @@ def test_in_float32_rows_are_grouped_for_the_accuracy_that_there_is():
     pencil = hj.assemble(hj.TensorField(hj.Grid((20, 20)), np.broadcast_to(np.eye(2), (20, 20, 2, 2))))
     dissection = dissect(pencil.pattern)
 
-    def groups(tolerance):
-        return group_blocks(dissection, lambda row: 201 - row, np.dtype(np.float32), 200, tolerance)
+    def first_rows(tolerance, solves=1):
+        return FactorisedAdjoint(tolerance, solves).groups(dissection, 200, 200, np.dtype(np.float32))[0]
 
-    asked, reached = groups(1e-8), groups(attainable(1e-8, np.float32))
-    np.testing.assert_array_equal(asked.first, reached.first)
-    many = group_blocks(dissection, lambda row: 201 - row, np.dtype(np.float32), 200, 1e-8, solves=100)
-    assert len(many.first) > len(asked.first)
+    asked = first_rows(1e-8)
+    np.testing.assert_array_equal(asked, first_rows(attainable(1e-8, np.float32)))
+    assert len(first_rows(1e-8, solves=100)) > len(asked)

@@ -10,8 +10,7 @@ from pencils import directions, graph_laplacian, indefinite, lattice
 
 import hks_jax as hj
 from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
-from hks_jax.eigen.count import certain_count
-from hks_jax.eigen.origin import lowered, translated
+from hks_jax.eigen.inertia import certain_count, lowered, translated
 
 SOLVER = hj.BlockLanczos(block=4)
 

@@ -190,7 +190,7 @@ def test_a_metric_is_fitted_to_the_mean(rng):
     times = [0.3, 0.6, 1.2]
     target = hj.hks(all_pairs(hidden, "mean"), times)
     start = hj.TensorField(grid, np.broadcast_to(np.eye(2), (*grid.shape, 2, 2)))
-    found = hj.fit_metric(target, times, start, "conformal", boundary="mean", max_steps=20)
+    found = hj.fit_metric(start, target, times, "conformal", boundary="mean", search=hj.inverse.Search(max_steps=20))
     got = hj.hks(all_pairs(found.field, "mean"), times)
     assert np.abs(np.log(got / target))[:, domain].max() < 0.01
 

@@ -10,10 +10,9 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.inverse.conformal import conformal_information
-from hks_jax.inverse.gauss_newton import GaussNewton
-from hks_jax.inverse.parametrisation import PARAMETRISATIONS
+from hks_jax.inverse.gauss_newton import GaussNewton, begun
 from hks_jax.inverse.search import choose_inner_product
-from hks_jax.inverse.unknowns import Nodal, nodes_of
+from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
 from hks_jax.linear import conjugate_gradients
 
 
@@ -42,9 +41,9 @@ def solve(matrix, scale, rhs, tolerance, most=1000):
             product, precondition, jnp.zeros_like(column), jnp.full(1, tolerance), **settings
         )
 
-    x, _, right, steps = solution()
-    np.testing.assert_array_equal(right[:, 0], rhs)
-    return x[:, 0], steps
+    found = solution()
+    np.testing.assert_array_equal(found.rhs[:, 0], rhs)
+    return found.x[:, 0], found.steps
 
 
 def test_rounding_costs_no_steps(rng):
@@ -87,12 +86,12 @@ def test_nothing_and_nan_are_told_apart():
 def test_only_a_step_with_a_tight_linear_system_may_be_the_last(changes, tight, done):
     """Steps are in tolerances; as soon as the next is expected to be below one, its system is solved to more digits."""
     optimiser = GaussNewton(1e-3)
-    state, y = optimiser.descent.init(jnp.zeros(4)), jnp.zeros(4)
-    state = optimiser.descent.accepted(y, state)
+    state, y = begun(jnp.zeros(4)), jnp.zeros(4)
+    state = optimiser.accepted(y, state)
     for change in changes:
         state = eqx.tree_at(lambda s: s.gradient, state, -jnp.ones(4))
         scale = 1e-3 * change / (1 - 1e-3 * change)  # a step s from 0 is s / (1 + s), relative to what it leads to
-        state = optimiser.descent.accepted(y + scale, eqx.tree_at(lambda s: s.values, state, y))
+        state = optimiser.accepted(y + scale, eqx.tree_at(lambda s: s.values, state, y))
     np.testing.assert_allclose(state.change, changes[-1], rtol=1e-6)
     assert (bool(state.tight), bool(state.done)) == (tight, done)
 
@@ -115,7 +114,7 @@ def test_no_step_is_chosen_where_what_was_taken_will_do():
 
 def preconditioner(field, times):
     """Return the unknowns, the inner product and the inverse of the preconditioner as a function of damping."""
-    unknowns = Nodal(PARAMETRISATIONS["conformal"](), field, nodes_of(hj.assemble(field).space.domain))
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], field, hj.assemble(field).space.domain)
     mass = choose_inner_product(unknowns, 0.0, None)
     information = conformal_information(unknowns, mass, jnp.asarray(times))
     eye = jnp.eye(unknowns.start().size)

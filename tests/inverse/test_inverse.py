@@ -10,11 +10,21 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.domain import spd
-from hks_jax.inverse import H1, LogDeterminant, Prior, TotalVariation, identifiability
+from hks_jax.inverse import (
+    H1,
+    Data,
+    Free,
+    LogDeterminant,
+    Prior,
+    Search,
+    TotalVariation,
+    identifiability,
+    wave_kernel,
+)
 from hks_jax.inverse.observation import observe
-from hks_jax.inverse.parametrisation import PARAMETRISATIONS
-from hks_jax.inverse.problem import Problem, more_pairs, outcome_of, pairs_for, truncation_shows
-from hks_jax.inverse.unknowns import Nodal, nodes_of
+from hks_jax.inverse.problem import Problem, more_pairs, outcome_of, truncation_shows
+from hks_jax.inverse.signature import pairs_for
+from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
 
 N = 10
 GRID = hj.Grid((N, N), 1 / (N - 1))
@@ -38,8 +48,8 @@ def signature(field, k=K, times=TIMES):
 def problem_of(target, times, init, k, weights=None):
     """The problem of a fit of conformal factors, without the fit."""
     space = hj.assemble(init).space
-    unknowns = Nodal(PARAMETRISATIONS["conformal"](), init, nodes_of(space.domain))
-    observation = observe(target, times, weights, "hks", "log", None, space, np.float64)
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], init, space.domain)
+    observation, _ = observe(target, times, Data(weights=weights), space, np.float64)
     return Problem(unknowns, observation, (), k, "neumann", "dense")
 
 
@@ -64,7 +74,7 @@ def test_exponential_and_logarithm_are_smooth_at_multiple_eigenvalues(rng, d):
 @pytest.mark.parametrize("d", [2, 3])
 def test_parametrisations_start_at_the_initial_field_and_stay_positive_definite(rng, name, d):
     base = jnp.asarray(random_spd(rng, (3,) * d).reshape(-1, d, d))
-    parametrisation = PARAMETRISATIONS[name]()
+    parametrisation = PARAMETRISATIONS[name]
     start = parametrisation.start(base)
     np.testing.assert_allclose(parametrisation.tensors(start, base), base, rtol=1e-12, atol=1e-12)
     moved = parametrisation.tensors(start + jnp.asarray(rng.standard_normal(start.shape)), base)
@@ -81,7 +91,7 @@ def test_parametrisations_start_at_the_initial_field_and_stay_positive_definite(
 @pytest.mark.slow
 def test_a_conformal_factor_is_recovered_from_a_flat_start():
     told = []
-    fit = hj.fit_metric(signature(CONFORMAL), TIMES, FLAT, "conformal", k=K, progress=told.append)
+    fit = hj.fit_metric(FLAT, signature(CONFORMAL), TIMES, "conformal", k=K, progress=told.append)
     assert fit.converged
     assert fit.result == "converged"
     assert error(fit, CONFORMAL) < 1e-5
@@ -95,7 +105,7 @@ def test_a_conformal_factor_is_recovered_from_a_flat_start():
 @pytest.mark.slow
 def test_a_full_tensor_field_is_recovered():
     truth = smooth_field()
-    fit = hj.fit_metric(signature(truth), TIMES, FLAT, k=K, max_steps=7)
+    fit = hj.fit_metric(FLAT, signature(truth), TIMES, k=K, search=Search(max_steps=7))
     assert error(fit, truth) < 0.03
     assert fit.loss < 1e-7 * fit.history[0].loss
 
@@ -109,13 +119,13 @@ def test_by_default_k_is_enough_for_a_target_of_all_pairs():
     truth, times = hj.TensorField(grid, factor * np.eye(2)), np.geomspace(0.004, 0.2, 5)
     flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (24, 20, 2, 2)))
     target = signature(truth, 480, times)
-    fit = hj.fit_metric(target, times, flat, "conformal")
+    fit = hj.fit_metric(flat, target, times, "conformal")
     assert fit.converged
     assert error(fit, truth) < 1e-5
     assert hj.truncation(fit.problem.pairs(fit.values), times).tail.max() < 2e-6
     assert fit.problem.k < 480
     with pytest.warns(hj.AccuracyWarning, match=r"k: 120 eigenpairs leave out .* Use k=None, or k=3\d\d or more"):
-        poor = hj.fit_metric(target, times, flat, "conformal", k=120, max_steps=4)
+        poor = hj.fit_metric(flat, target, times, "conformal", k=120, search=Search(max_steps=4))
     assert error(poor, truth) > 3e-3
 
 
@@ -136,7 +146,7 @@ def test_by_default_the_truth_explains_a_target_of_all_pairs():
     assert of_the_truth > (1e-4) ** 2 / 2
     assert 0.1 < left / of_the_truth < 10
     with pytest.warns(hj.AccuracyWarning, match="k: 35 eigenpairs leave out .* fitted its own truncation"):
-        fit = hj.fit_metric(target, times, truth, "conformal", k=35, max_steps=2)
+        fit = hj.fit_metric(truth, target, times, "conformal", k=35, search=Search(max_steps=2))
     assert fit.loss < 0.7 * of_the_truth
 
 
@@ -167,7 +177,7 @@ def test_k_grows_with_the_volume_that_a_fit_comes_to():
     """Three times the area of the start: the pairs that were enough there are not."""
     large = hj.TensorField(GRID, 3 * np.asarray(CONFORMAL.tensors))
     times = 3 * TIMES
-    fit = hj.fit_metric(signature(large, times=times), times, FLAT, "conformal", max_steps=12)
+    fit = hj.fit_metric(FLAT, signature(large, times=times), times, "conformal", search=Search(max_steps=12))
     first = pairs_for(times, hj.assemble(FLAT), FLAT)
     assert fit.history[0].stage == 0
     assert fit.history[-1].stage == 1
@@ -180,7 +190,7 @@ def test_k_grows_with_the_volume_that_a_fit_comes_to():
 def test_converged_means_the_unknowns():
     """A full field, whose weak directions short linear solves do not find: steps become small long before the end."""
     truth = smooth_field()
-    fit = hj.fit_metric(signature(truth), TIMES, FLAT, tolerance=1e-3, max_steps=20)
+    fit = hj.fit_metric(FLAT, signature(truth), TIMES, search=Search(tolerance=1e-3, max_steps=20))
     exact = fit.problem.unknowns.parametrisation.start(truth.tensors.reshape(-1, 2, 2))
     deviation = float(jnp.sqrt(jnp.mean((fit.values - exact) ** 2)))
     assert fit.converged
@@ -191,7 +201,7 @@ def test_converged_means_the_unknowns():
 def test_noise_stops_the_fit_where_it_explains_the_misfit(rng):
     target = signature(CONFORMAL) * np.exp(0.01 * rng.standard_normal((4, N, N)))
     # 45 pairs leave out 0.1 %, which does not show beside the noise: no warning.
-    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=45, noise=0.01)
+    fit = hj.fit_metric(FLAT, target, TIMES, "conformal", k=45, data=Data(noise=0.01))
     assert fit.result == "noise level reached"
     assert 0.5 * 0.01**2 * 0.3 < fit.misfit <= 0.5 * 0.01**2
     assert error(fit, CONFORMAL) < 0.03
@@ -206,7 +216,7 @@ def test_rotations_with_fixed_eigenvalues():
     values = np.diag([2.0, 0.8])
     init = hj.TensorField(GRID, np.broadcast_to(values, (N, N, 2, 2)))
     truth = hj.TensorField(GRID, rotation @ values @ np.swapaxes(rotation, -1, -2))
-    fit = hj.fit_metric(signature(truth), TIMES, init, "rotation", k=K)
+    fit = hj.fit_metric(init, signature(truth), TIMES, "rotation", k=K)
     assert error(fit, truth) < 0.02
 
 
@@ -219,7 +229,7 @@ def test_a_model_that_cannot_explain_the_target_is_told(rng):
     with pytest.warns(
         hj.AccuracyWarning, match=r"noise: the fit (converged|stalled) at residuals of 0\.0\d+, of which"
     ):
-        hj.fit_metric(target, times, flat, "conformal", k=36, noise=0.01, tolerance=0.05)
+        hj.fit_metric(flat, target, times, "conformal", k=36, data=Data(noise=0.01), search=Search(tolerance=0.05))
 
 
 @pytest.mark.slow
@@ -228,7 +238,12 @@ def test_eigenvalues_alone():
     target = hj.eigenpairs(CONFORMAL, 30).eigenvalues
     init = hj.TensorField(GRID, np.exp(0.1 * X - 0.15 * Y)[..., None, None] * np.eye(2))
     fit = hj.fit_metric(
-        target, None, init, "conformal", signature="eigenvalues", loss="relative", smoothness=0.2, max_steps=12
+        init,
+        target,
+        None,
+        "conformal",
+        data=Data(signature="eigenvalues", loss="relative"),
+        search=Search(smoothness=0.2, max_steps=12),
     )
     assert fit.misfit < 1e-8 * fit.history[0].misfit
     np.testing.assert_allclose(fit.hks, target, rtol=1e-3, atol=1e-9)
@@ -239,10 +254,12 @@ def test_a_wave_kernel_signature():
     pairs = hj.eigenpairs(CONFORMAL, 30)
     energies, sigma = hj.default_energies(pairs, 30)
     target = hj.wks(pairs, energies, sigma)
-    fit = hj.fit_metric(target, energies, FLAT, "conformal", signature="wks", sigma=sigma, k=30, max_steps=8)
+    fit = hj.fit_metric(
+        FLAT, target, energies, "conformal", k=30, data=Data(signature=wave_kernel(sigma)), search=Search(max_steps=8)
+    )
     assert fit.loss < 1e-3 * fit.history[0].loss
     with pytest.raises(ValueError, match=r"times: got energies up to 9, which take about \d+ eigenpairs; with 100"):
-        hj.fit_metric(target, np.linspace(3, 9, 30), FLAT, "conformal", signature="wks", sigma=sigma)
+        hj.fit_metric(FLAT, target, np.linspace(3, 9, 30), "conformal", data=Data(signature=wave_kernel(sigma)))
 
 
 def test_unobserved_entries_have_no_influence(rng):
@@ -262,15 +279,15 @@ def test_unobserved_entries_may_be_nan_and_do_not_count(rng):
     target = signature(CONFORMAL).copy()
     weights = (rng.uniform(size=(N, N)) > 0.3).astype(float)
     target[:, weights == 0] = np.nan
-    fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, weights=weights, max_steps=6)
+    fit = hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, data=Data(weights=weights), search=Search(max_steps=6))
     assert error(fit, CONFORMAL) < 1e-2
 
 
 @pytest.mark.slow
 def test_gauss_newton_needs_fewer_signatures_than_lbfgs():
     target = signature(CONFORMAL)
-    newton = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, max_steps=4)
-    lbfgs = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, optimiser="lbfgs", max_steps=12)
+    newton = hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, search=Search(max_steps=4))
+    lbfgs = hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, search=Search(optimiser="lbfgs", max_steps=12))
     assert newton.loss < lbfgs.loss < lbfgs.history[0].loss
     assert all(np.isfinite(step.gradient) for step in (*newton.history, *lbfgs.history))
 
@@ -283,19 +300,19 @@ def test_a_function_of_a_few_parameters():
 
     target = signature(bump({"height": 0.6, "x": 0.4}))
     start = {"height": 0.1, "x": 0.5}
-    fit = hj.fit_metric(target, TIMES, FLAT, bump, parameters=start, k=K)
+    fit = hj.fit_metric(FLAT, target, TIMES, Free(bump, start), k=K)
     np.testing.assert_allclose(fit.values, [0.6, 0.4], atol=1e-4)
-    with pytest.raises(ValueError, match="parameters: got None"):
-        hj.fit_metric(target, TIMES, FLAT, bump, k=K)
+    with unchecked(), pytest.raises(ValueError, match=r"parametrisation: got <function .* or Free"):
+        hj.fit_metric(FLAT, target, TIMES, bump, k=K)
     with pytest.raises(ValueError, match="regularisers: parameters of a function have no neighbours"):
-        hj.fit_metric(target, TIMES, FLAT, bump, parameters=start, k=K, regularisers=[H1(1.0)])
+        hj.fit_metric(FLAT, target, TIMES, Free(bump, start), k=K, regularisers=[H1(1.0)])
 
 
 def test_penalties_are_means_over_the_domain():
     grid = hj.Grid((40, 60), (1 / 39, 2 / 59))
     x, y = grid.nodes[..., 0], grid.nodes[..., 1]
     flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (40, 60, 2, 2)))
-    unknowns = Nodal(PARAMETRISATIONS["conformal"](), flat, nodes_of(grid.inside))
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], flat, grid.inside)
     values = jnp.asarray((3 * x + 2 * y).reshape(-1, 1))
     field = unknowns.field(values)
 
@@ -317,7 +334,9 @@ def test_a_regulariser_smooths_what_noise_roughens(rng):
     target = signature(CONFORMAL) * np.exp(0.05 * rng.standard_normal((4, N, N)))
 
     def roughness(*regularisers):
-        fit = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, regularisers=regularisers, max_steps=5)
+        fit = hj.fit_metric(
+            FLAT, target, TIMES, "conformal", k=K, regularisers=regularisers, search=Search(max_steps=5)
+        )
         assert fit.loss > fit.misfit or not regularisers
         return float(jnp.sum(jnp.diff(fit.values.reshape(N, N), axis=0) ** 2))
 
@@ -332,26 +351,28 @@ def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
         if step.step == 2:
             raise KeyboardInterrupt
 
-    stopped = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, progress=interrupt)
+    stopped = hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, progress=interrupt)
     assert stopped.result == "interrupted"
     assert not stopped.converged
     assert stopped.loss < 1e-2 * stopped.history[0].loss
-    first = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, max_steps=2, checkpoint=file)
+    first = hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, checkpoint=file, search=Search(max_steps=2))
     assert first.result == "steps exhausted"
-    again = hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, checkpoint=file)
+    again = hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, checkpoint=file)
     assert again.converged
     assert again.history[:3] == first.history
     assert [path.name for path in file.parent.iterdir()] == ["fit.npz"]
     with pytest.raises(ValueError, match=r"checkpoint: .* is of another fit"):
-        hj.fit_metric(2 * target, TIMES, FLAT, "conformal", k=K, checkpoint=file)
+        hj.fit_metric(FLAT, 2 * target, TIMES, "conformal", k=K, checkpoint=file)
     (tmp_path / "notes.txt").write_text("no checkpoint")
     with pytest.raises(ValueError, match=r"checkpoint: .*notes.txt: not a readable npz archive"):
-        hj.fit_metric(target, TIMES, FLAT, "conformal", k=K, checkpoint=tmp_path / "notes.txt")
+        hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, checkpoint=tmp_path / "notes.txt")
 
 
 @pytest.mark.slow
 def test_continuation_and_several_starts():
-    fit = hj.fit_metric(signature(CONFORMAL), TIMES, FLAT, "conformal", continuation=2, starts=2, max_steps=2, seed=3)
+    fit = hj.fit_metric(
+        FLAT, signature(CONFORMAL), TIMES, "conformal", search=Search(continuation=2, starts=2, max_steps=2, seed=3)
+    )
     assert [(step.start, step.stage) for step in fit.history[::3]] == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert fit.loss == min(fit.losses)
     assert len(fit.losses) == 2
@@ -387,7 +408,14 @@ def test_error_bars_of_a_fit_are_those_of_its_posterior():
     init = hj.TensorField(grid, np.broadcast_to(np.eye(2), (7, 6, 2, 2)))
     deviation = 0.02 * target * (1 + np.arange(6) / 3)
     fit = hj.fit_metric(
-        target, [0.15, 0.4], init, "conformal", k=42, deviation=deviation, regularisers=[H1(1e-5)], max_steps=3
+        init,
+        target,
+        [0.15, 0.4],
+        "conformal",
+        k=42,
+        regularisers=[H1(1e-5)],
+        data=Data(deviation=deviation),
+        search=Search(max_steps=3),
     )
     relative = np.asarray(deviation / target)
     assert fit.noise == pytest.approx(np.sqrt(target.size / np.sum(relative**-2.0)))
@@ -409,10 +437,12 @@ def test_error_bars_of_a_fit_are_those_of_its_posterior():
     np.testing.assert_allclose(
         found.tensors[..., 0, 0].ravel(), np.exp(fit.values[:, 0]) * found.values[:, 0], rtol=1e-10
     )
-    with pytest.raises(ValueError, match=r"deviation: 14 of 84 are not positive numbers \(the first at \(0, 0, 1\)"):
-        hj.fit_metric(target, [0.15, 0.4], init, deviation=np.where(np.arange(6) % 7 == 1, 0, 0.1)[: target.shape[-1]])
+    with pytest.raises(ValueError, match=r"deviation: 14 of 84 .* not positive numbers \(the first at \(0, 0, 1\)"):
+        hj.fit_metric(
+            init, target, [0.15, 0.4], data=Data(deviation=np.where(np.arange(6) % 7 == 1, 0, 0.1)[: target.shape[-1]])
+        )
     with pytest.raises(ValueError, match="deviation: it cannot be taken through a loss that is a function"):
-        hj.fit_metric(target, [0.15, 0.4], init, deviation=deviation, loss=lambda a, b: a - b)
+        hj.fit_metric(init, target, [0.15, 0.4], data=Data(deviation=deviation, loss=lambda a, b: a - b))
 
 
 @pytest.mark.slow
@@ -422,7 +452,7 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
     factor = np.exp(0.4 * np.sin(2 * grid.nodes[..., 0]) * np.cos(3 * grid.nodes[..., 1]))[..., None, None]
     target = signature(hj.TensorField(grid, factor * np.eye(2)), k, times)
     flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (14, 14, 2, 2)))
-    fit = hj.fit_metric(target, times, flat, "conformal", k=k, max_steps=2)
+    fit = hj.fit_metric(flat, target, times, "conformal", k=k, search=Search(max_steps=2))
     problem = fit.problem
     report = identifiability(fit, n=12, n_weak=2, iterations=6)
     jacobian = jax.jacfwd(lambda v: problem.observation.residuals(problem.pairs(v)))(fit.values)
@@ -434,7 +464,7 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
     assert 0 < report.effective <= 12
     assert (report.deviation <= 1).all()
     # Fewer times, less information.
-    fewer = hj.fit_metric(target[2:], times[2:], flat, "conformal", k=k, max_steps=1)
+    fewer = hj.fit_metric(flat, target[2:], times[2:], "conformal", k=k, search=Search(max_steps=1))
     poorer = identifiability(fewer.problem, fit.values, n=12, n_weak=1, iterations=6)
     assert poorer.strengths[11] < report.strengths[11]
 
@@ -448,31 +478,42 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
         ({"times": [0.1, -1.0, 1.0, 2.0]}, "times: got -1.0; expected positive"),
         ({"times": np.array([1e-5, 0.1, 0.2, 0.3])}, "times: got 1e-05, which takes about .* Use times from about"),
         ({"parametrisation": "spherical"}, "parametrisation: got 'spherical'; expected 'log-euclidean'"),
-        ({"signature": "sound"}, "signature: got 'sound'; expected 'hks'"),
-        ({"loss": "gain"}, "loss: got 'gain'; expected 'log'"),
-        ({"optimiser": "sgd"}, "optimiser: got 'sgd'; expected 'gauss-newton'"),
-        ({"weights": np.zeros((N, N))}, "weights: all are zero"),
-        ({"weights": np.ones(3)}, r"weights: got shape \(3,\); expected one that broadcasts"),
-        ({"noise": -1}, "noise: got -1; expected a finite number above 0"),
-        ({"max_steps": 0}, "max_steps: got 0; expected an integer from 1"),
-        ({"smoothness": -1.0}, "smoothness: got -1.0; expected a finite number from 0"),
-        ({"signature": "wks"}, "sigma: got None"),
-        ({"signature": lambda pairs: pairs.eigenvalues, "target": lambda t: t[0, 0]}, "k: got None"),
+        ({"data": {"signature": "sound"}}, "signature: got 'sound'; expected 'hks'"),
+        ({"data": {"loss": "gain"}}, "loss: got 'gain'; expected 'log'"),
+        ({"search": {"optimiser": "sgd"}}, "optimiser: got 'sgd'; expected 'gauss-newton'"),
+        ({"data": {"weights": np.zeros((N, N))}}, "weights: all are zero"),
+        ({"data": {"weights": np.ones(3)}}, r"weights: got shape \(3,\); expected one that broadcasts"),
+        ({"data": {"noise": -1}}, "noise: got -1; expected a finite number above 0"),
+        ({"search": {"max_steps": 0}}, "max_steps: got 0; expected an integer from 1"),
+        ({"search": {"smoothness": -1.0}}, "smoothness: got -1.0; expected a finite number from 0"),
+        ({"data": {"signature": "wks"}}, "signature: got 'wks'; .* wave_kernel"),
+        ({"data": {"signature": lambda pairs: pairs.eigenvalues}, "target": lambda t: t[0, 0]}, "k: got None"),
+        ({"data": {"signature": wave_kernel(0.5)}, "times": None}, "times: got None; expected energies"),
     ],
 )
 def test_bad_arguments_are_named(changes, message):
     target = np.linspace(1, 2, 4 * N * N).reshape(4, N, N)
-    target = changes.pop("target", lambda t: t)(target)
-    arguments = {"times": TIMES, "init": FLAT} | changes
+    target = changes.get("target", lambda t: t)(target)
+
+    def fit():
+        settings = {"data": Data(**changes.get("data", {})), "search": Search(**changes.get("search", {}))}
+        return hj.fit_metric(FLAT, **{"times": TIMES} | changes | {"target": target} | settings)
+
     with unchecked(), pytest.raises(ValueError, match=message):
-        hj.fit_metric(target, **arguments)
+        fit()
 
 
 def test_solvers_of_optimistix_are_taken_as_they_are():
     solver = optx.BFGS(1e-3, 1e-3)
     target = hj.heat_trace(hj.eigenpairs(CONFORMAL, K), TIMES)
     fit = hj.fit_metric(
-        target, TIMES, FLAT, "conformal", signature="heat-trace", k=K, optimiser=solver, tolerance=1e-2, max_steps=12
+        FLAT,
+        target,
+        TIMES,
+        "conformal",
+        k=K,
+        data=Data(signature="heat-trace"),
+        search=Search(optimiser=solver, tolerance=1e-2, max_steps=12),
     )
     assert float(outcome_of(fit.problem, fit.values).loss) == pytest.approx(fit.loss)
     assert fit.loss < 0.1 * fit.history[0].loss

@@ -114,7 +114,7 @@ def test_nifti_whose_header_contradicts_its_length(tmp_path, volume):
         content = bytearray(whole)
         struct.pack_into("<f" if place == 108 else "<h", content, place, value)
         assert refused(hj.io.read_tensors, path, bytes(content))
-    with pytest.raises(ValueError, match="does not begin with the size"):
+    with pytest.raises(ValueError, match=r"u\.nii\.gz: not a readable NIfTI image"):
         hj.io.read_tensors(_written(tmp_path / "u.nii.gz", gzip.compress(b"no image" * 100)))
 
 

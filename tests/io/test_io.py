@@ -168,7 +168,7 @@ def test_components_in_npy_and_npz(tmp_path, tensors, d, order):
     read = hj.io.read_tensors(tmp_path / "t.npy", order, spacing=0.5)
     np.testing.assert_array_equal(read.tensors, whole)
     assert (read.order, read.spacing) == (order, (0.5,) * d)
-    with pytest.raises(ValueError, match="of undeclared order, and programs differ"):
+    with pytest.raises(ValueError, match="does not declare their order, and programs differ"):
         hj.io.read_tensors(tmp_path / "t.npy")
     np.savez(tmp_path / "t.npz", D=components, order=order, spacing=np.ones(d))
     np.testing.assert_array_equal(hj.io.read_tensors(tmp_path / "t.npz", array="D").tensors, whole)

@@ -1,6 +1,7 @@
 """Units: of lengths and of diffusivities, read from headers, told, doubted and kept."""
 
 import json
+from dataclasses import replace
 
 import nibabel as nib
 import numpy as np
@@ -56,6 +57,7 @@ def test_lengths_of_nifti_are_in_mm(tmp_path, capsys, unit, voxel, expected):
 
 def test_masks_and_labels_that_lost_the_unit_lie_where_the_tensors_do(tmp_path):
     read = read_tensors(write(tmp_path / "t.nii", "micron", 150.0))
+    twice = replace(read, tensors=np.concatenate([read.tensors] * 2, axis=2))
     values = np.zeros(SHAPE, np.uint8)
     values[2:5] = 1
     for unit, voxel in (("unknown", 150.0), ("micron", 150.0), ("mm", 0.15)):  # as nibabel writes it, and right
@@ -63,9 +65,9 @@ def test_masks_and_labels_that_lost_the_unit_lie_where_the_tensors_do(tmp_path):
         image.header.set_xyzt_units(unit)
         nib.save(image, tmp_path / "m.nii")
         np.testing.assert_array_equal(read_mask(tmp_path / "m.nii", read.affine), values == 1)
-        np.testing.assert_array_equal(read_labels(tmp_path / "m.nii", SHAPE, read.affine), values)
+        np.testing.assert_array_equal(read_labels(tmp_path / "m.nii", read), values)
         with pytest.raises(ValueError, match=r"affine is the image's, .* cropped or resampled without its affine"):
-            read_labels(tmp_path / "m.nii", (8, 7, 6), read.affine)
+            read_labels(tmp_path / "m.nii", twice)
     image.header.set_xyzt_units("meter")
     nib.save(image, tmp_path / "m.nii")
     with pytest.raises(ValueError, match="the mask's affine places it"):

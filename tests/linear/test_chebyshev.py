@@ -7,11 +7,11 @@ import pytest
 from numpy.polynomial import chebyshev
 
 from hks_jax.linear.chebyshev import (
+    chebyshev_heat_coefficients,
     chebyshev_iteration,
     chebyshev_recurrence,
     coefficient_tails,
     gershgorin,
-    heat_coefficients,
     lanczos_bound,
     least_degree,
 )
@@ -63,7 +63,7 @@ def test_the_least_degree_keeps_the_error_and_one_less_does_not():
         degree = least_degree(extent / 2, error)
         tails = coefficient_tails(extent / 2)
         assert tails[degree + 1] <= error < tails[degree]
-        coefficients = heat_coefficients(jnp.array([extent]), 1.0, degree)[0]
+        coefficients = chebyshev_heat_coefficients(jnp.array([extent]), 1.0, degree)[0]
         assert np.abs(chebyshev.chebval(2 * x - 1, coefficients) - np.exp(-extent * x)).max() <= error
     assert least_degree(0.0, 1e-8) == 1
 

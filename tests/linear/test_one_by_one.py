@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.linear.batches import one_by_one
+from hks_jax.linear.loops import one_by_one
 
 
 def halvings(most, x, unit):

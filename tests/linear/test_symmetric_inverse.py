@@ -1,12 +1,11 @@
 """Inverses and inertia of batches of indefinite matrices, as CPUs, CUDA devices and others compute them."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hks_jax.linear import accelerators
 from hks_jax.linear.symmetric_inverse import (
     by_cholesky_factors,
     by_eigenvalues,
@@ -14,7 +13,12 @@ from hks_jax.linear.symmetric_inverse import (
     by_kernels,
 )
 
-WAYS = {"cpu": by_eigenvalues, "cuda": partial(by_kernels, interpret=True), "default": by_elimination}
+WAYS = {"cpu": by_eigenvalues, "cuda": by_kernels, "default": by_elimination}
+
+
+@pytest.fixture(autouse=True)
+def interpreted(monkeypatch):
+    monkeypatch.setattr(accelerators, "INTERPRETED", True)
 
 
 def of_spectrum(rng, values):

@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from hks_jax import Grid, SurfaceMesh, TensorField, plot
 from hks_jax.domain.examples import bumpy_torus_field, bumpy_torus_mesh, figure3_fields, figure4_fields
-from hks_jax.paper import figure1, figure2, figure3, figure4, figure5, figure6, run, table1, triangles
+from hks_jax.paper import fields, figure1, figure2, figure6, run, table1, triangles
 from hks_jax.paper.signature import continued_signature, enough_pairs, flat_signature, signature
 
 # What an independent implementation of the same method gives.
@@ -158,18 +158,19 @@ def cheap(monkeypatch):
 
     for module in (figure1, figure6):
         monkeypatch.setattr(module, "signature", cheap_signature)
-    for module in (figure2, figure3):
+    for module in (figure2, fields):
         monkeypatch.setattr(module, "flat_signature", lambda f, t, b="neumann": cheap_signature(f, [t], 1)[0])
-    for module in (figure4, figure5):
-        monkeypatch.setattr(module, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
+    monkeypatch.setattr(fields, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
     monkeypatch.setattr(figure2, "hks_expansion", lambda f, t: cheap_signature(f, t, 1))
 
 
-def draw(module, tmp_path, drawn, monkeypatch, **settings):
+def draw(figure, tmp_path, drawn, monkeypatch, size=None, **settings):
     """Run one figure with small settings, and return it once its file and its layout are right."""
-    name = module.__name__.rsplit(".", 1)[-1]
+    name = figure if isinstance(figure, str) else figure.__name__.rsplit(".", 1)[-1]
     for setting, value in settings.items():
-        monkeypatch.setattr(module, setting, value)
+        monkeypatch.setattr(figure, setting, value)
+    if size is not None:
+        monkeypatch.setitem(fields.SIZES, name, (size, size))
     (path,) = run(tmp_path, only=[name], echo=lambda text: None)
     pixels = imread(path)
     assert path == tmp_path / f"{name}.png"
@@ -223,7 +224,7 @@ def one_colour_range(images):
 
 @pytest.mark.usefixtures("cheap")
 def test_figure_3_has_ellipses_over_images(tmp_path, drawn, monkeypatch):
-    fig = draw(figure3, tmp_path, drawn, monkeypatch)
+    fig = draw("figure3", tmp_path, drawn, monkeypatch)
     assert [len(ax.collections) for ax in fig.axes] == [1] * 4 + [0] * 4
     assert [len(ax.images) for ax in fig.axes] == [0] * 4 + [1] * 4
     one_colour_range([ax.images[0] for ax in fig.axes[4:]])
@@ -232,7 +233,7 @@ def test_figure_3_has_ellipses_over_images(tmp_path, drawn, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_4_has_lines_over_every_field(tmp_path, drawn, monkeypatch):
-    fig = draw(figure4, tmp_path, drawn, monkeypatch, QUICK=31)
+    fig = draw("figure4", tmp_path, drawn, monkeypatch, size=31)
     n = len(figure4_fields(5))
     assert len(fig.axes) == 2 * n
     for top, bottom in zip(fig.axes[:n], fig.axes[n:], strict=True):
@@ -243,7 +244,7 @@ def test_figure_4_has_lines_over_every_field(tmp_path, drawn, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
-    fig = draw(figure5, tmp_path, drawn, monkeypatch, QUICK=31)
+    fig = draw("figure5", tmp_path, drawn, monkeypatch, size=31)
     *panels, bar = fig.axes
     titles = [ax.get_title() for ax in panels]
     assert titles == [f"index {i}" for i in ("−2", "−3/2", "−1", "−1/2", "1/2", "1", "3/2", "2", "5/2", "3")]
@@ -305,18 +306,18 @@ def test_figure_2_shows_the_boundary_and_its_removal(tmp_path, drawn, monkeypatc
 
 @pytest.mark.slow
 def test_figures_3_and_4_see_which_fields_are_flat(tmp_path, drawn, monkeypatch):
-    fig = draw(figure3, tmp_path, drawn, monkeypatch)
+    fig = draw("figure3", tmp_path, drawn, monkeypatch)
     spread = [float(np.ptp(ax.images[0].get_array())) for ax in fig.axes[4:]]
     assert spread[0] < 0.02
     assert min(spread[1:]) > 0.1
-    fig = draw(figure4, tmp_path, drawn, monkeypatch)
+    fig = draw("figure4", tmp_path, drawn, monkeypatch)
     spread = [float(np.ptp(ax.images[0].get_array())) for ax in fig.axes[5:]]
     assert max(spread[:3]) < 0.1 * min(spread[3:])  # straight, circles and spirals; waves and cells
 
 
 @pytest.mark.slow
 def test_figure_5_has_the_symmetries_of_its_fields(tmp_path, drawn, monkeypatch):
-    fig = draw(figure5, tmp_path, drawn, monkeypatch, QUICK=31)
+    fig = draw("figure5", tmp_path, drawn, monkeypatch, size=31)
     images = {ax.get_title(): ax.images[0].get_array().T for ax in fig.axes if ax.images}
     # The field of index i is the same after a turn by 2π/|2i − 2|; those of a quarter turn are nodes again.
     for index in ("−1", "3"):

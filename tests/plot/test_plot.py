@@ -355,13 +355,13 @@ def test_hks_curves_are_the_values_at_the_nodes():
 def test_hks_curves_errors():
     grid = Grid((5, 4))
     ax = new_figure(3, 3).subplots()
-    with pytest.raises(ValueError, match=r"values: got shape \(2, 5, 4\); expected .* \(1, 5, 4\)"):
+    with pytest.raises(ValueError, match=r"values: got shape \(2, 5, 4\) .*; expected .* \(1, 5, 4\)"):
         hks_curves(ax, np.zeros((2, 5, 4)), [1.0], grid, [[0, 0]])
     with pytest.raises(ValueError, match=r"points: \(9.0, 0.0\) lies outside"):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[9, 0]])
     with (
         unchecked(),
-        pytest.raises(ValueError, match=r"expansion: got shape \(2, 5, 4\); expected that of values, \(1, 5, 4\)"),
+        pytest.raises(ValueError, match=r"expansion: got shape \(2, 5, 4\) .*; expected .* \(1, 5, 4\)"),
     ):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[0, 0]], expansion=np.ones((2, 5, 4)))
     with unchecked(), pytest.raises(ValueError, match=r"points: got shape \(2,\)"):

@@ -8,7 +8,7 @@ from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.checks import require_count, require_number
-from hks_jax.inverse import H1, Prior, TotalVariation
+from hks_jax.inverse import H1, Data, Prior, Search, TotalVariation
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.io import find_invalid, repair_tensors
 from hks_jax.io.volume import TensorVolume
@@ -73,10 +73,10 @@ OTHERS = {
     "memory": ("memory", lambda v: hj.colouring(FIELD, [0.1], memory=v)),
     "slack": ("slack", lambda v: hj.colouring(FIELD, [0.1], slack=v)),
     "spare": ("spare", lambda v: hj.ChebyshevFilter(spare=v)),
-    "tolerance of fit_metric": ("tolerance", lambda v: fit(tolerance=v)),
-    "noise": ("noise", lambda v: fit(noise=v)),
-    "spread": ("spread", lambda v: fit(spread=v)),
-    "smoothness": ("smoothness", lambda v: fit(smoothness=v)),
+    "tolerance of Search": ("tolerance", lambda v: Search(tolerance=v)),
+    "noise": ("noise", lambda v: Data(noise=v)),
+    "spread": ("spread", lambda v: Search(spread=v)),
+    "smoothness": ("smoothness", lambda v: Search(smoothness=v)),
     "tolerance of GaussNewton": ("tolerance", lambda v: GaussNewton(tolerance=v)),
     "damping": ("damping", lambda v: GaussNewton(damping=v)),
     "growth": ("growth", lambda v: GaussNewton(growth=v)),
@@ -88,10 +88,6 @@ OTHERS = {
     "floor of repair": ("floor", lambda v: repair_tensors(VOLUME, "clip", v)),
     "sigma of wks": ("sigma", lambda v: hj.wks(pairs(), [1.0], v)),
 }
-
-
-def fit(**settings):
-    return hj.fit_metric(np.ones((1, *GRID.shape)), [1.0], FIELD, **settings)
 
 
 @pytest.mark.parametrize("case", OTHERS)
@@ -137,9 +133,9 @@ COMPLEX = {
     "spacing": lambda: hj.Grid((4, 5), spacing=np.array([1, 1 + 1j])),
     "origin": lambda: hj.Grid((4, 5), origin=1j),
     "times": lambda: hj.hks(pairs(), [1 + 1j]),
-    "times of a fit": lambda: hj.fit_metric(np.ones((1, 4, 5)), [1 + 1j], FIELD),
-    "target": lambda: hj.fit_metric(NODAL[None], [1.0], FIELD),
-    "weights": lambda: hj.fit_metric(np.ones((1, 4, 5)), [1.0], FIELD, weights=NODAL),
+    "times of a fit": lambda: hj.fit_metric(FIELD, np.ones((1, 4, 5)), [1 + 1j]),
+    "target": lambda: hj.fit_metric(FIELD, NODAL[None], [1.0]),
+    "weights": lambda: hj.fit_metric(FIELD, np.ones((1, 4, 5)), [1.0], data=Data(weights=NODAL)),
     "functions": lambda: hj.heat_flow(pairs(), [1.0], NODAL),
     "functions of a scale space": lambda: hj.gaussian_scale_space(FIELD, [1.0], NODAL),
     "f": lambda: hj.laplace_beltrami(FIELD, NODAL),

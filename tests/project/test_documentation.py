@@ -73,11 +73,20 @@ def test_tables_and_plots_are_what_was_measured(tables):
 
 def test_a_changed_result_and_one_shown_nowhere_are_told(tables, monkeypatch):
     stored, named = tables.load, tables.named()
-    rows = [{"n": 3, "eigh_s": 0.5, "value_s": 0.5, "value_and_gradient_s": 0.5, "hessian_product_s": 0.5}]
-    monkeypatch.setattr(tables, "load", lambda name: stored(name) | ({"rows": rows} if name == "dense" else {}))
+    rows = [{"way": "one by one", "seconds": 0.5, "first_call_s": 0.5}]
+    monkeypatch.setattr(tables, "load", lambda name: stored(name) | ({"rows": rows} if name == "batch" else {}))
     monkeypatch.setattr(tables, "named", lambda: named - {"stress"})
-    told = ["benchmarks/README.md: its tables", "benchmarks/README.md: stress.json is shown nowhere"]
+    told = ["benchmarks/accelerators/README.md: its tables", "benchmarks/results/stress.json is shown nowhere"]
     assert tables.differences() == told
+
+
+def test_a_table_has_the_rows_that_its_request_chooses(tables, monkeypatch):
+    rows = [{"solver": f"SLEPc, {way}", "seconds": 1.5} for way in ("slicing", "krylov")] + [{"solver": "LaPy"}]
+    monkeypatch.setattr(tables, "load", lambda name: {"rows": rows})
+    shown = tables.table("any", ["solver=SLEPc??slicing,La*", "solver", "seconds"])
+    assert shown.splitlines()[2:] == ["| SLEPc, slicing | 1.5 |", "| LaPy | — |"]
+    with pytest.raises(ValueError, match="no row"):
+        tables.table("any", ["solver=none", "seconds"])
 
 
 @pytest.mark.parametrize(

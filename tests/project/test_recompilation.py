@@ -122,7 +122,9 @@ def test_tolerances_of_fits_compile_nothing_anew(optimiser):
     target = np.asarray(hj.hks(hj.eigenpairs(field, 30), times))
 
     def fit(tolerance):
-        return hj.fit_metric(target, times, flat, "conformal", k=30, optimiser=optimiser, tolerance=tolerance)
+        return hj.fit_metric(
+            flat, target, times, "conformal", k=30, search=hj.inverse.Search(optimiser=optimiser, tolerance=tolerance)
+        )
 
     with compilations() as seen:
         rough = fit(1e-1)

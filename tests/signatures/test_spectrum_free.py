@@ -16,7 +16,7 @@ from scipy.special import ive
 import hks_jax as hj
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.fem.space import GridSpace
-from hks_jax.linear.chebyshev import coefficient_sizes, heat_coefficients
+from hks_jax.linear.chebyshev import chebyshev_heat_coefficients, coefficient_sizes
 from hks_jax.spectrum_free.plan import choose_method, work
 from hks_jax.spectrum_free.rational import exponential_poles
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
@@ -267,7 +267,7 @@ def test_bounds_hold():
 
 def test_coefficients_and_poles():
     times, top = jnp.array([0.1, 7.0]), 9.0
-    found = heat_coefficients(times, top, 80)
+    found = chebyshev_heat_coefficients(times, top, 80)
     for row, t in zip(found, np.asarray(times), strict=True):
         n = np.arange(81)
         np.testing.assert_allclose(np.abs(row), np.where(n == 0, 1, 2) * ive(n, t * top / 2), atol=1e-14)

@@ -20,8 +20,8 @@ a picture, and with --atlas a table of regions; for all of them group_summary.ts
 Tensors whose mean diffusivity no living tissue has in mm2/s are refused unless --unit, or the column unit, says in
 which unit they are: subjects in different units cannot be compared.
 
-A subject that fails does not stop the others. The same command, given again, computes only what is not there yet, or
-was of other files.
+A subject that fails does not stop the others. The same command, given again, computes only the signatures and
+tables that are not there yet, or were made of other files.
 
 examples:
   hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
@@ -48,7 +48,7 @@ from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.cli.study.folder import MAP, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
-from hks_jax.cli.values import Times, parse_times
+from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import recorded_boundary
 from hks_jax.io.tables import read_json
@@ -79,8 +79,7 @@ def run(args: argparse.Namespace, _: Progress) -> None:
         why = "is a scan of one subject; expected a number, residuals or roughness"
         raise ValueError(f"--noise: {args.noise} {why}. Second scans belong into a column noise of the table")
     args.strict_unit = True
-    times, settle = parse_times(args.times), args.boundary is None
-    if settle:  # subjects are compared, and so have the same boundary, with or without a mask
+    if settle := args.boundary is None:  # subjects are compared, and so have the same boundary, with or without a mask
         before = {} if args.replace else read_json(args.output / "study.json")
         args.boundary = recorded_boundary(before.get("settings", {})) or "mean"
     subjects = read_subjects(args.subjects, args)
@@ -96,7 +95,7 @@ def run(args: argparse.Namespace, _: Progress) -> None:
     if settle:
         progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
     with progress.catching_warnings():
-        study = _open(args, times, subjects, progress)
+        study = _open(args, subjects, progress)
         problems = {subject.name: "" for subject in subjects if subject not in chosen}
         problems |= run_all(study, chosen, progress, args.debug)
         if args.only:  # what others have done in the meantime
@@ -121,10 +120,7 @@ def _is_there(study: Study, subject: Subject) -> bool:
 
 
 def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
-    """Return why subjects are refused whose diffusivities are so far from the others' that the unit must be another.
-
-    Files that declare no lengths in mm, such as NumPy's, can be compared with each other alone.
-    """
+    """Return why subjects are refused whose diffusivities are too far from the others' for the same unit."""
     if study.settings.metric == "tensor":  # which need not be diffusion
         return {}
     inputs = {subject.name: read_json(study.path(subject, f"{MAP}.json")).get("Input", {}) for subject in done}
@@ -139,15 +135,13 @@ def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
     }
 
 
-def _open(args: argparse.Namespace, times: Times, subjects: list[Subject], progress: StudyProgress) -> Study:
-    """Return the study, described in its folder, its times settled: as given, or as it has them, or as they suit all.
-
-    A folder of a study of other settings, which is not to be replaced, is refused.
-    """
-    study = Study(args.output, Settings.of(args, times=times), args.time_unit, reading_options(args), args.save_pairs)
+def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
+    """Return the study, described in its folder, with its times settled; refuse a folder of another study."""
+    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
+    times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = study.record, dict(before)
-    if times.automatic:  # they remain what they were
+    if times.automatic:  # they remain those of before
         now["times"], then["times"] = chosen, before.get("chosen")
     for part in ("settings", "reading"):
         now |= now.pop(part)
@@ -173,7 +167,7 @@ def _suitable(
     if args.metric == "adjugate":
         raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
     ranges: dict[str, Range] = {}
-    silent = StudyProgress(1, True, io.StringIO())  # what is to be warned of is, when the subject's turn comes
+    silent = StudyProgress(1, True, io.StringIO())  # warnings come when the subject's turn does
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
         with suppress(Exception):  # said when its turn comes

@@ -1,4 +1,4 @@
-"""The folder of a study, a BIDS derivative: names, sidecars, what is done already, and the tables of the group."""
+"""The folder of a study, a BIDS derivative: names, sidecars, finished subjects, and the tables of the group."""
 
 import argparse
 import hashlib
@@ -97,10 +97,7 @@ class Study:
     def write_signature(
         self, subject: Subject, fingerprint: str, result: Result, warnings: list[str], draw: Callable[[Path], Any]
     ) -> None:
-        """Write a subject's signature, its picture and, last, the sidecar that says it is done.
-
-        Nothing in the files depends on when or where they were computed.
-        """
+        """Write a subject's signature, its picture and, last, the sidecar that says it is done; all without dates."""
         self.forget(subject)
         args, report, scaled = subject.args, result.report, result.arrays.get("scaled_times")
         target = self.path(subject, MAP)
@@ -129,7 +126,7 @@ class Study:
     def forget(self, subject: Subject) -> None:
         """Remove what an earlier run with other settings, or an interrupted one, has left of a subject."""
         sidecar, picture = self.path(subject, f"{MAP}.json"), self.path(subject, f"{MAP}.png", "figures")
-        sidecar.unlink(missing_ok=True)  # first: what it stands for is complete as long as it is there
+        sidecar.unlink(missing_ok=True)  # first: it says that the other files are complete
         ours = [file for kind in _SUFFIXES for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
         for path in [*ours, picture, sidecar.with_name("explore.html")]:
             path.unlink(missing_ok=True)
@@ -156,7 +153,7 @@ class Study:
             )
 
     def write_description(self, subjects: list[Subject], chosen: str) -> None:
-        """Write what the study is: the files of a BIDS derivative, and the times."""
+        """Write the description of the study: the files of a BIDS derivative, and the times."""
         description = {
             "Name": "Heat kernel signatures of diffusion tensor fields",
             "BIDSVersion": "1.10.0",
@@ -174,10 +171,7 @@ class Study:
         write_table(self.folder / "participants.tsv", ("participant_id", *covariates), rows)
 
     def write_group(self, subjects: list[Subject], problems: Mapping[str, str], with_regions: bool) -> list[Path]:
-        """Write the table of all subjects and, of those that are done, that of all regions; return their paths.
-
-        Of the others, `problems` says by their names why they are not done.
-        """
+        """Write the tables of all subjects and of all regions; `problems` says by name why some are not done."""
         n = 1 + any(subject.session for subject in subjects)
         head, ids = ("participant_id", "session_id")[:n], {s.name: (s.participant, s.session)[:n] for s in subjects}
         summary = [(*ids[s.name], *_summary(self.path(s, f"{MAP}.json"), problems.get(s.name))) for s in subjects]
@@ -195,17 +189,14 @@ class Study:
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return by name the options of reading and, where error bars are asked for, of noise.
-
-    A second scan is one of the files, and said to be one alone: its path may change.
-    """
+    """Return by name the options of reading and noise; a second scan is "file", as its path may change."""
     names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
     return reading if second_scan(args) is None else {**reading, "noise": "file"}
 
 
 def times_text(unit: str) -> str:
-    """Say what the times of a study are."""
+    """Describe the times of a study."""
     if unit == "lambda1":
         return "times of each subject are the given numbers over its own first positive eigenvalue λ₁"
     return "the same times for all subjects, in (metric length)²: s for the metric D⁻¹ of mm²/s on mm"
@@ -230,7 +221,8 @@ def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
     images = [args.file, *args.others]
     if not args.others and args.bval is None and is_nifti(args.file) and is_one_of_six(args.file):
         images = siblings(args.file)
-    sidecars = [sidecar_of(path) for path in images[:1] if args.bval is None and is_nifti(path)]
+    sidecar = sidecar_of(images[0]) if args.bval is None and is_nifti(images[0]) else None
+    sidecars = [] if sidecar is None or not sidecar.is_file() else [sidecar]
     given = {"file": images, "sidecar": sidecars, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
     inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
     second = second_scan(args)

@@ -21,7 +21,7 @@ class Subject:
         participant: ``sub-`` and a label.
         session: ``ses-`` and a label, or nothing.
         arguments: the command's arguments with those of the row; None where these are wrong.
-        problem: what is wrong with them.
+        problem: why they are wrong; else empty.
         covariates: the columns that are no arguments.
     """
 
@@ -57,8 +57,8 @@ class _RowParser(argparse.ArgumentParser):
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     """Read the table, and join each row with the arguments that hold for all subjects.
 
-    A row with wrong options becomes a subject with a problem. What is wrong for all raises ValueError: no table, no
-    columns `participant_id` and `file`, labels that BIDS does not allow, or a subject (and session) twice.
+    A row with wrong options becomes a subject with a problem. ValueError is for the table itself: no columns
+    `participant_id` and `file`, labels that BIDS does not allow, or a subject (and session) twice.
     """
     rows, parser = read_table(path), _RowParser(add_help=False)
     add_options(parser, f"@file {READING} @noise @atlas @names")
@@ -92,7 +92,7 @@ def _label(path: Path, entity: str, text: str) -> str:
 
 
 def _words(folder: Path, row: dict[str, str]) -> tuple[list[str], dict[str, str]]:
-    """Return what a row says as a command line does, and its other columns."""
+    """Return a row's options as the words of a command line, and its other columns."""
     words, covariates = [], {}
     if "file" in row:
         words.append(str(folder / row.pop("file")))

@@ -1,4 +1,4 @@
-"""The computations of a study: what is to be done of each subject, and doing it."""
+"""The computations of a study: finding and running those that each subject lacks."""
 
 import io
 import sys
@@ -35,7 +35,7 @@ PATIENCE = 0.5
 
 
 def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> dict[str, str]:
-    """Compute what is not there yet; return why some subjects failed, by their names.
+    """Compute all subjects that are not done; return why some of them failed, by their names.
 
     Other processes with the same study share the work: each subject is computed by the one that comes to it first. One
     that begins the study anew, with other settings, makes this one raise ValueError.
@@ -91,7 +91,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
 
 
 class _Task(NamedTuple):
-    """What is to be done of a subject: its signature, and the table of its regions, unless its fingerprint is empty."""
+    """The work on a subject: its signature, and the table of its regions unless that one's fingerprint is empty."""
 
     study: Study
     subject: Subject
@@ -101,7 +101,7 @@ class _Task(NamedTuple):
 
     @classmethod
     def of(cls, study: Study, subject: Subject) -> "_Task":
-        """Return what is to be done: what is not there, or was of other files or settings."""
+        """Return the parts that are missing, or were made of other files or settings."""
         fingerprint = study.fingerprint(subject)
         regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
         task = cls(study, subject, fingerprint, True, regions)
@@ -113,7 +113,7 @@ class _Task(NamedTuple):
         return self.study.folder / self.subject.folder / ".attempt"
 
     def left(self) -> "_Task | None":
-        """Return what is not there, as another process may have done it meanwhile."""
+        """Return the parts that are still missing: another process may have done some meanwhile."""
         missing = self.signature and not self.study.has(self.subject, MAP, self.fingerprint)
         known = not missing and self.study.has(self.subject, REGIONS, self.regions)
         left = self._replace(signature=missing, regions="" if known else self.regions)

@@ -6,9 +6,7 @@ by Weyl's law eigenvalues are spread evenly enough for that. The factorisations 
 all products with a Jacobian at one point.
 """
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,24 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.compilation import jit_quickly, known_here
-from hks_jax.eigen.complement.adjoint import (
-    SINGULAR,
-    Adjoint,
-    amplification,
-    attainable,
-    definite_product,
-    first_beyond,
-    group_numbers,
-    middles_of_gaps,
-    shifts_between,
-)
-from hks_jax.eigen.complement.blockwise import cleaned, projected, solve_in_blocks, without_known
-from hks_jax.eigen.origin import LocatedPencil
+from hks_jax.eigen.complement import adjoint as complement
+from hks_jax.eigen.complement.adjoint import Adjoint, Columns, OfRows, Rows, Scalar, Shifts, Values, Vectors
+from hks_jax.eigen.inertia import LocatedPencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
+from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import products_with_columns, times
+from hks_jax.linear.products import matmul, products_with_columns
 
 BLOCK = 16
 """Rows solved at once."""
@@ -45,27 +34,10 @@ _GROWTH = 4e7
 _MEMORY = 5e8
 """Bytes that factorisations may take together."""
 
-Shifted = tuple[Factorisation, Float[Array, " groups"]]
+Shifted = tuple[Factorisation, Shifts]
 """Factorisations of K − σM, stacked, and their shifts."""
-
-
-class Groups(NamedTuple):
-    """How rows are grouped; static.
-
-    Attributes:
-        first: (groups,) the first row of each group.
-        last: (groups,) its last row.
-    """
-
-    first: Int[np.ndarray, " groups"]
-    last: Int[np.ndarray, " groups"]
-
-
-class Takes(NamedTuple):
-    """How to take known eigenvectors out of columns: those next to the shift, or all."""
-
-    near: Callable[[Float[Array, "n b"]], Float[Array, "n b"]]
-    all: Callable[[Float[Array, "n b"]], Float[Array, "n b"]]
+Groups = tuple[Int[np.ndarray, " groups"], Int[np.ndarray, " groups"]]
+"""The first row of each group, and its last row; static."""
 
 
 class FactorisedAdjoint(Adjoint[SymmetricPencil]):
@@ -81,34 +53,71 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     tolerance: float = eqx.field(default=1e-8, static=True)
     solves: int = eqx.field(default=1, static=True)
 
-    def prepare(self, pencil: SymmetricPencil, values: Float[Array, " p"], k: int) -> Shifted:
+    def prepare(self, pencil: SymmetricPencil, values: Values, k: int) -> Shifted:
         """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
         if known_here((pencil, values)):
             # One after another: the solver has compiled that.
             dissection = jax.device_put(dissection)
-            shifts = self._shifts(pencil, np.asarray(values), self._groups(dissection, values, k))
+            shifts = self._shifts(pencil, np.asarray(values), self.groups(dissection, len(values), k, values.dtype))
             each = [factorise(dissection, pencil.shifted(jnp.asarray(shift))) for shift in shifts]
             stacked = jax.tree.map(lambda *x: np.stack(x), *((f.downward, f.upward, f.pivots) for f in each))
             return Factorisation(dissection, *jax.device_put(stacked)), jax.device_put(shifts)
         # Compiled without the dissection: what a compiled function hands through is copied.
-        factors, shifts = _factorise(dissection, pencil, values, k, self)
+        factors, shifts = self._factorise(dissection, pencil, values, k)
         return Factorisation(dissection, *factors), shifts
 
-    def solve(
-        self,
-        prepared: Shifted,
-        pencil: SymmetricPencil,
-        values: Float[Array, " p"],
-        vectors: Float[Array, "p n_dof"],
-        rhs: Float[Array, "k n_dof"],
-    ) -> Float[Array, "k n_dof"]:
-        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
-        return _solve(*prepared, pencil, values, vectors, rhs, self)
+    @jit_quickly(static_argnames="k")
+    def _factorise(
+        self, dissection: Dissection, pencil: SymmetricPencil, values: Values, k: int
+    ) -> tuple[tuple[Any, ...], Shifts]:
+        shifts = self._shifts(pencil, values, self.groups(dissection, len(values), k, values.dtype))
+        factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
+        return (factors.downward, factors.upward, factors.pivots), shifts
 
-    def _groups(self, dissection: Dissection, values: Float[Array, " p"], k: int) -> Groups:
-        distance = partial(self._distance, len(values), k)
-        return group_blocks(dissection, distance, values.dtype, k, self.tolerance, self.solves)
+    @jit_quickly()
+    def solve(self, prepared: Shifted, pencil: SymmetricPencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
+        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
+        factors, shifts = prepared
+        k, tolerance, clean = (
+            len(rhs),
+            complement.attainable(self.tolerance, rhs.dtype),
+            complement.without_known(pencil, vectors),
+        )
+
+        def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
+            fields = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.pivots))
+            near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]]
+            return Factorisation(factors.dissection, *fields), near.T, pencil.mass.apply(near)
+
+        def solve_block(group: tuple[Factorisation, Array, Array], b: Array, wanted: Array, shifts: Array) -> Columns:
+            factor, near, images = group
+
+            def without_near(x: Columns) -> Columns:
+                return x - matmul(near, products_with_columns(images, x))
+
+            return self._solve_block(pencil, values, without_near, clean, factor, b, wanted, shifts)
+
+        left, wanted = complement.projected(pencil, vectors, rhs, tolerance, self._amplified(pencil, values, k))
+        first, _ = self.groups(factors.dissection, len(values), k, values.dtype)
+        x = complement.solve_in_blocks(of_group, solve_block, BLOCK, first, left, wanted, values[:k])
+        definite = not isinstance(self, InteriorAdjoint)
+        return (
+            x
+            if definite and _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance
+            else complement.cleaned(pencil, vectors, x)
+        )
+
+    def groups(self, dissection: Dissection, p: int, k: int, dtype: np.dtype) -> Groups:
+        """Group blocks of the first k of p rows, each by the distance that its middle row has; see `group_numbers`."""
+        start = np.arange(0, k, BLOCK)
+        end = np.minimum(start + BLOCK, k)
+        distance = self._distance(p, k, (start + end - 1) / 2)
+        entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
+        room = max(int(_MEMORY / (entries * dtype.itemsize)), 1)
+        number = complement.group_numbers(distance, k * self.solves, complement.attainable(self.tolerance, dtype), room)
+        _, first = np.unique(number, return_index=True)
+        return start[first], np.append(start[first[1:]], k) - 1
 
     # What differs where eigenvalues are left on both sides of those that are known follows.
 
@@ -116,27 +125,34 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         """Return how far the eigenvalues of rows are from Λ, by Weyl's law in 2D."""
         return p + 1 - row
 
-    def _shifts(self, pencil: Any, values: Float[Array, " p"], groups: Groups) -> Float[Array, " groups"]:
-        beyond = first_beyond(values)
-        return shifts_between(values, beyond - values[groups.last], beyond - values[groups.first])
+    def _shifts(self, pencil: Any, values: Values, groups: Groups) -> Shifts:
+        (first, last), beyond = groups, complement.first_beyond(values)
+        return complement.shifts_between(values, beyond - values[last], beyond - values[first])
 
-    def _amplified(self, pencil: Any, values: Float[Array, " p"], k: int) -> Float[Array, " k"]:
+    def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
         """Return how much larger the solutions of rows become than those of others as large."""
-        return amplification(values, k)
+        return complement.amplification(values, k)
 
+    # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those next
+    # to σ above all, which is why no others are taken out before the end, or before that makes it start again.
     def _solve_block(
-        self, pencil: Any, values: Float[Array, " p"], takes: Takes, *of_block: Any
-    ) -> Float[Array, "n b"]:
-        """Solve for columns, given the factorisation, the columns, the errors wanted, and the eigenvalues."""
-        factor, b, wanted, eigenvalues = of_block
+        self,
+        pencil: Any,
+        values: Values,
+        without_near: OfColumns,
+        without_known: OfColumns,
+        factor: Factorisation,
+        b: Columns,
+        wanted: Float[Array, " b"],
+        shifts: Float[Array, " b"],
+    ) -> Columns:
+        stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
 
-        # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those
-        # next to σ above all, which is why no others are taken out before the end, or before that makes it start again.
-        def precondition(r: Array) -> Array:
-            return takes.near(factor.solve_columns(r))
+        def precondition(r: Columns) -> Columns:
+            return without_near(factor.solve(r))
 
-        product = definite_product(pencil, eigenvalues, first_beyond(values))
-        return conjugate_gradients(product, precondition, b, wanted, clean=takes.all).converged
+        product = complement.definite_product(stiffness, mass, shifts, complement.first_beyond(values))
+        return conjugate_gradients(product, precondition, b, wanted, clean=without_known).converged
 
 
 # Eigenvalues are left on both sides of the known ones: K − λᵢM is indefinite on the complement. But let a shift σ, like
@@ -166,95 +182,34 @@ class InteriorAdjoint(FactorisedAdjoint):
         others = (p - k) / 2
         return (k + others - row) / (row + others + 1)
 
-    def _shifts(self, pencil: Any, values: Float[Array, " p"], groups: Groups) -> Float[Array, " groups"]:
-        low, high = _left(pencil, values)
+    def _shifts(self, pencil: Any, values: Values, groups: Groups) -> Shifts:
+        (first, last), (low, high) = groups, _left(pencil, values)
         odds = (high - values) / (values - low)
-        mean = jnp.sqrt(odds[groups.first] * odds[groups.last])
+        mean = jnp.sqrt(odds[first] * odds[last])
         # Where all known are one eigenvalue, there is the gap between it and the origin, above which it is the first.
-        return middles_of_gaps(jnp.sort(values), (high + mean * low) / (1 + mean), values[0] / 2)
+        return complement.middles_of_gaps(jnp.sort(values), (high + mean * low) / (1 + mean), values[0] / 2)
 
-    def _amplified(self, pencil: Any, values: Float[Array, " p"], k: int) -> Float[Array, " k"]:
+    def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
         low, high = _left(pencil, values)
         return (high - low) / 2 / jnp.minimum(high - values[:k], values[:k] - low)
 
     def _solve_block(
-        self, pencil: Any, values: Float[Array, " p"], takes: Takes, *of_block: Any
-    ) -> Float[Array, "n b"]:
-        factor, b, wanted, eigenvalues = of_block
+        self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
+    ) -> Columns:
+        factor, b, wanted, shifts = of_block
         stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
 
-        def inner(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
+        def inner(x: Columns, y: Columns) -> Float[Array, " b"]:
             return jnp.sum(x * mass(y), axis=0)
 
-        def product(x: Float[Array, "n b"]) -> tuple[Float[Array, "n b"], Float[Array, " b"]]:
-            return factor.solve_columns(stiffness(x) - eigenvalues * mass(x)), SINGULAR * inner(x, x)
+        def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
+            return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
         # Of the traces of known eigenvectors that rounding leaves, A amplifies those next to σ alone.
-        right = factor.solve_columns(b)
-        return conjugate_gradients(product, takes.near, right, wanted, inner, takes.all).converged
+        right = factor.solve(b)
+        return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 
 
-def _left(pencil: LocatedPencil, values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _left(pencil: LocatedPencil, values: Values) -> tuple[Scalar, Scalar]:
     """Return estimates of Λ₋ and Λ₊, the eigenvalues next to the known ones that are left."""
     return jnp.min(values) - pencil.spacing, jnp.max(values) + pencil.spacing
-
-
-@jit_quickly(static_argnames=("k", "adjoint"))
-def _factorise(
-    dissection: Dissection, pencil: SymmetricPencil, values: Float[Array, " p"], k: int, adjoint: FactorisedAdjoint
-) -> tuple[tuple[Any, ...], Float[Array, " groups"]]:
-    """Return the fields of the stacked factorisations of K − σM, without the dissection, and the shifts."""
-    shifts = adjoint._shifts(pencil, values, adjoint._groups(dissection, values, k))
-    factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
-    return (factors.downward, factors.upward, factors.pivots), shifts
-
-
-@jit_quickly(static_argnames="adjoint")
-def _solve(
-    factors: Factorisation,
-    shifts: Float[Array, " groups"],
-    pencil: SymmetricPencil,
-    values: Float[Array, " p"],
-    vectors: Float[Array, "p n_dof"],
-    rhs: Float[Array, "k n_dof"],
-    adjoint: FactorisedAdjoint,
-) -> Float[Array, "k n_dof"]:
-    k, tolerance, clean = len(rhs), attainable(adjoint.tolerance, rhs.dtype), without_known(pencil, vectors)
-
-    def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
-        fields = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.pivots))
-        near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]]
-        return Factorisation(factors.dissection, *fields), near.T, pencil.mass.apply(near)
-
-    def solve_block(group: tuple[Factorisation, Array, Array], *of_block: Array) -> Float[Array, "n_dof b"]:
-        factor, near, near_images = group
-
-        def without_near(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
-            return x - times(near, products_with_columns(near_images, x))
-
-        return adjoint._solve_block(pencil, values, Takes(without_near, clean), factor, *of_block)
-
-    left, wanted = projected(pencil, vectors, rhs, tolerance, adjoint._amplified(pencil, values, k))
-    first = adjoint._groups(factors.dissection, values, k).first
-    x = solve_in_blocks(of_group, solve_block, BLOCK, first, left, wanted, values[:k])
-    definite = not isinstance(adjoint, InteriorAdjoint)
-    return x if definite and _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance else cleaned(pencil, vectors, x)
-
-
-def group_blocks(
-    dissection: Dissection,
-    distance_of: Callable[[Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
-    dtype: np.dtype,
-    k: int,
-    tolerance: float,
-    solves: int = 1,
-) -> Groups:
-    """Group blocks of the rows 0 … k−1, each by what its middle row has for a distance; see `group_numbers`."""
-    start = np.arange(0, k, BLOCK)
-    end = np.minimum(start + BLOCK, k)
-    distance = distance_of((start + end - 1) / 2)
-    entries = sum(own.size * (own.shape[1] + 2 * boundary.shape[1]) for own, boundary, *_ in dissection.levels)
-    room = max(int(_MEMORY / (entries * dtype.itemsize)), 1)
-    number = group_numbers(distance, k * solves, attainable(tolerance, dtype), room)
-    _, first = np.unique(number, return_index=True)
-    return Groups(start[first], np.append(start[first[1:]], k) - 1)

@@ -36,6 +36,8 @@ _LEAST_NODES = 6
 _LARGE = 1 << 21
 """Numbers in all vectors from which on a round takes so long that its blocks are told one by one."""
 
+Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
+
 
 class ChebyshevFilter(Eigensolver[Pencil]):
     """Chebyshev-filtered subspace iteration on stencils: no factorisation, memory for the vectors and little more.
@@ -66,8 +68,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     mesh: Mesh | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
-        """Check the settings."""
-        require_number("tolerance", self.tolerance, 1)
         require_count("block", self.block)
         require_number("spare", self.spare)
         require_count("max_rounds", self.max_rounds)
@@ -100,9 +100,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         return Plan(k, size, self.block, space.n_null, self.tolerance, self.single_precision, mesh)
 
 
-def _lowest(
-    pencil: Pencil, plan: Plan, max_rounds: int, report: Report
-) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
+def _lowest(pencil: Pencil, plan: Plan, max_rounds: int, report: Report) -> Pairs:
     grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in _nested(pencil, plan)]
     grid = grids.pop()
     state, rounds = grid.from_random(pencil.volume), _FIRST_ROUNDS
@@ -174,10 +172,7 @@ class Pace:
         self._work, self._seconds, self._begin = work, now - self._begin, now
 
     def seconds_left(self, done: int = 0, work: int = 0) -> float | None:
-        """Return the seconds left, with `done` of `work` products of the present round done; None where unknown.
-
-        Of a round that is not under way, nothing is done, and the work is taken for that of the last.
-        """
+        """Return the seconds left, with `done` of `work` products of this round done, if any; None where unknown."""
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))

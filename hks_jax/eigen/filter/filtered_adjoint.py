@@ -11,11 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from hks_jax.checks import require_count
-from hks_jax.eigen.complement.adjoint import Adjoint, amplification, attainable, definite_product, first_beyond
-from hks_jax.eigen.complement.blockwise import projected, solve_in_blocks, without_known
+from hks_jax.eigen.complement import adjoint as complement
+from hks_jax.eigen.complement.adjoint import Adjoint, Columns, Rows, Scalar, Values, Vectors
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 from hks_jax.fem.pencil import Pencil
@@ -41,26 +41,18 @@ class FilteredAdjoint(Adjoint[Pencil]):
     block: int = eqx.field(default=32, static=True)
 
     def __check_init__(self) -> None:
-        """Check the block's size."""
         require_count("block", self.block)
 
-    def prepare(self, pencil: Pencil, values: Float[Array, " p"], k: int) -> Float[Array, ""]:
+    def prepare(self, pencil: Pencil, values: Values, k: int) -> Scalar:
         """Return the upper end of the spectrum of D⁻¹K."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("adjoint: FilteredAdjoint needs a grid; use FactorisedAdjoint for a mesh")
         return upper_end(nodal_pencil(pencil))
 
-    def solve(
-        self,
-        prepared: Float[Array, ""],
-        pencil: Pencil,
-        values: Float[Array, " p"],
-        vectors: Float[Array, "p n_dof"],
-        rhs: Float[Array, "k n_dof"],
-    ) -> Float[Array, "k n_dof"]:
+    def solve(self, prepared: Scalar, pencil: Pencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         space, nodal, high = pencil.space, nodal_pencil(pencil), prepared
-        k, tolerance, beyond = rhs.shape[0], attainable(self.tolerance, rhs.dtype), first_beyond(values)
+        tolerance, beyond = complement.attainable(self.tolerance, rhs.dtype), complement.first_beyond(values)
         # The polynomial is one of D⁻¹K, whose values are the quotients φᵀKφ / φᵀDφ: on coarse grids a fraction of λ.
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
@@ -68,20 +60,21 @@ class FilteredAdjoint(Adjoint[Pencil]):
         # Nearer to the band it does not reach its gain, and would no longer be definite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
-        clean = without_known(pencil, vectors)
+        clean = complement.without_known(pencil, vectors)
+        stiffness, mass_product = pencil.stiffness.of_columns(), pencil.mass.of_columns()
 
-        def one_block(_: None, b: Array, wanted: Array, shifts: Array, references: Array) -> Float[Array, "n_dof b"]:
+        def one_block(_: None, b: Array, wanted: Array, shifts: Array, references: Array) -> Columns:
             degree = jnp.ceil(jnp.clip(band.degree_for(jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
-            def precondition(r: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+            def precondition(r: Columns) -> Columns:
                 columns = to_columns(space.extend(r.T, outside=0.0).reshape(r.shape[1], -1), nodal.shape)
                 z = correction(nodal, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
                 return clean(-space.restrict(to_rows(z).reshape(-1, *nodal.shape)).T)
 
-            return conjugate_gradients(definite_product(pencil, shifts, beyond), precondition, b, wanted).converged
+            product = complement.definite_product(stiffness, mass_product, shifts, beyond)
+            return conjugate_gradients(product, precondition, b, wanted).converged
 
-        left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
-        one_group = np.zeros(1, int)
-        return solve_in_blocks(
-            lambda _: None, one_block, self.block, one_group, left, wanted, values[:k], quotients[:k]
-        )
+        k, one_group = len(rhs), np.zeros(1, int)
+        left, wanted = complement.projected(pencil, vectors, rhs, tolerance, complement.amplification(values, k))
+        rows = left, wanted, values[:k], quotients[:k]
+        return complement.solve_in_blocks(lambda _: None, one_block, self.block, one_group, *rows)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from hks_jax.fem.nodal import NodalPencil
-from hks_jax.linear.chebyshev import chebyshev_iteration, gershgorin, lanczos_bound
+from hks_jax.linear.chebyshev import Columns, chebyshev_iteration, gershgorin, lanczos_bound
 from hks_jax.linear.products import aligned
 
 _STEPS = 64
@@ -57,12 +57,12 @@ class Band(NamedTuple):
 def correction(
     pencil: NodalPencil,
     band: Band,
-    residual: Float[Array, "*shape b"],
+    residual: Columns,
     value: Float[Array, " b"],
     degree: Int[Array, ""],
-    whole: Float[Array, "*shape b"] | float = 0.0,
+    whole: Columns | float = 0.0,
     terms: Int[Array, ""] | int = 0,
-) -> Float[Array, "*shape b"]:
+) -> Columns:
     """Return q(D⁻¹K) D⁻¹ residual with the polynomial that belongs to ``value`` ζ (at most the band's low end).
 
     With ``terms`` n > 0, W in place of D⁻¹; value and band are then those of WK. Where a column of ``whole`` is not
@@ -74,14 +74,14 @@ def correction(
         for matrix in (pencil.stiffness, pencil.mass)
     )
 
-    def further(y: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
+    def further(y: Columns) -> Columns:
         if pencil.mass.is_diagonal:
             return y
         return jax.lax.fori_loop(0, terms, lambda _, sum_: y + (sum_ - mass(sum_)), y)
 
     reference = jnp.minimum(value, band.low)
 
-    def run(inverse: Callable[[Array], Array]) -> Float[Array, "*shape b"]:
+    def run(inverse: Callable[[Array], Array]) -> Columns:
         w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - aligned(reference.astype(dtype), whole) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 

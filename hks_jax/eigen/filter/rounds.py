@@ -10,18 +10,10 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from hks_jax.eigen.filter import subspace
 from hks_jax.eigen.filter.coarsening import interpolate
 from hks_jax.eigen.filter.polynomial import Band, correction
-from hks_jax.eigen.filter.subspace import (
-    EVERYWHERE,
-    block_of,
-    measured,
-    own_blocks,
-    rayleigh_ritz,
-    shared,
-    to_own_rows,
-    to_slabs,
-)
+from hks_jax.eigen.filter.subspace import EVERYWHERE
 from hks_jax.eigen.quality import allowed_residuals
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.halo import Slabs
@@ -42,78 +34,51 @@ those of more than twice their eigenvalues, before the filter needs a better inv
 _MOST_TERMS = 15
 """Further terms of its Neumann series, at most."""
 
+Scalar = Float[Array, ""]
+Number = Int[Array, ""]
+Values = Float[Array, " m"]
+OwnRows = Float[Array, "own nodes"]
+"""The whole vectors that this device filters."""
+
 
 class Plan(NamedTuple):
-    """The sizes of a computation; static.
+    """The sizes of a computation; static."""
 
-    Attributes:
-        wanted: how many eigenpairs.
-        size: how many vectors, whole blocks.
-        block: vectors filtered together.
-        n_null: zero eigenvalues.
-        tolerance: relative residual that counts as converged.
-        single_precision: whether filters run in float32.
-        mesh: the devices that vectors are shared among; None for one.
-    """
-
-    wanted: int
-    size: int
-    block: int
-    n_null: int
-    tolerance: float
-    single_precision: bool
-    mesh: Mesh | None
+    wanted: int  # how many eigenpairs
+    size: int  # how many vectors, whole blocks
+    block: int  # vectors filtered together
+    n_null: int  # zero eigenvalues
+    tolerance: float  # relative residual that counts as converged
+    single_precision: bool  # whether filters run in float32
+    mesh: Mesh | None  # the devices that vectors are shared among; None for one
 
 
 class FilterState(NamedTuple):
-    """What is known between two rounds.
+    """What is known between two rounds."""
 
-    Attributes:
-        values: (m,) Ritz values θ, ascending.
-        vectors: (m, nodes) M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab.
-        residuals: (m,) ‖Kx − θMx‖/‖Mx‖.
-        lumped_values: (m,) xᵀKx / xᵀDx with the lumped mass D.
-        terms: further terms of the mass's inverse that were needed so far.
-        rounds: rounds so far on this grid.
-    """
-
-    values: Float[Array, " m"]
-    vectors: Float[Array, "m nodes"]
-    residuals: Float[Array, " m"]
-    lumped_values: Float[Array, " m"]
-    terms: Int[Array, ""]
-    rounds: Int[Array, ""]
+    values: Values  # Ritz values θ, ascending
+    vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab
+    residuals: Values  # ‖Kx − θMx‖/‖Mx‖
+    lumped_values: Values  # xᵀKx / xᵀDx with the lumped mass D
+    terms: Number  # further terms of the mass's inverse that were needed so far
+    rounds: Number  # rounds so far on this grid
 
 
 class Filtering(NamedTuple):
-    """The polynomials of a round.
+    """The polynomials of a round."""
 
-    Attributes:
-        band: what they damp.
-        terms: further terms of the mass's inverse.
-        degrees: by block; 0 where all has converged.
-        values: (m,) ψ of each vector, at which its polynomial is scaled.
-        factor: (m,) by which corrections are multiplied.
-    """
-
-    band: Band
-    terms: Int[Array, ""]
-    degrees: Int[Array, " blocks"]
-    values: Float[Array, " m"]
-    factor: Float[Array, " m"]
+    band: Band  # what they damp
+    terms: Number  # further terms of the mass's inverse
+    degrees: Int[Array, " blocks"]  # by block; 0 where all has converged
+    values: Values  # ψ of each vector, at which its polynomial is scaled
+    factor: Values  # by which corrections are multiplied
 
 
 class GridFilter(eqx.Module):
-    """Subspace iteration on one grid. What is compiled for one serves all grids of its shape.
+    """Subspace iteration on one grid. What is compiled for one serves all grids of its shape."""
 
-    Attributes:
-        pencil: K and M.
-        high: a bound of the spectrum of D⁻¹K.
-        plan: static.
-    """
-
-    pencil: NodalPencil
-    high: Float[Array, ""]
+    pencil: NodalPencil  # K and M
+    high: Scalar  # a bound of the spectrum of D⁻¹K
     plan: Plan = eqx.field(static=True)
 
     @property
@@ -121,27 +86,27 @@ class GridFilter(eqx.Module):
         """How the grid is cut between rounds; None on one device."""
         return self.pencil.cut(self.plan.mesh)
 
-    def allowed(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, " m"]:
+    def allowed(self, rounding: Scalar, state: FilterState) -> Values:
         """Return the residuals up to which pairs count as converged."""
         scale = jnp.maximum(state.values, state.values[self.plan.n_null])
         return allowed_residuals(scale, rounding, self.plan.tolerance)
 
-    def unconverged(self, rounding: Float[Array, ""], state: FilterState) -> Int[Array, ""]:
+    def unconverged(self, rounding: Scalar, state: FilterState) -> Number:
         """Return how many of the wanted pairs have not converged."""
         return jnp.sum(~(state.residuals <= self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
-    def excess(self, rounding: Float[Array, ""], state: FilterState) -> Float[Array, ""]:
+    def excess(self, rounding: Scalar, state: FilterState) -> Scalar:
         """Return the largest residual of the wanted pairs, as a multiple of the one that counts as converged."""
         return jnp.max((state.residuals / self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
-    def from_random(self, volume: Float[Array, ""]) -> FilterState:
+    def from_random(self, volume: Scalar) -> FilterState:
         """Return the state after filtering random functions."""
         plan, shape, dtype = self.plan, self.pencil.shape, self.high.dtype
         low = jnp.minimum(1.3 * weyl(plan.size, volume, len(shape)).astype(dtype), self.high / 3)
 
-        def run(grid: GridFilter, low: Float[Array, ""]) -> FilterState:
+        def run(grid: GridFilter, low: Scalar) -> FilterState:
             pencil, band = grid.pencil, Band(low, grid.high)
             degree = jnp.ceil(band.degree_for(jnp.zeros_like(low), _SPREAD)).astype(int)
 
@@ -150,11 +115,11 @@ class GridFilter(eqx.Module):
                 image = pencil.stiffness @ x
                 return to_rows(x + correction(pencil, band, image, jnp.full(plan.block, low), degree, x))
 
-            numbers = own_blocks(grid.slabs, plan.size // plan.block)
+            numbers = subspace.own_blocks(grid.slabs, plan.size // plan.block)
             keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
             return grid._begin(jax.lax.map(damped, keys).reshape(-1, pencil.free.size))
 
-        return shared(self.slabs, run, EVERYWHERE, _layout(self.slabs))(self, low)
+        return subspace.shared(self.slabs, run, EVERYWHERE, _layout(self.slabs))(self, low)
 
     @jax.jit
     def from_coarse(self, coarse: "GridFilter", state: FilterState) -> FilterState:
@@ -162,18 +127,18 @@ class GridFilter(eqx.Module):
         slabs, shape, block = coarse.slabs, coarse.pencil.shape, self.plan.block
 
         def run(grid: GridFilter, vectors: Float[Array, "m coarse_nodes"]) -> FilterState:
-            rows = to_own_rows(slabs, block, vectors)
+            rows = subspace.to_own_rows(slabs, block, vectors)
 
             def of_block(number: Array) -> Float[Array, "b nodes"]:
-                return to_rows(interpolate(grid.pencil, block_of(rows, number, block, shape)))
+                return to_rows(interpolate(grid.pencil, subspace.block_of(rows, number, block, shape)))
 
             return grid._begin(jax.lax.map(of_block, jnp.arange(len(rows) // block)).reshape(len(rows), -1))
 
         layout = _layout(self.slabs)
-        return shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
+        return subspace.shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
 
     def improve_told(
-        self, rounding: Float[Array, ""] | None, state: FilterState, done: Callable[[int, int], Any] | None = None
+        self, rounding: Scalar | None, state: FilterState, done: Callable[[int, int], Any] | None = None
     ) -> FilterState:
         """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz.
 
@@ -182,26 +147,26 @@ class GridFilter(eqx.Module):
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
-        def run(grid: GridFilter, rounding: Float[Array, ""] | None, state: FilterState) -> FilterState:
-            numbers = own_blocks(slabs, plan.size // plan.block)
+        def run(grid: GridFilter, rounding: Scalar | None, state: FilterState) -> FilterState:
+            numbers = subspace.own_blocks(slabs, plan.size // plan.block)
             chosen = grid.choose(rounding, state)
 
-            def step(own: Array, rows: Float[Array, "own nodes"]) -> Float[Array, "own nodes"]:
+            def step(own: Array, rows: OwnRows) -> OwnRows:
                 rows = grid.filter_block(chosen, state.values, numbers[own], own, rows)
                 if done is not None and chosen.degrees[own]:
                     jax.block_until_ready(rows)
                     done(int(chosen.degrees[: own + 1].sum()), int(chosen.degrees.sum()))
                 return rows
 
-            filtered = for_each(numbers.size, step, to_own_rows(slabs, plan.block, state.vectors))
-            return grid.ritz(to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
+            filtered = for_each(numbers.size, step, subspace.to_own_rows(slabs, plan.block, state.vectors))
+            return grid.ritz(subspace.to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
 
-        return shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
+        return subspace.shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
 
     improve = jax.jit(improve_told, donate_argnames="state")
 
     @jax.jit
-    def choose(self, rounding: Float[Array, ""] | None, state: FilterState) -> Filtering:
+    def choose(self, rounding: Scalar | None, state: FilterState) -> Filtering:
         """Return the polynomials of a round: the band that they damp, and their degrees."""
         plan = self.plan
         spare = jnp.arange(plan.size) >= plan.wanted
@@ -220,14 +185,7 @@ class GridFilter(eqx.Module):
         return Filtering(band, terms, degrees, filtered_values, factor)
 
     @partial(jax.jit, donate_argnames="vectors")
-    def filter_block(
-        self,
-        chosen: Filtering,
-        values: Float[Array, " m"],
-        number: Int[Array, ""],
-        own: Int[Array, ""],
-        vectors: Float[Array, "own nodes"],
-    ) -> Float[Array, "own nodes"]:
+    def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
         """Return the rows with a block filtered: the one of this number among all, the `own`th among these rows."""
         pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
         dtype = jnp.float32 if self.plan.single_precision else values.dtype
@@ -253,21 +211,20 @@ class GridFilter(eqx.Module):
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
 
     @partial(jax.jit, donate_argnames="vectors")
-    def ritz(self, vectors: Float[Array, "m nodes"], terms: Int[Array, ""], rounds: Int[Array, ""]) -> FilterState:
+    def ritz(self, vectors: Float[Array, "m nodes"], terms: Number, rounds: Number) -> FilterState:
         """Return the state whose vectors are the Ritz vectors of the rows."""
         slabs, block = self.slabs, self.plan.block
         own = self.pencil.own(slabs)
-        values, vectors = rayleigh_ritz(own, slabs, block, vectors)
-        residuals, lumped_values = measured(own, slabs, block, values, vectors)
+        values, vectors = subspace.rayleigh_ritz(own, slabs, block, vectors)
+        residuals, lumped_values = subspace.measured(own, slabs, block, values, vectors)
         return FilterState(values, vectors, residuals, lumped_values, terms, rounds)
 
-    def _begin(self, rows: Float[Array, "own nodes"]) -> FilterState:
-        """Return the first state on this grid, from this device's rows."""
+    def _begin(self, rows: OwnRows) -> FilterState:
         zero = jnp.zeros((), int)
-        return self.ritz(to_slabs(self.slabs, self.plan.block, rows), zero, zero)
+        return self.ritz(subspace.to_slabs(self.slabs, self.plan.block, rows), zero, zero)
 
 
-def _lumping(plan: Plan, state: FilterState) -> tuple[Int[Array, ""], Float[Array, " m"], Float[Array, " m"]]:
+def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
     """Return how many further terms the inverse of the mass needs, and with them ψ and the scale of each vector."""
     values, wanted = state.values, state.values[plan.wanted - 1]
     # 1 − β of the modes: what the lumped mass takes from their eigenvalues.

@@ -19,12 +19,15 @@ from jaxtyping import Array, Float, Int
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns
 from hks_jax.linear.accelerators import row_by_row
-from hks_jax.linear.products import combine
-from hks_jax.linear.standard_form import pencil_eigh
+from hks_jax.linear.dense_eigh import pencil_eigh
+from hks_jax.linear.products import matmul
 
 EVERYWHERE = PartitionSpec()
 _CHUNK = 1 << 14
 """Nodes rotated at once."""
+
+Values = Float[Array, " m"]
+Rows = Float[Array, "m nodes"]
 
 
 def shared(slabs: Slabs | None, function: Callable, in_specs: Any, out_specs: Any) -> Callable:
@@ -62,25 +65,20 @@ def to_slabs(slabs: Slabs | None, block: int, rows: Float[Array, "own nodes"]) -
     return dealt.reshape(rows.shape[0] * slabs.mesh.size, -1)
 
 
-def block_of(x: Float[Array, "m nodes"], number: Array, block: int, shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
+def block_of(x: Rows, number: Array, block: int, shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
     """Return a block of the rows as columns."""
     return to_columns(row_by_row(jax.lax.dynamic_slice_in_dim(x, number * block, block)), shape)
 
 
-def rayleigh_ritz(
-    pencil: NodalPencil, slabs: Slabs | None, block: int, x: Float[Array, "m nodes"]
-) -> tuple[Float[Array, " m"], Float[Array, "m nodes"]]:
-    """Return the Ritz values, ascending, and the M-orthonormal Ritz vectors in place of the rows.
-
-    With ``slabs``, pencil and rows are this device's share.
-    """
+def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows) -> tuple[Values, Rows]:
+    """Return Ritz values, ascending, and M-orthonormal Ritz vectors in place of the rows; all on this device's slab."""
     m, nodes = x.shape
     products = pencil.products()
 
     def among_rows(number: Array) -> tuple[Array, ...]:
         images = products(block_of(x, number, block, pencil.shape))
         # As columns: were they turned into rows, XLA would compute the stencils in that order, seven times slower.
-        return tuple(combine(x, image.reshape(nodes, block)) for image in images)
+        return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
     both = _total(slabs, jax.lax.map(among_rows, jnp.arange(m // block)))
     stiffness, mass = (jnp.moveaxis(p, 0, 1).reshape(m, m) for p in both)
@@ -88,20 +86,18 @@ def rayleigh_ritz(
     values, mix = (_of_first(slabs, found) for found in (values, vectors.T))
 
     def rotate(number: Array, x: Array) -> Array:
-        rotated = combine(mix, jax.lax.dynamic_slice_in_dim(x, number * _CHUNK, _CHUNK, axis=1))
+        rotated = matmul(mix, jax.lax.dynamic_slice_in_dim(x, number * _CHUNK, _CHUNK, axis=1))
         return jax.lax.dynamic_update_slice_in_dim(x, rotated, number * _CHUNK, axis=1)
 
     whole = nodes // _CHUNK
     if whole:
         x = jax.lax.fori_loop(0, whole, rotate, x)
     if nodes % _CHUNK:
-        x = x.at[:, whole * _CHUNK :].set(combine(mix, x[:, whole * _CHUNK :]))
+        x = x.at[:, whole * _CHUNK :].set(matmul(mix, x[:, whole * _CHUNK :]))
     return values, x
 
 
-def measured(
-    pencil: NodalPencil, slabs: Slabs | None, block: int, values: Float[Array, " m"], x: Float[Array, "m nodes"]
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Values, x: Rows) -> tuple[Values, Values]:
     """Return ‖Kx − θMx‖/‖Mx‖ and the lumped quotient xᵀKx / xᵀDx of each row; see `rayleigh_ritz`."""
     products = pencil.products()
 
@@ -118,7 +114,6 @@ def measured(
 
 
 def _total(slabs: Slabs | None, tree: Any) -> Any:
-    """Return sums over all devices."""
     return tree if slabs is None else slabs.total(tree)
 
 

@@ -20,10 +20,7 @@ def factorise_on_host(matrix: csc_matrix) -> SuperLU:
 
 
 def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bool]:
-    """Return the number of eigenvalues below the shift, and whether it is certain.
-
-    By the negative pivots of K − σM; the test is that of `hks_jax.linear.multifrontal.try_out`.
-    """
+    """Return how many eigenvalues lie below σ, by pivots of K − σM, and whether that is certain by `try_out`'s test."""
     matrix = (K - shift * M).tocsc()
     try:
         factor = factorise_on_host(matrix)

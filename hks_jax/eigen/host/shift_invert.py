@@ -12,7 +12,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
 from threadpoolctl import threadpool_limits
 
-from hks_jax.checks import require_count, require_number
+from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.host.host_adjoint import HostAdjoint
 from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices, inertia_on_host
@@ -53,8 +53,6 @@ class ShiftInvert(Eigensolver[Pencil]):
         return n_dof - 1
 
     def __check_init__(self) -> None:
-        """Check the settings."""
-        require_number("tolerance", self.tolerance, 1)
         require_count("max_restarts", self.max_restarts)
         if self.basis is not None:
             require_count("basis", self.basis, 2)

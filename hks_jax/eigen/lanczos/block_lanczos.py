@@ -7,27 +7,25 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from hks_jax.checks import require_count, require_number
+from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
+from hks_jax.eigen.complement.adjoint import Values, Vectors
 from hks_jax.eigen.dense import Dense
+from hks_jax.eigen.inertia import LocatedPencil, dissected, lowered, translated
 from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, first_state, unfinished
-from hks_jax.eigen.origin import LocatedPencil
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
 from hks_jax.eigen.quality import measure_pairs
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
-from hks_jax.linear.dissection import dissect
 from hks_jax.linear.loops import when, while_loop
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 SLICE = 170
 """Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
-
-
 _DENSE = 3000
 """Unknowns up to which all pairs are computed where slicing fails."""
 
@@ -51,8 +49,6 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     slice_size: int | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
-        """Check the settings."""
-        require_number("tolerance", self.tolerance, 1)
         require_count("block", self.block)
         if self.slice_size is not None:
             require_count("slice_size", self.slice_size)
@@ -79,18 +75,17 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         """Return the sizes of the computation, of whose k eigenvalues some are known to be zero."""
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
-        return Plan(k, self.block, size, 3 * slices + 12, nulls)
+        return Plan(k, self.block, size, 3 * slices + 12, self.tolerance, nulls)
 
     def slice(self, problem: Problem, plan: Plan, report: Report = silent) -> SlicingState:
         """Compute the wanted eigenpairs from zero upwards, slice by slice."""
-        dissection = dissect(problem.pencil.pattern)
+        dissection = dissected(problem.pencil)
         if not is_traced(problem):
             problem = problem._replace(pencil=tabulated(problem.pencil))
-            dissection = jax.device_put(dissection)
 
         def step(state: SlicingState) -> SlicingState:
-            factor, searchable, state = cut(problem, dissection, plan, self.tolerance, state)
-            state = when(searchable, partial(search, problem, factor, plan, self.tolerance), state)
+            factor, searchable, state = cut(problem, dissection, plan, state)
+            state = when(searchable, partial(search, problem, factor, plan), state)
             if report is not silent and not is_traced(state):  # to put numbers into words, the host waits for them
                 known, bound = min(int(state.known), plan.wanted), float(state.complete_below)
                 report(f"{known} of {plan.wanted} eigenpairs, all below {bound:.6g}")
@@ -121,11 +116,7 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
 
 @jit_quickly(static_argnames="k")
 def _lowest(
-    pencil: SymmetricPencil,
-    values: Float[Array, " capacity"],
-    vectors: Float[Array, "capacity n_dof"],
-    bound: Float[Array, ""],
-    k: int,
+    pencil: SymmetricPencil, values: Float[Array, " capacity"], vectors: Stored, bound: Float[Array, ""], k: int
 ) -> RawPairs:
     """Return the lowest known pairs, NaN where there are fewer than k, and the bound, NaN if one was found twice."""
     order = jnp.argsort(values)[:k]
@@ -134,3 +125,31 @@ def _lowest(
     if values.dtype == jnp.float32:
         bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & known), jnp.nan, bound)
     return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound
+
+
+def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, pencil: LocatedPencil) -> RawPairs:
+    """Return the first k pairs from the origin, then the guards: those that follow, and those before the origin.
+
+    Where the spectrum has fewer guards the others are zero vectors, with the eigenvalue of the first pair.
+    """
+    if isinstance(solver, Dense):
+        values, vectors, bound = solver.lowest(pencil, pencil.size)
+        values, vectors = _from(pencil.negative, pencil.size, values, vectors)
+        return values[: k + guards], vectors[: k + guards], bound
+    if guards == 0:
+        return solver.lowest(pencil, k, report)
+    assert isinstance(solver, BlockLanczos)
+    distance, before = lowered(pencil, guards // 2, solver.block)
+    moved = translated(pencil, -distance, pencil.negative - before, pencil.first + distance, pencil.spacing)
+    values, vectors, bound = solver.lowest(moved, k + guards, report)
+    return *_from(before, pencil.size - moved.negative, values - distance, vectors), bound - distance
+
+
+@jax.jit
+def _from(
+    first: Int[Array, ""], existing: Int[Array, ""] | int, values: Values, vectors: Vectors
+) -> tuple[Values, Vectors]:
+    """Return pairs from the first wanted one on, then those before it."""
+    there = jnp.arange(values.size) < existing
+    values, vectors = jnp.where(there, values, values[first]), jnp.where(there[:, None], vectors, 0)
+    return jnp.roll(values, -first), jnp.roll(vectors, -first, axis=0)

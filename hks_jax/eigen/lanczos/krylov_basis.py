@@ -11,14 +11,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.linear import accelerators, column_kernels, lapack
 from hks_jax.linear.operators import OfColumns
-from hks_jax.linear.products import combine, gram, products_with_columns, times
+from hks_jax.linear.products import gram, matmul, products_with_columns
 
 _PIECE = 128
 """Rows kept together: vectors are projected on whole pieces, but not on those that are still empty."""
-
 _SMALL = 1e-7
 """Components up to here are taken away in single precision: what it leaves of them is rounding."""
-
 _NODES = 2048
 """Degrees of freedom combined at once: what is read and what comes of it stay in the cache."""
 
@@ -31,6 +29,8 @@ class Piece(NamedTuple):
 
 
 Basis = tuple[Piece, ...] | Float[Array, "n_dof rows"]
+Block = Float[Array, "n_dof b"]
+Small = Float[Array, "b b"]
 
 
 def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
@@ -51,7 +51,7 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
     return tuple(pieces)
 
 
-def write(basis: Basis, block: Float[Array, "n_dof b"], row: Int[Array, ""]) -> Basis:
+def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
     """Return the basis with columns as its rows from the given one on, a multiple of b."""
     if not isinstance(basis, tuple):
         return jax.lax.dynamic_update_slice_in_dim(accelerators.row_by_row(basis), block, row, axis=1)
@@ -72,7 +72,7 @@ def write(basis: Basis, block: Float[Array, "n_dof b"], row: Int[Array, ""]) -> 
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
     """Return what columns x, given as Mx, have in the first vectors of the basis: VVᵀMx."""
     if not isinstance(basis, tuple):
-        return times(accelerators.row_by_row(basis), gram(basis, images))
+        return matmul(accelerators.row_by_row(basis), gram(basis, images))
     used = [filled > at for at in _starts(basis)]
 
     def none(rows: Array, x: Array) -> Float[Array, "rows c"]:
@@ -88,7 +88,7 @@ def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]
         parts = jnp.zeros(images.shape[::-1], dtype)
         for filled_piece, product, rows in zip(used, products, pieces, strict=True):
             mix = product.T.astype(dtype)
-            parts = jax.lax.cond(filled_piece, lambda m, r, p: p + combine(m, r), lambda m, r, p: p, mix, rows, parts)
+            parts = jax.lax.cond(filled_piece, lambda m, r, p: p + matmul(m, r), lambda m, r, p: p, mix, rows, parts)
         return parts.astype(images.dtype)
 
     whole = [piece.rows for piece in basis]
@@ -102,7 +102,7 @@ def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]
 def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     """Return many linear combinations of all rows of the basis."""
     if not isinstance(basis, tuple):
-        return combine(mix, basis.T)
+        return matmul(mix, basis.T)
     n = basis[0].rows.shape[1]
     width = min(_NODES, n)
     mixes = jnp.split(mix, _starts(basis)[1:], axis=1)
@@ -110,7 +110,7 @@ def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     def some(number: Array, sums_so_far: Float[Array, "q n_dof"]) -> Float[Array, "q n_dof"]:
         at = jnp.minimum(number * width, n - width)  # the last may overlap the one before
         parts = [jax.lax.dynamic_slice_in_dim(piece.rows, at, width, axis=1) for piece in basis]
-        sums = sum(map(combine, mixes, parts), jnp.zeros((), mix.dtype))
+        sums = sum(map(matmul, mixes, parts), jnp.zeros((), mix.dtype))
         return jax.lax.dynamic_update_slice_in_dim(sums_so_far, sums, at, axis=1)
 
     return jax.lax.fori_loop(0, -(-n // width), some, jnp.zeros((len(mix), n), mix.dtype))
@@ -133,19 +133,13 @@ def _put(
     )
 
 
-def recur(
-    block: Float[Array, "n_dof b"],
-    image: Float[Array, "n_dof b"],
-    before: Float[Array, "n_dof b"],
-    coupling: Float[Array, "b b"],
-    x: Float[Array, "n_dof b"],
-) -> tuple[Float[Array, "n_dof b"], Float[Array, "b b"]]:
+def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) -> tuple[Block, Small]:
     """Return x = (K − σM)⁻¹M · block without that block and the one before, and what it has in the block itself."""
 
     def plain() -> tuple[Array, Array]:
         diagonal = gram(image, x)
         diagonal = (diagonal + diagonal.T) / 2
-        return x - times(block, diagonal) - times(before, coupling), diagonal
+        return x - matmul(block, diagonal) - matmul(before, coupling), diagonal
 
     def by_kernels() -> tuple[Array, Array]:
         parts = column_kernels.parts_of_products(image, x)
@@ -154,20 +148,16 @@ def recur(
     return _one_of(by_kernels, plain, x)
 
 
-def without(
-    block: Float[Array, "n_dof b"], image: Float[Array, "n_dof b"], x: Float[Array, "n_dof b"]
-) -> Float[Array, "n_dof b"]:
+def without(block: Block, image: Block, x: Block) -> Block:
     """Return x without what it has of M-orthonormal columns, given also their image under M."""
 
     def by_kernels() -> Array:
         return column_kernels.remainder(x, block, column_kernels.parts_of_products(image, x))[0]
 
-    return _one_of(by_kernels, lambda: x - times(block, gram(image, x)), x)
+    return _one_of(by_kernels, lambda: x - matmul(block, gram(image, x)), x)
 
 
-def orthonormal(
-    mass: OfColumns, x: Float[Array, "n_dof b"]
-) -> tuple[Float[Array, "n_dof b"], Float[Array, "n_dof b"], Float[Array, "b b"]]:
+def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
     The inner products are factorised by their eigenvalues; in kernels, for which these take long, by a pivoted Cholesky
@@ -180,9 +170,9 @@ def orthonormal(
         for _ in range(2):
             image = mass(y)
             factor, change = _factored(gram(y, image))
-            y = times(y, change)
-            total = times(total, factor)
-        return y, times(image, change), total
+            y = matmul(y, change)
+            total = matmul(total, factor)
+        return y, matmul(image, change), total
 
     def by_kernels() -> tuple[Array, Array, Array]:
         parts = column_kernels.parts_of_products(x, mass(x))
@@ -195,13 +185,13 @@ def orthonormal(
     return _one_of(by_kernels, plain, x)
 
 
-def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Float[Array, "n_dof b"]) -> Any:
+def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Block) -> Any:
     if x.shape[1] <= column_kernels.LARGEST and column_kernels.agree(x.dtype):
         return jax.lax.platform_dependent(cuda=by_kernels, default=plain)
     return plain()
 
 
-def _factored(products: Float[Array, "b b"]) -> tuple[Float[Array, "b b"], Float[Array, "b b"]]:
+def _factored(products: Small) -> tuple[Small, Small]:
     """Return F with FFᵀ = G, the inner products, and F⁻ᵀ."""
     norms = jnp.sqrt(jnp.diagonal(products))
     norms = jnp.where(norms > 0, norms, 1)

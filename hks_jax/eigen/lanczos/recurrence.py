@@ -6,85 +6,64 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.lanczos.krylov_basis import Basis, begin, combined, orthonormal, recur, within, without, write
+from hks_jax.eigen.lanczos import krylov_basis
+from hks_jax.eigen.lanczos.krylov_basis import Basis, Block, Small, orthonormal
 from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.multifrontal import Factorisation
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, products_with_columns
+from hks_jax.linear.products import matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _STRETCH = 16
 """Called plainly, how many steps are one computation on a CPU, between which it can be interrupted."""
 
+Known = Float[Array, "w n_dof"]
+RitzPairs = tuple[Float[Array, " ritz"], Float[Array, "ritz n_dof"]]
+"""Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors; zero where there are fewer."""
+
 
 class ShiftedSolve(NamedTuple):
-    """How to apply (K − σM)⁻¹.
+    """How to apply (K − σM)⁻¹."""
 
-    Attributes:
-        factor: the factorisation of K − σM.
-        shift: σ.
-        passes: how often to solve: once, or twice, where the factorisation is inaccurate, then with the residual. None:
-            once, for which nothing else is compiled.
-    """
-
-    factor: Factorisation
-    shift: Float[Array, ""]
-    passes: Int[Array, ""] | None
+    factor: Factorisation  # the factorisation of K − σM
+    shift: Float[Array, ""]  # σ
+    passes: Int[Array, ""] | None  # 1, or 2 where the factorisation is inaccurate; None: 1, with nothing else compiled
 
 
 class _Blocks(NamedTuple):
     """Two neighbouring blocks of the basis, and the image under M of the latter."""
 
-    before: Float[Array, "n_dof b"]
-    block: Float[Array, "n_dof b"]
-    image: Float[Array, "n_dof b"]
-    coupling: Float[Array, "b b"]
+    before: Block
+    block: Block
+    image: Block
+    coupling: Small
 
 
 class _Recurrence(NamedTuple):
-    """What has been computed so far.
+    """What has been computed so far."""
 
-    Attributes:
-        basis: known eigenvectors and the blocks so far, M-orthonormal rows; the rest is zero.
-        blocks: the last two blocks, of which the latter is not yet in the basis.
-        matrix: the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, and those below it.
-    """
-
-    basis: Basis
-    blocks: _Blocks
+    basis: Basis  # known eigenvectors and the blocks so far, M-orthonormal rows; the rest is zero
+    blocks: _Blocks  # the last two blocks, of which the latter is not yet in the basis
+    # the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, and those below it
     matrix: Float[Array, "steps two b b"]
 
 
 def block_lanczos(
     pencil: SymmetricPencil,
     shifted: ShiftedSolve,
-    start: Float[Array, "n_dof b"],
-    known: Float[Array, "w n_dof"],
-    room: int,
-    steps: int | Int[Array, ""],
+    start: Block,  # the first block, any vectors
+    known: Known,  # M-orthonormal eigenvectors, or zero rows; w a multiple of b, 0 where nothing is known
+    room: int,  # for how many blocks there is room; static
+    steps: int | Int[Array, ""],  # how many blocks to compute, even; traced, as many as there is room for
     wanted: int,
-) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
+) -> RitzPairs:
     """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     Neighbouring blocks are kept orthogonal by the recurrence, and in double precision two at a time by one pass against
     the whole basis, which reads it from memory half as often and leaves it M-orthonormal to rounding.
-
-    Args:
-        pencil: K and M.
-        shifted: how to solve with K − σM.
-        start: the first block, any vectors.
-        known: M-orthonormal eigenvectors, or zero rows; w a multiple of b, 0 where nothing is known.
-        room: for how many blocks there is room; static.
-        steps: how many blocks to compute, even; traced, as many as there is room for.
-        wanted: how many Ritz pairs to return.
-
-    Returns:
-        The Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors; zero where there are
-        fewer.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
     # Traced, all of them are one loop: were its length to differ within a batch, each turn would copy all of the state.
@@ -100,16 +79,14 @@ def block_lanczos(
 
 
 @jit_quickly(static_argnames="room")
-def _begin(
-    pencil: SymmetricPencil, start: Float[Array, "n_dof b"], known: Float[Array, "w n_dof"], room: int
-) -> _Recurrence:
+def _begin(pencil: SymmetricPencil, start: Block, known: Known, room: int) -> _Recurrence:
     """Return the state before the first step: the first block is orthogonal to the known vectors."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2 if len(known) else 0):
-        block = block - combine(products_with_columns(known, mass(block)).T, known).T
+        block = block - matmul(products_with_columns(known, mass(block)).T, known).T
         block, _, _ = orthonormal(mass, block)
     block, image, _ = orthonormal(mass, block)
-    basis = begin(known, len(known) + room * b, b)
+    basis = krylov_basis.begin(known, len(known) + room * b, b)
     none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, 2, b, b), start.dtype)
     return _Recurrence(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix)
 
@@ -125,7 +102,10 @@ def _advance(
     last: int | Array,
 ) -> _Recurrence:
     """Take the steps from the first to before the last, or two ``alone``; their blocks begin at row ``offset``."""
-    every, two = _every(state.blocks.block.dtype), accelerators.at_hand()
+    # Next to the shift an eigenvalue's θ may be a thousand times as large as the others, and what rounding leaves of
+    # its eigenvector in a block grows as much in a step: in single precision every step projects on the whole basis.
+    every = 2 if state.blocks.block.dtype == jnp.float64 else 1
+    two = accelerators.at_hand()
 
     def advance(shifted: ShiftedSolve, state: _Recurrence) -> _Recurrence:
         steps = _stepping(pencil, shifted, offset)
@@ -152,38 +132,36 @@ def _stepping(
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     factor, shift, passes = shifted
 
-    def solve(rhs: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
+    def solve(rhs: Block) -> Block:
         if passes is None:
-            return factor.solve_columns(rhs)
+            return factor.solve(rhs)
 
         def residual_of(x: Array) -> Array:
             return rhs - (stiffness(x) - shift * mass(x))
 
         if accelerators.at_hand():
-            x = factor.solve_columns(rhs)
-            return x + factor.solve_columns(residual_of(x))
+            x = factor.solve(rhs)
+            return x + factor.solve(residual_of(x))
 
         # A loop, so that the solve is compiled once.
         def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, residual = state
-            x = x + factor.solve_columns(residual)
+            x = x + factor.solve(residual)
             return x, jax.lax.cond(done < passes - 1, residual_of, lambda _: residual, x)
 
         return jax.lax.fori_loop(0, passes, refine, (jnp.zeros_like(rhs), rhs))[0]
 
-    def step(
-        number: Array, basis: Basis, blocks: _Blocks, now: bool | Array
-    ) -> tuple[Basis, _Blocks, Float[Array, "two b b"]]:
+    def step(number: Array, basis: Basis, blocks: _Blocks, now: bool | Array) -> tuple[Basis, _Blocks, Array]:
         # Write the last block into the basis, and find the one that follows it.
         before, block, image, coupling = blocks
         b = block.shape[1]
-        onward, diagonal = recur(block, image, before, coupling, solve(image))
+        onward, diagonal = krylov_basis.recur(block, image, before, coupling, solve(image))
         row = offset + b * number
 
         def project(block: Array, onward: Array) -> tuple[Array, Array]:
-            parts = within(basis, jnp.concatenate([image, mass(onward)], axis=1), row)
+            parts = krylov_basis.within(basis, jnp.concatenate([image, mass(onward)], axis=1), row)
             block = block - parts[:, :b]
-            return block, without(block, image, onward - parts[:, b:])
+            return block, krylov_basis.without(block, image, onward - parts[:, b:])
 
         if not isinstance(now, bool):
             block, onward = jax.lax.cond(now, project, lambda block, onward: (block, onward), block, onward)
@@ -191,7 +169,7 @@ def _stepping(
             block, onward = project(block, onward)
         following, its_image, coupling = orthonormal(mass, onward)
         blocks = _Blocks(block, following, its_image, coupling)
-        return write(basis, block, row), blocks, jnp.stack([diagonal, coupling])
+        return krylov_basis.write(basis, block, row), blocks, jnp.stack([diagonal, coupling])
 
     def steps(number: Array, state: _Recurrence, projecting: tuple[bool | Array, ...]) -> _Recurrence:
         basis, blocks, entries = state.basis, state.blocks, []
@@ -217,19 +195,8 @@ def _in_any_of_batch(size: int, batched: list[bool], conditions: Bool[Array, " b
     return jnp.any(conditions), False
 
 
-def _every(dtype: np.dtype) -> int:
-    """Return after how many steps to project on the whole basis.
-
-    Next to the shift an eigenvalue's θ may be a thousand times as large as the others, and what rounding leaves of its
-    eigenvector in a block grows as much in a step: in single precision there is room for one.
-    """
-    return 2 if jnp.finfo(dtype).bits == 64 else 1
-
-
 @jit_quickly(static_argnames=("offset", "wanted"))
-def _ritz_pairs(
-    state: _Recurrence, offset: int, steps: int | Int[Array, ""], wanted: int
-) -> tuple[Float[Array, " wanted"], Float[Array, "wanted n_dof"]]:
+def _ritz_pairs(state: _Recurrence, offset: int, steps: int | Int[Array, ""], wanted: int) -> RitzPairs:
     room, _, b, _ = state.matrix.shape
     i = jnp.arange(room)
     diagonal, below = state.matrix[:, 0], state.matrix[:-1, 1]
@@ -240,4 +207,4 @@ def _ritz_pairs(
     full = full.at[i[1:], :, i[:-1], :].set(jnp.swapaxes(below, 1, 2))
     theta, modes = lapack.eigh(full.reshape(room * b, room * b))
     order = jnp.argsort(-jnp.abs(theta))[:wanted]
-    return theta[order], combined(jnp.pad(modes[:, order].T, ((0, 0), (offset, 0))), state.basis)
+    return theta[order], krylov_basis.combined(jnp.pad(modes[:, order].T, ((0, 0), (offset, 0))), state.basis)

@@ -13,49 +13,48 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.lanczos.krylov_basis import orthonormal
-from hks_jax.eigen.lanczos.recurrence import ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, crowded, make_room, steps_for
+from hks_jax.eigen.lanczos.krylov_basis import Block, orthonormal
+from hks_jax.eigen.lanczos.recurrence import RitzPairs, ShiftedSolve, block_lanczos
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, crowded, make_room, steps_for
 from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.loops import when
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import combine, gram, products_with_columns, times
+from hks_jax.linear.products import gram, matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _ERROR = 0.1
 """How far the error of solves may reach towards the tolerance of the lowest eigenvalue sought."""
-
 _EXCUSE = 30
 """How much more than usual rounding may spoil residuals, where nothing converges otherwise."""
-
 _MOVES = 3
 """How often in a row to move a shift at which the inertia is not to be trusted, before it must do."""
-
 _TURNS = 12
 """Inverse iterations in a search, at most."""
-
 _COPY = 1e-6
 """How far below an eigenvalue, relative, there is none of its copies."""
 
+Scalar = Float[Array, ""]
+Interval = tuple[Scalar, Scalar]
+Order = Int[Array, " ritz"]
+"""In which order to store Ritz vectors, those that are taken first."""
+
 
 def cut(
-    problem: Problem, dissection: Dissection, plan: Plan, tolerance: float, state: SlicingState
+    problem: Problem, dissection: Dissection, plan: Plan, state: SlicingState
 ) -> tuple[Factorisation, Bool[Array, ""], SlicingState]:
     """Factorise at the state's shift; return with it whether to search there, and the state, with room for that."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
     trial = try_out(factor, problem.pencil, state.shift, state.noise)
-    searchable, full, following = _consider(
-        problem, factor.negative, trial, plan, tolerance, state._replace(vectors=None)
-    )
+    searchable, full, following = _consider(problem, factor.negative, trial, plan, state._replace(vectors=None))
     return factor, searchable, when(full, partial(make_room, plan), following._replace(vectors=state.vectors))
 
 
-@jit_quickly(static_argnames=("plan", "tolerance"))
+@jit_quickly(static_argnames="plan")
 def _consider(
-    problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, tolerance: float, state: SlicingState
+    problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, state: SlicingState
 ) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
     """Return whether to search at the state's shift, whether to make room for it, and the state: if it is not to be
     searched, finished or with a better shift."""
@@ -71,7 +70,7 @@ def _consider(
     # Of more copies than are wanted some are enough: the certificate is below them.
     cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
-    accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, tolerance, lowest))
+    accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
     # Another shift costs a factorisation, refined solves more: they are for where it is no better.
     moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
 
@@ -100,30 +99,28 @@ def _consider(
     return searchable, searchable & crowded(plan, state), state
 
 
-def _needed(
-    problem: Problem, tolerance: float, lowest: Float[Array, ""], excuse: Float[Array, ""] | float = 1.0
-) -> Float[Array, ""]:
+def _needed(problem: Problem, plan: Plan, lowest: Scalar, excuse: Scalar | float = 1.0) -> Scalar:
     """Return how small residuals ‖Kφ − λMφ‖/‖Mφ‖ must be if the lowest eigenvalue not known yet is to converge."""
     rounding = excuse * indistinct(problem.pencil, lowest.dtype)
-    return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, tolerance)
+    return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, plan.tolerance)
 
 
-def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float, state: SlicingState) -> SlicingState:
+def search(problem: Problem, factor: Factorisation, plan: Plan, state: SlicingState) -> SlicingState:
     """Find the eigenpairs around the shift."""
     assert state.vectors is not None
     shifted = ShiftedSolve(factor, state.shift, state.passes)
     if not is_traced(state.multiple) and state.multiple:
-        order, vectors, following = _nearest(problem, shifted, plan, tolerance, state)
+        order, vectors, following = _nearest(problem, shifted, plan, state)
     else:
         # Where one slice is enough nothing is known as a rule, and there are no rows of zeros to stay orthogonal to. Of
         # several slices the first would have to be compiled apart.
         nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
         known, interval, steps = _window(problem, plan, state, 0 if nothing else plan.window)
         ritz = block_lanczos(problem.pencil, shifted, state.start, known, plan.steps, steps, plan.ritz)
-        order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
+        order, following = _accept(problem, plan, ritz, interval, state._replace(vectors=None))
         vectors = ritz[1]
         if not is_traced(following.stuck) and following.stuck and state.below > 0:
-            order, vectors, following = _nearest(problem, shifted, plan, tolerance, state)
+            order, vectors, following = _nearest(problem, shifted, plan, state)
     # Apart, so that nothing else is in memory besides the two arrays of vectors.
     return following._replace(vectors=_stored(state.vectors, vectors, order, state.known))
 
@@ -132,8 +129,8 @@ def search(problem: Problem, factor: Factorisation, plan: Plan, tolerance: float
 # eigenvalues than it takes steps. Inverse iteration finds as many as it has vectors, if they are near to the shift: of
 # copies that are more any will do.
 def _nearest(
-    problem: Problem, shifted: ShiftedSolve, plan: Plan, tolerance: float, state: SlicingState
-) -> tuple[Int[Array, " ritz"], Float[Array, "ritz n_dof"], SlicingState]:
+    problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState
+) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
     """Search by inverse iteration, orthogonal to all that is known; see `_accept`. For concrete values."""
     missing = int(state.below - jnp.sum(state.values < state.shift))
     count = min(missing + plan.block, plan.ritz, problem.pencil.size - int(state.known))
@@ -147,26 +144,22 @@ def _nearest(
             break
     ritz = jnp.pad(1 / (values - state.shift), (0, plan.ritz - count)), jnp.pad(x.T, ((0, plan.ritz - count), (0, 0)))
     interval = jnp.where(problem.negative > 0, 0, -jnp.inf).astype(values.dtype), jnp.asarray(jnp.inf, values.dtype)
-    order, following = _accept(problem, plan, tolerance, ritz, interval, state._replace(vectors=None))
+    order, following = _accept(problem, plan, ritz, interval, state._replace(vectors=None))
     return order, ritz[1], following
 
 
 @jit_quickly()
 def _inverse_iteration(
-    pencil: SymmetricPencil,
-    shifted: ShiftedSolve,
-    vectors: Float[Array, "m n_dof"],
-    known: Int[Array, ""],
-    x: Float[Array, "n_dof c"],
-) -> tuple[Float[Array, " c"], Float[Array, "n_dof c"], Float[Array, " c"]]:
+    pencil: SymmetricPencil, shifted: ShiftedSolve, vectors: Stored, known: Int[Array, ""], x: Block
+) -> tuple[Float[Array, " b"], Block, Float[Array, " b"]]:
     """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the first vectors, and their residuals."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
-    x = shifted.factor.solve_columns(mass(x))
+    x = shifted.factor.solve(mass(x))
     for _ in range(2):
         parts = jnp.where(jnp.arange(len(vectors))[:, None] < known, products_with_columns(vectors, mass(x)), 0)
-        x, _, _ = orthonormal(mass, x - combine(parts.T, vectors).T)
+        x, _, _ = orthonormal(mass, x - matmul(parts.T, vectors).T)
     values, mix = lapack.eigh(gram(x, stiffness(x)))
-    x = times(x, mix)
+    x = matmul(x, mix)
     image = mass(x)
     return values, x, jnp.linalg.norm(stiffness(x) - values * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
@@ -174,7 +167,7 @@ def _inverse_iteration(
 @jit_quickly(static_argnames=("plan", "rows"))
 def _window(
     problem: Problem, plan: Plan, state: SlicingState, rows: int
-) -> tuple[Float[Array, "rows n_dof"], tuple[Float[Array, ""], Float[Array, ""]], Int[Array, ""]]:
+) -> tuple[Float[Array, "rows n_dof"], Interval, Int[Array, ""]]:
     """Return how to search around the state's shift.
 
     These are so many of the known eigenvectors nearest to it, to stay orthogonal to, zero where there are fewer; the
@@ -194,31 +187,18 @@ def _window(
 
 
 @jit_quickly(donate_argnames="known_vectors")
-def _stored(
-    known_vectors: Float[Array, "capacity n_dof"],
-    vectors: Float[Array, "ritz n_dof"],
-    order: Int[Array, " ritz"],
-    known: Int[Array, ""],
-) -> Float[Array, "capacity n_dof"]:
+def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: Order, known: Int[Array, ""]) -> Stored:
     """Return the known vectors with others, in that order, behind them: in place."""
     return jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], known, 0)
 
 
-@jit_quickly(static_argnames=("plan", "tolerance"))
+@jit_quickly(static_argnames="plan")
 def _accept(
-    problem: Problem,
-    plan: Plan,
-    tolerance: float,
-    ritz: tuple[Float[Array, " ritz"], Float[Array, "ritz n_dof"]],
-    interval: tuple[Float[Array, ""], Float[Array, ""]],
-    state: SlicingState,
-) -> tuple[Int[Array, " ritz"], SlicingState]:
+    problem: Problem, plan: Plan, ritz: RitzPairs, interval: Interval, state: SlicingState
+) -> tuple[Order, SlicingState]:
     """Take what converged of the Ritz pairs in the interval, and choose the next shift.
 
-    What is known outside that interval may have been found again: nothing out there is taken.
-
-    Returns:
-        In which order to store the Ritz vectors, those that are taken first, and the state without its vectors.
+    What is known outside that interval may have been found again: nothing out there is taken. The state has no vectors.
     """
     (theta, vectors), (low, high) = ritz, interval
     shift, index, dtype = state.shift, jnp.arange(plan.capacity), vectors.dtype
@@ -230,7 +210,7 @@ def _accept(
     # Where nothing converged, as on a domain much longer than wide, it is rounding that is worse than usual: the
     # residuals say so.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
-    allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), tolerance)
+    allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), plan.tolerance)
     converged = (residuals <= allowed) & (theta != 0)
     # Above the first that did not converge, or farther away than those looked at, some are missing.
     above = near > shift
@@ -241,7 +221,7 @@ def _accept(
     complete = state.below == jnp.sum(state.values < shift) + jnp.sum(accepted & (values < shift))
     # What is known is kept out of later searches. If it has parts in the missing eigenvectors, which may be of much
     # smaller eigenvalues, these do not converge any more: then only what is accurate enough for them is taken.
-    needed = _needed(problem, tolerance, jnp.maximum(state.reached, first_nonzero), excuse)
+    needed = _needed(problem, plan, jnp.maximum(state.reached, first_nonzero), excuse)
     accepted &= complete | (residuals <= needed)
 
     order = jnp.argsort(jnp.where(accepted, values, jnp.inf))
@@ -284,7 +264,7 @@ def _accept(
     return order, state._replace(shift=jnp.where(complete, following, again))
 
 
-def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Float[Array, ""]:
+def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
     """Return the mean distance of the last few known eigenvalues; of few, at least what is expected."""
     few = jnp.minimum(state.known, plan.slice_size)
     ordered = jnp.sort(state.values)
@@ -293,7 +273,7 @@ def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Float[Array, 
     return jnp.where(few < plan.block, jnp.fmax(mean, problem.spacing), mean)
 
 
-def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Float[Array, ""]:
+def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
     """Return where to cut next: within the next slice, or in a gap above the last eigenvalue wanted."""
     ordered, known = jnp.sort(state.values), state.known
     index = jnp.arange(plan.capacity)

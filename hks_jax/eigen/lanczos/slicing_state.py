@@ -12,43 +12,29 @@ from hks_jax.linear.pencil import SymmetricPencil
 _NODES = 1 << 16
 """Degrees of freedom of all eigenvectors that are moved at once."""
 
+Stored = Float[Array, "capacity n_dof"]
+
 
 class Problem(NamedTuple):
-    """A pencil, and what is known of its spectrum beforehand. The eigenvalues sought are counted from zero upwards.
+    """A pencil, and what is known of its spectrum beforehand. The eigenvalues sought are counted from zero upwards."""
 
-    Attributes:
-        pencil: K and M.
-        first: the first shift.
-        spacing: the mean distance of eigenvalues to expect.
-        lowest: how large to expect the lowest one that is not zero.
-        unit: residuals of eigenvalues that are smaller than this are measured by it.
-        negative: how many eigenvalues are negative, and not sought.
-    """
-
-    pencil: SymmetricPencil
-    first: Float[Array, ""]
-    spacing: Float[Array, ""]
-    lowest: Float[Array, ""]
-    unit: Float[Array, ""]
-    negative: Int[Array, ""]
+    pencil: SymmetricPencil  # K and M
+    first: Float[Array, ""]  # the first shift
+    spacing: Float[Array, ""]  # the mean distance of eigenvalues to expect
+    lowest: Float[Array, ""]  # how large to expect the lowest one that is not zero
+    unit: Float[Array, ""]  # residuals of eigenvalues that are smaller than this are measured by it
+    negative: Int[Array, ""]  # how many eigenvalues are negative, and not sought
 
 
 class Plan(NamedTuple):
-    """The sizes of a computation; static.
+    """The sizes of a computation; static."""
 
-    Attributes:
-        wanted: how many eigenpairs.
-        block: vectors per Lanczos block.
-        slice_size: eigenvalues that a slice is expected to find, half of them below its shift.
-        max_slices: factorisations before giving up.
-        nulls: how many of the wanted eigenvalues are zero, by what is known of the matrices.
-    """
-
-    wanted: int
-    block: int
-    slice_size: int
-    max_slices: int
-    nulls: int
+    wanted: int  # how many eigenpairs
+    block: int  # vectors per Lanczos block
+    slice_size: int  # eigenvalues that a slice is expected to find, half of them below its shift
+    max_slices: int  # factorisations before giving up
+    tolerance: float  # relative residual that counts as converged
+    nulls: int  # how many of the wanted eigenvalues are zero, by what is known of the matrices
 
     @property
     def steps(self) -> int:
@@ -75,54 +61,33 @@ class Plan(NamedTuple):
         return self.wanted + self.block + self.ritz
 
 
+# Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
 def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
-    """Return the number of Lanczos blocks, even, that finds a number of eigenvalues.
-
-    Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
-    """
+    """Return the number of Lanczos blocks, even, that finds a number of eigenvalues."""
     return 2 * -(-(21 * size + 120 * plan.block) // (20 * plan.block))
 
 
 class SlicingState(NamedTuple):
-    """What is known between two slices.
+    """What is known between two slices."""
 
-    Attributes:
-        values: (capacity,) known eigenvalues in the order found; infinite where there is none.
-        vectors: (capacity, n_dof) their M-orthonormal eigenvectors; None where they are handed over apart.
-        known: how many there are.
-        shift: where to cut next.
-        below: eigenvalues from zero to the shift, by the inertia of the factorisation there; −1 if that is not trusted.
-        multiple: whether many of them are not known, and copies of one eigenvalue.
-        far: the last shift below which there were too many to search there,
-        far_below: and how many; 0 before there is one.
-        reached: known up to this without a gap, as far as is known.
-        complete_below: every eigenvalue below it is known, by the inertia of a factorisation.
-        start: (n_dof, block) where Lanczos starts next.
-        noise: (n_dof, block) independent normal numbers.
-        slices: factorisations so far.
-        moved: how often in a row the shift was moved because the factorisation was inaccurate there.
-        passes: how often to solve: once, or again with the residual.
-        stuck: whether the last search found none of the missing pairs.
-        finished: whether all is found and certified.
-    """
-
-    values: Float[Array, " capacity"]
-    vectors: Float[Array, "capacity n_dof"] | None
-    known: Int[Array, ""]
-    shift: Float[Array, ""]
+    values: Float[Array, " capacity"]  # known eigenvalues in the order found; infinite where there is none
+    vectors: Stored | None  # their M-orthonormal eigenvectors; None where they are handed over apart
+    known: Int[Array, ""]  # how many there are
+    shift: Float[Array, ""]  # where to cut next
+    # eigenvalues from zero to the shift, by the inertia of the factorisation there; −1 if that is not trusted
     below: Int[Array, ""]
-    multiple: Bool[Array, ""]
-    far: Float[Array, ""]
-    far_below: Int[Array, ""]
-    reached: Float[Array, ""]
-    complete_below: Float[Array, ""]
-    start: Float[Array, "n_dof block"]
-    noise: Float[Array, "n_dof block"]
-    slices: Int[Array, ""]
-    moved: Int[Array, ""]
-    passes: Int[Array, ""]
-    stuck: Bool[Array, ""]
-    finished: Bool[Array, ""]
+    multiple: Bool[Array, ""]  # whether many of them are not known, and copies of one eigenvalue
+    far: Float[Array, ""]  # the last shift below which there were too many to search there,
+    far_below: Int[Array, ""]  # and how many; 0 before there is one
+    reached: Float[Array, ""]  # known up to this without a gap, as far as is known
+    complete_below: Float[Array, ""]  # every eigenvalue below it is known, by the inertia of a factorisation
+    start: Float[Array, "n_dof block"]  # where Lanczos starts next
+    noise: Float[Array, "n_dof block"]  # independent normal numbers
+    slices: Int[Array, ""]  # factorisations so far
+    moved: Int[Array, ""]  # how often in a row the shift was moved because the factorisation was inaccurate there
+    passes: Int[Array, ""]  # how often to solve: once, or again with the residual
+    stuck: Bool[Array, ""]  # whether the last search found none of the missing pairs
+    finished: Bool[Array, ""]  # whether all is found and certified
 
 
 @jit_quickly(static_argnames="plan")
@@ -169,21 +134,17 @@ def make_room(plan: Plan, state: SlicingState) -> SlicingState:
 
 
 @jit_quickly(static_argnames="plan", donate_argnames="vectors")
-def _with_room(plan: Plan, vectors: Float[Array, "capacity n_dof"], state: SlicingState) -> SlicingState:
+def _with_room(plan: Plan, vectors: Stored, state: SlicingState) -> SlicingState:
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
     count = jnp.minimum(count, plan.capacity - plan.ritz)
     kept = jnp.arange(plan.capacity) < count
     return state._replace(
-        values=jnp.where(kept, state.values[order], jnp.inf),
-        vectors=_reordered(vectors, order, kept),
-        known=count,
+        values=jnp.where(kept, state.values[order], jnp.inf), vectors=_reordered(vectors, order, kept), known=count
     )
 
 
-def _reordered(
-    vectors: Float[Array, "capacity n_dof"], order: Int[Array, " capacity"], kept: Bool[Array, " capacity"]
-) -> Float[Array, "capacity n_dof"]:
+def _reordered(vectors: Stored, order: Int[Array, " capacity"], kept: Bool[Array, " capacity"]) -> Stored:
     """Return the rows in that order, zero where none is kept: in place where they may be overwritten."""
 
     def some(at: int | Array, width: int, vectors: Array) -> Array:

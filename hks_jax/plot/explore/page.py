@@ -18,9 +18,10 @@ from matplotlib import colormaps
 from hks_jax import __version__
 from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.surface_mesh import SurfaceMesh
+from hks_jax.domain.simplicial_mesh import SurfaceMesh
 from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
 from hks_jax.plot.orientation import LETTERS
+from hks_jax.plot.signature import bounding_box
 from hks_jax.signatures.hks import Normalisation
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
@@ -111,14 +112,17 @@ def explore(
     layers += scalar_layers(maps or {}, inside)
     noise = None if deviation is None else _checked(deviation, times, shape, "deviation")[1]
     parts = None if labels is None else regions(labels, label_names, inside)
-    _check_size(int(inside.sum()), t.size, layers, noise is not None)
+    size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(each.values.size for each in layers))
+    if size > LIMIT:
+        raise ValueError(
+            f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
+            f"{LIMIT // 1024**2}, which a browser can open. Show fewer times, one slice, or part of the domain"
+        )
     flat = (4 * math.pi * t) ** (d / 2)
     # (4πt)^(d/2)·HKS is of order 1 in any unit: no float32 is too small for it.
     scale = flat[:, None] if normalisation == "raw" else 1.0
     shown = {"values": scale * array[:, inside]} | ({} if noise is None else {"deviation": scale * noise[:, inside]})
-    low = [int(along.min()) for along in np.nonzero(inside)]
-    high = [int(along.max()) + 1 for along in np.nonzero(inside)]
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    box = bounding_box(inside, margin=0)
     about = {
         "title": title,
         "facts": [[str(name), str(value)] for name, value in (facts or {}).items()],
@@ -126,7 +130,7 @@ def explore(
         "dimension": d,
         "mesh": bool(surface),
         "shape": inside[box].shape,
-        "offset": low,
+        "offset": [part.start for part in box],
         **place,
         **_in_space(world, d),
         "unit": unit,
@@ -157,15 +161,6 @@ def _checked(values: Any, times: Any, shape: tuple[int, ...], name: str = "value
             "hks_jax.hks returns them"
         )
     return t, array
-
-
-def _check_size(n_nodes: int, n_times: int, layers: list[Layer], noise: bool) -> None:
-    size = 4 * (n_nodes * n_times * (1 + noise) + sum(layer.values.size for layer in layers))
-    if size > LIMIT:
-        raise ValueError(
-            f"values: {n_times} times at {n_nodes} nodes take {size / 1024**2:.0f} MiB; expected at most "
-            f"{LIMIT // 1024**2}, which a browser can open. Show fewer times, one slice, or part of the domain"
-        )
 
 
 def _deep_node(inside: Bool[np.ndarray, "*shape"]) -> list[int]:

@@ -1,0 +1,136 @@
+"""The work of each device, as counts of operations and bytes sent, on 1, 2, 4 and 8 virtual devices.
+
+    python benchmarks/accelerators/devices.py [--nodes 64 48 40] [-o FILE]
+
+Virtual devices share the machine's cores, so that their wall time says nothing. The compiler counts the flops of one
+device's stencil product, and the traced program gives the bytes of collectives, loops multiplied out. One number is a
+time: node·columns a second of the stencil product on one device.
+"""
+
+import argparse
+import os
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+# Before JAX starts.
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from machine import RESULTS, timed, write
+
+import hks_jax as hj
+from hks_jax.devices import Slabs, chebyshev_series
+from hks_jax.eigen.filter.rounds import FilterState, GridFilter
+from hks_jax.fem.nodal import nodal_pencil
+from hks_jax.fem.stencil import Stencil
+
+DEGREE, PAIRS, COLUMNS = 100, 90, 16
+COLLECTIVES = ("ppermute", "all_to_all", "psum")
+
+
+def sent(jaxpr: Any, times: int = 1) -> dict[str, int]:
+    """Return the bytes that one device hands to each kind of collective: its share, not the traffic of algorithms."""
+    found = dict.fromkeys(COLLECTIVES, 0)
+    for equation in jaxpr.eqns:
+        kind = next((c for c in COLLECTIVES if equation.primitive.name.startswith(c)), None)
+        if kind:
+            found[kind] += times * sum(x.aval.size * x.aval.dtype.itemsize for x in equation.invars)
+        loops = equation.params["length"] if equation.primitive.name == "scan" else 1
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda p: hasattr(p, "eqns")):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                below = sent(inner, times * loops)
+                # The length of these loops is unknown, and so is their traffic.
+                assert equation.primitive.name != "while" or not any(below.values())
+                found = {c: found[c] + below[c] for c in COLLECTIVES}
+    return found
+
+
+def counts(shape: tuple[int, ...], devices: int) -> dict:
+    """Return the counts of an inner device of `devices`."""
+    others = min(devices - 1, 1)  # to send anything to
+    mesh = jax.make_mesh((devices,), ("devices",), devices=jax.devices()[:devices])
+    slabs = Slabs(mesh, shape, (False,) * len(shape))
+    struct = partial(jax.ShapeDtypeStruct, dtype=jnp.float32)
+    padded, offsets = slabs.padded_shape, 3 ** len(shape)
+    stencil, lumped, columns = struct((offsets, *padded)), struct(padded), struct((*padded, COLUMNS))
+    halo = jax.jit(slabs.product).lower(stencil, columns).compile()
+    series = struct((1, DEGREE + 1))
+    heat = jax.make_jaxpr(partial(chebyshev_series, slabs))(stencil, lumped, columns, struct(()), series)
+
+    spacing = 1 / (max(shape) - 1)
+    pencil = hj.assemble(hj.TensorField(hj.Grid(shape, spacing), jnp.broadcast_to(jnp.eye(3), (*shape, 3, 3))))
+    plan = hj.ChebyshevFilter(block=COLUMNS // 2, mesh=mesh).plan(PAIRS, pencil.space)
+    grid, values = GridFilter(nodal_pencil(pencil), jnp.ones(()), plan), struct((plan.size,))
+    vectors = struct((plan.size, int(np.prod(padded))))
+    count = jax.ShapeDtypeStruct((), int)
+    state = FilterState(values, vectors, values, values, count, count)
+    one_round = jax.make_jaxpr(GridFilter.improve)(grid, struct(()), state)
+    exchanged = sent(one_round.jaxpr)
+    return {
+        "devices": devices,
+        "stencil_product": {
+            "node_columns": int(np.prod(slabs.local_shape)) * COLUMNS,
+            "flops": float(halo.cost_analysis()["flops"]),
+            "bytes_sent": others * sent(jax.make_jaxpr(slabs.product)(stencil, columns).jaxpr)["ppermute"],
+        },
+        "heat": {
+            "degree": DEGREE,
+            "node_columns": int(np.prod(slabs.local_shape)) * COLUMNS * DEGREE,
+            "bytes_sent": others * sent(heat.jaxpr)["ppermute"],
+        },
+        "filter_round": {
+            "vectors": plan.size,
+            "vectors_filtered": plan.size // devices,
+            "vector_bytes": vectors.size * 4 // devices,
+            "all_to_all_bytes": exchanged["all_to_all"] * (devices - 1) // devices,
+            "halo_bytes": others * exchanged["ppermute"],
+            "sum_bytes": others * exchanged["psum"],
+        },
+    }
+
+
+def speed(dtype: Any) -> float:
+    """Return node·columns a second of one stencil product in 3D, on one device of all cores."""
+    shape, steps = (64, 64, 64), 10
+    c, x = jnp.full((27, *shape), 1 / 27, dtype), jnp.ones((*shape, COLUMNS), dtype)
+
+    def many(c: jax.Array, x: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, steps, lambda _, y: Stencil(c, (False,) * 3) @ y, x)
+
+    return steps * x.size / timed(jax.jit(many), c, x, repeats=20)[0]
+
+
+def main() -> None:
+    """Count, print a table, and write the result file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--nodes", type=int, nargs=3, default=(64, 48, 40), help="along each axis")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "devices.json")
+    arguments = parser.parse_args()
+    shape = tuple(arguments.nodes)
+    speeds = {"float32": speed(jnp.float32)}
+    with jax.enable_x64(True):
+        speeds["float64"] = speed(jnp.float64)
+    rows = [counts(shape, devices) for devices in (1, 2, 4, 8)]
+    print("devices | product: Mflop, kB sent | heat: kB sent | round: vectors, MB dealt, kB halo, kB summed")
+    for row in rows:
+        product, filtered = row["stencil_product"], row["filter_round"]
+        print(
+            f"{row['devices']:7d} | {product['flops'] / 1e6:8.2f} {product['bytes_sent'] / 1e3:8.1f} | "
+            f"{row['heat']['bytes_sent'] / 1e3:8.1f} | {filtered['vectors_filtered']:4d} "
+            f"{filtered['all_to_all_bytes'] / 1e6:8.2f} {filtered['halo_bytes'] / 1e3:8.1f} "
+            f"{filtered['sum_bytes'] / 1e3:8.1f}"
+        )
+    print({name: f"{value:.2g} node·columns/s" for name, value in speeds.items()})
+    write(arguments.output, rows, nodes=shape, columns=COLUMNS, dtype="float32", node_columns_per_second=speeds)
+
+
+if __name__ == "__main__":
+    main()

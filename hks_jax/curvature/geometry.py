@@ -1,0 +1,195 @@
+"""Curvature of a metric, and the Laplace–Beltrami operator of a function, at the nodes of a grid."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from hks_jax.arrays import nan_is_meant, nan_outside
+from hks_jax.checks import real_array
+from hks_jax.curvature.jet import (
+    Jet,
+    at_nodes,
+    christoffel,
+    domain_nodes,
+    function_jet,
+    inner,
+    metric_jet,
+    nodal_jet,
+    wraps_per_axis,
+)
+from hks_jax.domain import spd
+from hks_jax.domain.tensor_field import TensorField
+
+
+@nan_is_meant
+def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
+    """Return the scalar curvature R of a metric at the nodes; on a surface it is 2K, K the Gaussian curvature.
+
+    Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order of the
+    nodal tensors (see `gaussian_curvature`).
+
+    Args:
+        field: the metric, d = 2 or 3.
+        periodic: whether the axes are periodic (a node n that is node 0), one for all or one per axis.
+
+    Returns:
+        (*shape), in 1/length²; NaN outside the mask, and where no difference stencil fits in it.
+
+    Raises:
+        ValueError: fewer than 8 nodes on an axis of a nodal field; bad `periodic`.
+    """
+    return _at_nodes(scalar, field, wraps_per_axis(periodic, field.grid.dimension))
+
+
+@nan_is_meant
+def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
+    """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
+
+    Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order of the
+    nodal tensors, centred where the grid and the mask allow it and one-sided at their edges.
+
+    Args:
+        field: the metric, d = 2.
+        periodic: whether the axes are periodic (a node n that is node 0), one for all or one per axis.
+
+    Returns:
+        (*shape), in 1/length²; NaN outside the mask, and where no stencil of 7 nodes (8 for a second derivative
+        next to an edge) along a grid line fits in it.
+
+    Raises:
+        ValueError: a field that is not two-dimensional; fewer than 8 nodes on an axis of a nodal field; bad
+            `periodic`.
+    """
+    if field.grid.dimension != 2:
+        raise ValueError(
+            f"field: got a grid of shape {field.grid.shape}; Gaussian curvature belongs to metrics in two "
+            "dimensions. Take a slice: the metric's components in a coordinate plane, on its two-dimensional grid"
+        )
+    return _at_nodes(gaussian, field, wraps_per_axis(periodic, 2))
+
+
+@partial(jax.jit, static_argnums=(0, 2))
+def _at_nodes(curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
+    metric, known = metric_jet(field, wraps)
+    return nan_outside(curvature(metric), known)
+
+
+# The coordinate planes; in three dimensions each at the place of the axis that is not in it.
+_PLANES = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
+
+
+def riemann(metric: Jet) -> Float[Array, "... p p"]:
+    """Return the curvature tensor R_abcd of a metric in 2 or 3 dimensions, ab and cd running over the p planes,
+
+        R_abcd = ½(∂_b∂_c g_ad + ∂_a∂_d g_bc − ∂_a∂_c g_bd − ∂_b∂_d g_ac) + ⟨Γ_bc, Γ_ad⟩ − ⟨Γ_bd, Γ_ac⟩
+
+    in Christoffel symbols of the first kind (Landau and Lifshitz, The Classical Theory of Fields, §92). The planes are
+    12 on a surface, which is Brioschi's formula with its determinants expanded (Gray, Modern Differential Geometry of
+    Curves and Surfaces, §17.1), and 23, 31, 12 in three dimensions.
+    """
+    planes = _PLANES[metric.value.shape[-1]]
+    hessian, symbols, inverse = metric.hessian, christoffel(metric), spd.inverse(metric.value)
+
+    def product(i: int, j: int, k: int, m: int) -> Array:
+        return inner(inverse, symbols[..., i, j], symbols[..., k, m])
+
+    def component(a: int, b: int, c: int, d: int) -> Array:
+        linear = (
+            hessian[..., a, d, b, c] + hessian[..., b, c, a, d] - hessian[..., b, d, a, c] - hessian[..., a, c, b, d]
+        )
+        return linear / 2 + product(b, c, a, d) - product(b, d, a, c)
+
+    numbers = range(len(planes))
+    lower = {(i, j): component(*planes[i], *planes[j]) for i in numbers for j in range(i + 1)}
+    rows = [jnp.stack([lower[max(i, j), min(i, j)] for j in numbers], axis=-1) for i in numbers]
+    return jnp.stack(rows, axis=-2)
+
+
+def einstein(metric: Jet) -> Float[Array, "... 3 3"]:
+    """Return the Einstein tensor (Ric − ½Rg)ⁱʲ of a three-dimensional metric.
+
+    It is the double dual of the curvature tensor, −R_abcd/|g| at the place ij of the planes ab and cd, and so in three
+    dimensions all of the curvature.
+    """
+    return -riemann(metric) / spd.determinant(metric.value)[..., None, None]
+
+
+def scalar(metric: Jet) -> Float[Array, "..."]:
+    """Return the scalar curvature R of a metric in two or three dimensions."""
+    if metric.value.shape[-1] == 2:
+        return 2 * gaussian(metric)
+    return -2 * jnp.sum(einstein(metric) * metric.value, axis=(-2, -1))
+
+
+def gaussian(metric: Jet) -> Float[Array, "..."]:
+    """Return the Gaussian curvature R₁₂₁₂/|g| of a metric ((E, F), (F, G))."""
+    return riemann(metric)[..., 0, 0] / spd.determinant(metric.value)
+
+
+def scalar_and_ricci_squared(metric: Jet) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return R and |Ric|² = RicᵢⱼRicⁱʲ of a three-dimensional metric.
+
+    With the Einstein tensor G, R = −2 tr G and |Ric|² = |G|² + R²/4.
+    """
+    mixed = jnp.sum(einstein(metric)[..., :, :, None] * metric.value[..., None, :, :], axis=-2)
+    R = -2 * jnp.trace(mixed, axis1=-2, axis2=-1)
+    return R, jnp.sum(mixed * jnp.swapaxes(mixed, -1, -2), axis=(-2, -1)) + R**2 / 4
+
+
+@nan_is_meant
+def laplace_beltrami(
+    field: TensorField,
+    f: Float[Array, "*shape"] | Callable[[Array], Array],
+    periodic: bool | Sequence[bool] = False,
+) -> Float[Array, "*shape"]:
+    """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes: the geometers' −Δf, negative where f peaks.
+
+    Derivatives are exact of whatever is given as a function, the metric or `f`, and differences of sixth order of
+    what is given at the nodes (see `gaussian_curvature`).
+
+    Args:
+        field: the metric, d = 2 or 3.
+        f: nodal values (*shape), or a function from coordinates (d,) to a number, differentiable by JAX.
+        periodic: whether the axes are periodic, one for all or one per axis.
+
+    Returns:
+        (*shape), in units of f/length²; NaN outside the mask, and where no difference stencil fits in it.
+
+    Raises:
+        ValueError: values of another shape; fewer than 8 nodes on an axis where differences are needed; bad `periodic`.
+    """
+    if callable(f):
+        f = f if isinstance(f, jtu.Partial) else jtu.Partial(f)
+    else:
+        f = real_array("f", f)
+        if f.shape != field.grid.shape:
+            raise ValueError(f"f: got shape {f.shape}; expected the grid's shape {field.grid.shape}, or a function")
+    return _laplace_beltrami(field, f, wraps_per_axis(periodic, field.grid.dimension))
+
+
+@partial(jax.jit, static_argnums=2)
+def _laplace_beltrami(field: TensorField, f: Array | jtu.Partial, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
+    inside = domain_nodes(field.grid, wraps)
+    metric, known = metric_jet(field, wraps)
+    if callable(f):
+
+        def number(x: Array) -> Array:
+            return real_array("f", f(x)).astype(x.dtype)
+
+        scalar = at_nodes(lambda x: function_jet(number, x), field.grid, inside)
+    else:
+        scalar, of_f = nodal_jet(jnp.where(inside, f, 0), field.grid, inside, wraps)
+        known = known & of_f
+    return nan_outside(laplacian(metric, scalar), known)
+
+
+def laplacian(metric: Jet, scalar: Jet) -> Float[Array, "..."]:
+    """Return gᵃᵇ(∂ₐ∂ᵦf − Γᶜₐᵦ ∂_c f) from the jets of the metric (to first order) and of f."""
+    inverse = spd.inverse(metric.value)
+    raised = jnp.sum(inverse * scalar.gradient[..., None, :], axis=-1)
+    connection = jnp.sum(christoffel(metric) * raised[..., :, None, None], axis=-3)
+    return jnp.sum(inverse * (scalar.hessian - connection), axis=(-2, -1))

@@ -1,0 +1,155 @@
+"""Figures of scalars on a plane over t: the HKS at each time, and several scalars, a row each."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float, Real
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+
+from hks_jax.domain.grid import Grid
+from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
+from hks_jax.plot.images import masked, scalar_image, shared_colours
+from hks_jax.plot.orientation import Orientation
+
+
+def hks_panels(
+    values: Real[ArrayLike, "n_times nx ny"],
+    times: Sequence[float] | Real[ArrayLike, " n_times"],
+    grid: Grid,
+    *,
+    titles: Sequence[str] | None = None,
+    unit: str = "",
+    shared_range: bool = False,
+    path: str | os.PathLike[str] | None = None,
+    suptitle: str = "",
+    orientation: Orientation | None = None,
+    z: Real[ArrayLike, "n_times nx ny"] | None = None,
+    **kwargs: Any,
+) -> Figure:
+    """Return a figure with one image of the HKS per time, each with its own colour map unless `shared_range`.
+
+    Args:
+        values: (n_times, *shape), as `hks_jax.hks` returns them.
+        times: (n_times,).
+        grid: the 2D grid of the values.
+        titles: one per time; None: “t = …”.
+        unit: the unit of t, written after it.
+        shared_range: whether all images use the colours of one range.
+        path: where to save the figure; None: nowhere.
+        suptitle: the figure's title.
+        orientation: as for `scalar_image`.
+        z: (n_times, *shape), as for `scalar_image`: what noise could make fades.
+        **kwargs: passed to `scalar_image`, for all images, such as its cmap, vmin, vmax, centre, quantiles, least_range
+            and label.
+
+    Raises:
+        ValueError: shapes that do not agree; no time at all.
+    """
+    require_plane("grid", grid)
+    t = checked_times(times, grid, values=values)
+    titles = panel_titles(t, titles, unit)
+    images = [masked("values", v, grid) for v in np.asarray(values)]
+    if shared_range:
+        kwargs = shared_colours(images, kwargs)
+
+    rows, columns = _layout(t.size)
+    width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
+    fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
+    noise = [None] * t.size if z is None else np.asarray(z)
+    for index, ax in enumerate(axes_in_rows(fig, t.size, columns)):
+        scalar_image(ax, images[index], grid, orientation=orientation, z=noise[index], **kwargs)
+        ax.set_title(titles[index], fontsize="medium")
+        ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
+    return finished(fig, suptitle, path)
+
+
+def axes_in_rows(figure: Figure, count: int, columns: int) -> list[Axes]:
+    """Return so many axes of a figure, in rows that are full but for the last."""
+    panels = figure.subplots(math.ceil(count / columns), columns, squeeze=False).ravel().tolist()
+    for ax in panels[count:]:
+        ax.remove()
+    return panels[:count]
+
+
+def time_rows(
+    rows: Mapping[str, Real[ArrayLike, "n_times nx ny"]],
+    times: Sequence[float] | Real[ArrayLike, " n_times"],
+    grid: Grid,
+    *,
+    unit: str = "",
+    shared: str = "none",
+    cmap: str | Colormap | Mapping[str, str] = "viridis",
+    quantiles: tuple[float, float] = (0.0, 1.0),
+    suptitle: str = "",
+) -> Figure:
+    """Return a figure with a row of images for each scalar and a column for each time, such as the HKS beside scalars.
+
+    Args:
+        rows: the scalars by name, each (n_times, *shape), NaN where there is nothing to draw.
+        times: (n_times,).
+        grid: the 2D grid of the values.
+        unit: the unit of t.
+        shared: which images share the colours of one range: ``"none"``, or those of each ``"row"``.
+        cmap: a colour map, or one for each row by name.
+        quantiles: as for `scalar_image`.
+        suptitle: the figure's title.
+
+    Raises:
+        ValueError: no rows or times; values that are not one image per time; another `shared`.
+    """
+    require_plane("grid", grid)
+    if shared not in ("none", "row"):
+        raise ValueError(f'shared: got {shared!r}; expected "none" or "row"')
+    if not rows:
+        raise ValueError("rows: got none; expected one scalar or more")
+    t = checked_times(times, grid, **{f"rows: {name}": values for name, values in rows.items()})
+    width, height = panel_size(grid, 1.9)
+    figure = new_figure(t.size * (width + 0.65) + 0.6, len(rows) * (height + 0.2) + 0.5 + 0.3 * bool(suptitle))
+    panels = figure.subplots(len(rows), t.size, squeeze=False)
+    for line, (name, values) in zip(panels, rows.items(), strict=True):
+        images = [masked(f"rows: {name}", each, grid) for each in np.asarray(values)]
+        colours: dict[str, Any] = {"cmap": cmap[name] if isinstance(cmap, Mapping) else cmap, "quantiles": quantiles}
+        if shared == "row":
+            colours = shared_colours(images, colours)
+        for ax, image in zip(line, images, strict=True):
+            scalar_image(ax, image, grid, **colours)
+            ax.set(xticks=[], yticks=[])
+        line[0].set_ylabel(name, fontsize=SMALL)
+    for ax, title in zip(panels[0], panel_titles(t, None, unit), strict=True):
+        ax.set_title(title, fontsize="medium")
+    return finished(figure, suptitle)
+
+
+def checked_times(times: Any, grid: Grid, **arrays: Any) -> Float[np.ndarray, " n_times"]:
+    """Return the times; raise ValueError unless there are some, and one value of each array per time and node."""
+    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    for name, array in arrays.items():
+        if array is not None and (np.shape(array) != (t.size, *grid.shape) or t.ndim != 1 or t.size == 0):
+            raise ValueError(
+                f"{name}: got shape {np.shape(array)} and times of shape {t.shape}; expected "
+                f"(n_times, *grid.shape) = {(t.size, *grid.shape)} and at least one time"
+            )
+    return t
+
+
+def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None, unit: str) -> Sequence[str]:
+    """Return a title for each time; raise ValueError for another number of them."""
+    if titles is None:
+        return [f"$t$ = {number_text(s)} {unit}".rstrip() for s in t]
+    if len(titles) != t.size:
+        raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
+    return titles
+
+
+def _layout(n: int) -> tuple[int, int]:
+    """Return rows and columns for n panels: up to four in a row, rows evenly filled."""
+    if n <= 4:
+        return 1, n
+    columns = min(range(3, 6), key=lambda c: (-n % c, math.ceil(n / c)))
+    return math.ceil(n / columns), columns
