@@ -12,6 +12,7 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
+from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest, widened
@@ -168,6 +169,10 @@ def _lowest(
         pairs = solve_doubled(pencil, solvers, size, extra, throw, report)
     else:
         pairs = solve_lowest(widened(pencil, solvers, size + extra).parts[0], solvers[0], size, extra, throw, report)
+        found = jax.lax.stop_gradient(pairs)
+        doubtful = solver == "auto" and isinstance(solvers[0], ShiftInvert) and not pencil.bounded
+        if doubtful and (found.unconfirmed or not found.converged.all()):  # as where k cuts many copies
+            pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
     return truncate(pairs, k, multiplet)
 
 

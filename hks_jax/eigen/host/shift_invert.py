@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
 from threadpoolctl import threadpool_limits
@@ -151,3 +152,14 @@ def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: flo
         np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
         complete_below,
     )
+
+
+def lower_bound(pencil: Pencil) -> Float[Array, ""]:
+    """Return a number below which inertia finds no eigenvalue; NaN where it is not certain."""
+    data, matrices = host_matrices(pencil)
+    K, M = matrices(*data)
+    typical = float(np.median(np.abs(K.diagonal()) / M.diagonal())) or 1.0
+    for below in 1e-3 * typical * 4.0 ** np.arange(25):
+        if inertia_on_host(K, M, -below) == (0, True):
+            return jax.device_put(np.asarray(-below, pencil.stiffness.dtype))
+    return jax.device_put(np.asarray(np.nan, pencil.stiffness.dtype))
