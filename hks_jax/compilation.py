@@ -64,18 +64,18 @@ def jit_quickly(
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
             if is_staged() or not _understood():
                 return usual(*args, **kwargs)
-            if not is_traced((args, kwargs)) and (on_host is None or not linear):
-                found = None if on_host is None else _on_host(on_host, signature.bind(*args, **kwargs).args, None, None)
-                return quick(*args, **kwargs) if found is None else found
             bound = signature.bind(*args, **kwargs)
+            if not linear and not is_traced((args, kwargs)):
+                found = _on_host(on_host, bound.args, None, None)
+                return quick(*args, **kwargs) if found is None else found
             given = {name: None if name in static else x for name, x in bound.arguments.items()}
             moved = [jax.tree.map(partial(is_moved, name), x) for name, x in given.items()]
-            x, known = eqx.partition(list(given.values()), moved)
-            if whole or is_traced(known) or not all(map(_is_inexact, jax.tree.leaves(x))):
+            parts = eqx.partition(list(given.values()), moved)[::-1]
+            known, x = map(jax.tree.leaves, parts)
+            if whole or is_traced(known) or not all(map(_is_inexact, x)):
                 return usual(*args, **kwargs)
-            known, (x, structure) = jax.tree.leaves(known), (jax.tree.leaves(x), jax.tree.structure((known, x)))
             fixed = tuple(bound.arguments[name] if name in static else None for name in given)
-            program = _Program(usual, fixed, structure, on_host)
+            program = _Program(usual, fixed, jax.tree.structure(parts), on_host)
             if not linear:
                 return _differentiable(program, known, x)
             results, structure = jax.tree.flatten(like(*bound.args))

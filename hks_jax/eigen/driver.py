@@ -52,9 +52,10 @@ def eigenpairs(
         solver: ``"auto"`` (by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
             ``"shift-invert"`` (on the host), ``"block-lanczos"`` (2D and surfaces above all),
             ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
-            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``. Of matrices and forms of
-            your own that may be indefinite, and in an interval, only ``"dense"`` and ``"block-lanczos"``; derivatives
-            in an interval take the tolerance of the solver's ``adjoint`` alone.
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``. Matrices and
+            forms of your own that may be indefinite, and intervals, take only ``"dense"`` and ``"block-lanczos"``;
+            the former, where values are concrete, ``"shift-invert"`` too. Derivatives in an interval take the tolerance
+            of the solver's ``adjoint`` alone.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns;
             ``"drop"`` leaves its copies out of every signature; ``"complete"`` computes 8 pairs more and takes the
