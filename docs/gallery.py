@@ -1,4 +1,4 @@
-"""Make docs/gallery.md and its pictures: ``python docs/gallery.py``, or with names of pictures only those."""
+"""Make docs/gallery.md and its pictures: ``python docs/gallery.py [NAME…]``."""
 
 import inspect
 import sys
@@ -23,8 +23,8 @@ DPI = 72
 HEAD = """\
 # Gallery
 
-Every picture of `hks_jax.plot`, with the function of [gallery.py](gallery.py) that draws it. The site shows its code
-below the picture. `python docs/gallery.py` draws the pictures and writes this page.
+This page shows every picture of `hks_jax.plot`, with a link to the function of [gallery.py](gallery.py) that draws it.
+`python docs/gallery.py` draws the pictures and writes this page.
 """
 
 IMPORTS = """\
@@ -52,16 +52,16 @@ def signature_at_dot(field: hj.TensorField) -> jax.Array:
 
 
 def panels() -> Figure:
-    """The signature over t, each image with its own colours or, with `shared_range`, all with the same."""
+    """Each panel shows the signature at one time, with its own range of colours or (`shared_range`) a common one."""
     field = brain_like()
     times = np.array([0.4, 1.5, 6.0]) * 1e5
     values = hj.hks(hj.eigenpairs(field, 300), times)
-    # The natural boundary raises the signature fourfold: leave the highest values to the colour bar's arrows.
+    # The natural boundary raises the signature up to fourfold; the range of colours excludes these highest values.
     return plot.hks_panels(values, times, field.grid, unit="s", quantiles=(0.01, 0.9), label="HKS in 1/s")
 
 
 def glyphs() -> Figure:
-    """Unit circles of the metric, coloured by anisotropy or by orientation."""
+    """Ellipses show the unit circles of the metric; their colour is the anisotropy or the orientation."""
     field = brain_like()
     figure = plot.new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2)
@@ -71,7 +71,7 @@ def glyphs() -> Figure:
 
 
 def lines() -> Figure:
-    """Integral lines of the eigenvectors, evenly spaced, over an image of the signature."""
+    """Evenly spaced integral lines of the eigenvectors are drawn on an image of the signature."""
     field = hj.examples.figure4_fields(41)["waves"]
     (values,) = hj.hks(hj.eigenpairs(field, 200, "mirror", multiplet="drop"), [0.02], "flat")
     figure = plot.new_figure(4.6, 3.8)
@@ -83,7 +83,7 @@ def lines() -> Figure:
 
 
 def convolution() -> Figure:
-    """Line integral convolution: every direction at once, alone or as shading of a scalar."""
+    """Line integral convolution shows the eigenvector field at every pixel, alone or as shading of a scalar."""
     field = hj.examples.figure4_fields(41)["cells"]
     (values,) = hj.hks(hj.eigenpairs(field, 200, "mirror", multiplet="drop"), [0.02], "flat")
     figure = plot.new_figure(7.6, 3.6)
@@ -94,7 +94,7 @@ def convolution() -> Figure:
 
 
 def degenerate() -> Figure:
-    """Degenerate points, where the eigenvalues are equal, with the index that the eigenvectors have around them."""
+    """At degenerate points the eigenvalues are equal. Each mark shows the index of the eigenvector field."""
     grid = hj.Grid.from_bounds(-1, 1, (61, 61))
     z = grid.nodes[..., 0] + 1j * grid.nodes[..., 1]
     v = (z - 0.5) * (z + 0.4 - 0.3j) * np.conj(z + 0.1 + 0.5j) ** 2 * np.conj(z - 0.2 - 0.6j)
@@ -110,7 +110,7 @@ def degenerate() -> Figure:
 
 
 def curves() -> Figure:
-    """HKS(t) at points, with the expansion in curvature dashed, and the times that the eigenpairs do not resolve."""
+    """Solid curves show HKS(t) at two points; dashed curves show its expansion. Shading marks unresolved times."""
     field = hj.examples.sphere_field(41, 1.5)
     pairs = hj.eigenpairs(field, 150, multiplet="drop")
     times = jnp.geomspace(0.005, 3, 60)
@@ -131,7 +131,7 @@ def curves() -> Figure:
 
 
 def weyl() -> Figure:
-    """The number of eigenvalues up to λ beside Weyl's law; where the grid is too coarse they fall behind."""
+    """The number of eigenvalues up to λ follows Weyl's law until the grid is too coarse for λ."""
     field = hj.examples.figure4_fields(41)["cells"]
     pairs = hj.eigenpairs(field, 250)
     figure = plot.new_figure(7.6, 3.2)
@@ -142,7 +142,7 @@ def weyl() -> Figure:
 
 
 def influence() -> Figure:
-    """The boundary's share of the signature, with lines at 1 % and 10 %."""
+    """The maps show the boundary's share of the signature. Contour lines mark 1 % and 10 %."""
     field = brain_like()
     times = np.array([0.4, 1.5, 6.0]) * 1e5
     values = hj.boundary_influence(field, times, 300)
@@ -154,7 +154,7 @@ def influence() -> Figure:
 
 
 def around_one() -> Figure:
-    """4πt·HKS, 1 where the metric is flat: above with the rim of a mask, below without it."""
+    """4πt·HKS is 1 where the metric is flat. The upper row has the effect of a mask's rim, the lower row does not."""
     field = brain_like()
     times = np.array([0.4, 1.5, 6.0]) * 1e5
     pairs = hj.eigenpairs(field, 600, "mean")
@@ -170,7 +170,7 @@ def around_one() -> Figure:
 
 
 def ball() -> Figure:
-    """(4πt)^(3/2)·HKS of a ball with a hill and a basin: a natural rim covers them, the mean leaves its curvature."""
+    """In (4πt)^(3/2)·HKS of a ball, a natural rim hides two inclusions; the mean shows them and the rim's curvature."""
     n = 24
     grid = hj.Grid((n, n, n), 2 / (n - 1), -1.0)
     x, y, z = np.moveaxis(grid.nodes, -1, 0)
@@ -193,7 +193,7 @@ def ball() -> Figure:
 
 
 def rim_errors() -> Figure:
-    """The error at the rim of flat domains: of natural and Dirichlet conditions, and of their mean."""
+    """The curves show the error at the rim of flat domains for natural and Dirichlet conditions and their mean."""
     n = 41
     x, y = np.meshgrid(*[np.linspace(-1, 1, n)] * 2, indexing="ij")
     radius = np.hypot(x, y)
@@ -223,7 +223,7 @@ def rim_errors() -> Figure:
 
 
 def rows() -> Figure:
-    """The signature over t beside the trace and the anisotropy, smoothed by Gaussians or by heat flow in the metric."""
+    """The rows show the signature, and trace and anisotropy smoothed by Gaussians or by heat flow in the metric."""
     field = hj.examples.figure3_fields(41)["T³"]
     pairs = hj.eigenpairs(field, 200, "mirror", multiplet="drop")
     times = np.array([1.0, 4.0, 16.0])
@@ -236,7 +236,7 @@ def rows() -> Figure:
 
 
 def derivative() -> Figure:
-    """Which tensor, changed in which direction, drives the signature at the black dot."""
+    """The bars show the derivative of the signature at the black dot with respect to every tensor."""
     field = hj.examples.figure4_fields(24)["waves"]
     derivative_of = jax.grad(lambda tensors: signature_at_dot(hj.TensorField(field.grid, tensors)))
     gradient = derivative_of(field.tensors)
@@ -248,7 +248,7 @@ def derivative() -> Figure:
 
 
 def fit() -> Figure:
-    """A metric found from its signature: target, fit and difference over t, the metric, and the loss of each step."""
+    """The panels show target, fit and difference at two times, the fitted metric, and the loss of each step."""
     grid = hj.Grid(shape=(20, 20), spacing=1 / 19)
     x, y = grid.nodes[..., 0], grid.nodes[..., 1]
     hidden = hj.TensorField(grid, jnp.exp(0.4 * jnp.sin(3 * x) * jnp.cos(2 * y))[..., None, None] * jnp.eye(2))
@@ -258,7 +258,7 @@ def fit() -> Figure:
 
 
 def volume() -> Figure:
-    """A volume over t, as three orthogonal slices: first the narrow hill of the metric shows, then the wide one."""
+    """Three orthogonal slices at several times show a narrow maximum of the metric first, and later a wide one."""
     n = 20
     grid = hj.Grid((n, n, n), 2 / n, -1.0)
     factor = np.ones(grid.shape)
@@ -271,7 +271,7 @@ def volume() -> Figure:
 
 
 def surfaces() -> Figure:
-    """Surfaces of equal value in a volume, rendered by PyVista (`pip install "hks-jax[pyvista]"`)."""
+    """PyVista renders isosurfaces of a volume (`pip install "hks-jax[pyvista]"`)."""
     n = 24
     grid = hj.Grid((n, n, n), 2 / n, -1.0)
     x, y, z = np.moveaxis(np.pi * grid.nodes, -1, 0)
@@ -286,7 +286,7 @@ def surfaces() -> Figure:
 
 
 def torus() -> Figure:
-    """A surface, coloured by its signature."""
+    """The colour of a surface shows its signature."""
     mesh = hj.examples.bumpy_torus_mesh(90)
     (values,) = hj.hks(hj.eigenpairs(mesh, 60, multiplet="drop"), [1.0])
     figure = plot.new_figure(5.0, 3.4)
@@ -297,7 +297,7 @@ def torus() -> Figure:
 
 
 def solid() -> Figure:
-    """Half of a ball of tetrahedra with fast diffusion along helices about its axis."""
+    """The colour shows the signature on half of a tetrahedral ball. Diffusion is fast along helices about its axis."""
     ball = hj.examples.ball_mesh(11)
     x, y, z = np.asarray(ball.vertices).T
     along = np.stack([-y, x, 0.4 + 0 * z], axis=-1)
@@ -325,10 +325,10 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
     "The boundary's influence": influence,
     "Around 1, without the rim": around_one,
     "Around 1, in a volume": ball,
-    "What is left at a rim": rim_errors,
-    "Beside Gaussian smoothing and heat flow": rows,
+    "Errors at a rim": rim_errors,
+    "Smoothing and heat flow": rows,
     "Volumes": volume,
-    "Surfaces of equal value": surfaces,
+    "Isosurfaces": surfaces,
     "Sensitivity": derivative,
     "Fits": fit,
     "Surfaces": torus,
@@ -337,7 +337,7 @@ ENTRIES: dict[str, Callable[[], Figure]] = {
 
 
 def code(name: str) -> str:
-    """Return the code of one picture, or that before all of them, as the site shows it."""
+    """Return the code of one picture as the site shows it; ``before`` is the code that all pictures share."""
     if name == "before":
         helpers = "\n\n".join(inspect.getsource(helper) for helper in (brain_like, signature_at_dot))
         return f"All code below begins with\n\n```python\n{IMPORTS}\n\n{helpers}```"
@@ -359,14 +359,14 @@ def page() -> str:
 
 
 def main(names: list[str]) -> None:
-    """Draw the pictures, all or those named, and write the page."""
+    """Draw the named pictures, or all if none is named, and write the page."""
     jax.config.update("jax_enable_x64", True)
     for draw in ENTRIES.values():
         if names and draw.__name__ not in names:
             continue
         with warnings.catch_warnings():
-            # Symmetric fields have multiple eigenvalues, and some is always cut: no picture shows it. The curves show
-            # what happens at times that the pairs do not resolve.
+            # k cuts a multiple eigenvalue of the symmetric fields, without effect on a picture. The curves include
+            # unresolved times on purpose.
             warnings.filterwarnings("ignore", ".*(multiple eigenvalue|too small for k)", hj.AccuracyWarning)
             path = plot.save_figure(draw(), PICTURES / f"{draw.__name__}.png", dpi=DPI)
         print(path, path.stat().st_size // 1024, "KiB", flush=True)

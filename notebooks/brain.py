@@ -1,12 +1,13 @@
 # %% [markdown]
 # # A brain, from the scan to its signature
 #
-# Diffusion-weighted images with b-values and directions; tensors, fitted by DIPY; mask, slice, metric, eigenpairs; the
-# heat kernel signature over t; pictures, and a NIfTI that lies where the scan does. It runs on a scan of yours by
+# This notebook starts from diffusion-weighted images with b-values and directions. DIPY fits the tensors. Then follow
+# the mask, a slice, the metric, the eigenpairs, the heat kernel signature at several times, pictures, and a NIfTI
+# file in the space of the scan. To use your own scan, run
 #
 #     HKS_SCAN=dwi.nii.gz HKS_SLICE=10 python notebooks/brain.py
 #
-# with `dwi.bval` and `dwi.bvec` beside it. Without one, the scan of a phantom is simulated.
+# with `dwi.bval` and `dwi.bvec` beside the scan. Without a scan, the notebook simulates one of a phantom.
 
 # %%
 import os
@@ -27,14 +28,14 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## The scan
 #
-# The signal of tissue with the tensor D along the direction u is S₀ exp(−b uᵀDu), with Rician noise: the modulus of a
-# complex number with normal noise, here 2 % of S₀. Directions follow FSL's convention: along the voxel axes, the first
-# reversed where the affine's determinant is positive.
+# In tissue with the tensor D, the signal along the direction u is S₀ exp(−b uᵀDu). Its noise is Rician: the signal is
+# the modulus of a complex number with Gaussian noise, here 2 % of S₀. Directions follow FSL's convention. They refer
+# to the voxel axes, and the first axis is reversed if the affine's determinant is positive.
 
 
 # %%
 def simulate(folder, noise=0.02):
-    """Write a scan of the phantom: 2 images without weighting, 30 with b = 1000 s/mm². Return its name, and D."""
+    """Write a scan of the phantom: 2 images without weighting, 30 with b = 1000 s/mm². Return its path and D."""
     rng = np.random.default_rng(0)
     tensors, mask, spacing = phantom((52, 62, 9))
     u = rng.standard_normal((32, 3))
@@ -57,10 +58,10 @@ bval, bvec = (scan.with_name(stem + suffix) for suffix in (".bval", ".bvec"))
 # %% [markdown]
 # ## Tensors
 #
-# Without a mask, DIPY's `median_otsu` finds the brain. A slice takes the in-plane block of D: diffusion that stays in
-# it. The rim, where tissue mixes with what surrounds it, is taken off. What noise has made of some tensors is no
-# diffusion: DIPY clips their eigenvalues to almost nothing, and D⁻¹ would be enormous. The nearest other tensor takes
-# their place.
+# Without a mask, DIPY's `median_otsu` finds the brain. A slice uses the in-plane block of D, so diffusion stays in
+# the slice. The rim is removed, because its voxels contain tissue and its surroundings. Noise makes some tensors
+# indefinite. DIPY clips their eigenvalues to almost zero, and D⁻¹ would be extremely large. These tensors are
+# replaced by the nearest valid tensors.
 
 # %%
 volume = hj.io.fit_dwi(scan, bval, bvec, b_max=1500)
@@ -74,8 +75,8 @@ assert np.linalg.eigvalsh(plane.tensors[plane.mask]).min() > 0.99e-4
 # %% [markdown]
 # ## Metric, eigenpairs, times
 #
-# `metric="inverse"`, g = D⁻¹, is the metric of the diffusion itself, and t is its time. In it heat spreads by √(Dt):
-# from two voxels on, the grid can show it, to a few per cent.
+# `metric="inverse"` is g = D⁻¹, the metric of the diffusion itself, and t is diffusion time. In the time t heat
+# spreads over the distance √(Dt). If this distance is at least two voxels, the error of the grid is a few per cent.
 
 # %%
 grid = plane.grid("largest")
@@ -92,7 +93,8 @@ assert report.tail.max() < 0.02
 assert report.resolution_bias.max() < 0.05
 
 # %% [markdown]
-# Heat is neither made nor lost: at large t it is the same everywhere, one over the area of the slice in the metric.
+# The total heat is constant. At large t it is uniformly distributed, and the signature is one over the area of the
+# slice in the metric.
 
 # %%
 latest = hj.hks(pairs, [40 / float(pairs.eigenvalues[1])])[0]
@@ -101,7 +103,7 @@ assert np.allclose(latest[grid.inside & np.isfinite(signature[0])], 1 / float(pa
 # %% [markdown]
 # ## Pictures
 #
-# What the scan is of: mean diffusivity, and the ellipses of D, coloured by direction.
+# The first figure shows the mean diffusivity and the ellipses of D, coloured by direction.
 
 # %%
 figure = hj.plot.new_figure(11, 5.6)
@@ -115,9 +117,10 @@ for ax in (left, right):
 hj.plot.save_figure(figure, "brain-tensors.png")
 
 # %% [markdown]
-# Its signature. The rim is a natural boundary, and raises it up to fourfold; the colours span the inside, and arrows at
-# the colour bars say that there is more. At first it shows tissue: ventricles are low, as heat leaves them soon. Later
-# it shows what is far from all else.
+# The second figure shows the signature. The rim is a natural boundary and raises the signature up to fourfold. The
+# colours span the values inside; arrows at the colour bars mark larger values. At small times the signature shows
+# tissue: ventricles are low, because heat leaves them quickly. At large times it shows points that are far from all
+# others.
 
 # %%
 depth = distance_transform_edt(np.pad(grid.inside, 1), sampling=grid.spacing)[1:-1, 1:-1]
@@ -139,10 +142,10 @@ print("signature of the fluid over that of tissue:", np.round(ratios, 2))
 assert ratios[0] < 0.9
 
 # %% [markdown]
-# ## What noise does to it
+# ## The effect of noise
 #
-# Of a phantom the true tensors are known. The signature averages over what heat reaches: its error is a fraction of
-# that of the tensors.
+# For a phantom, the true tensors are given. The signature averages over the region that heat reaches. Its relative
+# error is therefore a fraction of the relative error of the tensors.
 
 # %%
 if truth is not None:
@@ -156,9 +159,9 @@ if truth is not None:
     assert max(errors) < 0.5 * np.median(of_tensors[deep])
 
 # %% [markdown]
-# ## Files, and the same by one command
+# ## Files, and the same result from the command line
 #
-# The NIfTI has the times along its fourth axis, and the affine puts the slice where it was cut.
+# The NIfTI file has the times along its fourth axis. Its affine gives the position of the slice in the scan.
 
 # %%
 image = nib.load(hj.io.save(folder / "hks.nii.gz", signature, plane, name="hks"))

@@ -1,14 +1,14 @@
 # %% [markdown]
 # # Several devices
 #
-# Batches, times, eigenvectors and space can be shared out among the devices of a mesh with one axis. The results are
-# those of one device, to rounding. Where there is only one CPU, it is made to look like eight here: that shows what
-# goes where, and makes nothing faster.
+# Batches, times, eigenvectors and space can be distributed over the devices of a mesh with one axis. The results
+# equal those of one device up to rounding. If there is only one CPU, JAX presents it as eight devices here. This
+# shows the distribution of data, but does not make the computation faster.
 
 # %%
 import os
 
-# Before JAX starts. It is for the CPU alone; GPUs are found as they are.
+# Set this flag before JAX starts. It affects only the CPU.
 if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
 
@@ -27,7 +27,7 @@ print(f"{mesh.size} devices: {devices[0].device_kind}")
 assert mesh.size > 1
 
 
-def difference(a, b):  # the largest, relative to the largest value
+def difference(a, b):  # the largest difference, relative to the largest value
     a, b = np.asarray(a), np.asarray(b)
     return float(np.abs(a - b).max() / np.abs(b).max())
 
@@ -35,7 +35,7 @@ def difference(a, b):  # the largest, relative to the largest value
 # %% [markdown]
 # ## Batches
 #
-# Metrics on one grid, from a flat one to a wavy one, two for each device. Nothing is exchanged.
+# The batch contains metrics on one grid, two for each device, from a flat metric to a wavy one. Nothing is exchanged.
 
 # %%
 grid = hj.Grid((24, 24), 1 / 23)
@@ -58,7 +58,7 @@ assert difference(signatures, jax.lax.map(signature, jnp.asarray(batch))) < 1e-1
 # %% [markdown]
 # ## Times
 #
-# Without a spectrum, by selected inversion, every time is a computation of its own.
+# With selected inversion, the computations for different times are independent.
 
 # %%
 wavy = hj.assemble(hj.TensorField(grid, batch[-1]))
@@ -76,8 +76,9 @@ assert difference(by_time[-1], signatures[-1, 0]) < 1e-5  # 60 pairs leave out l
 # %% [markdown]
 # ## The eigenpairs of one field
 #
-# The Chebyshev filter takes whole functions, Rayleigh–Ritz takes all functions on a part of the grid: twice a round the
-# vectors are dealt anew. They come back in slabs across the first axis, one on each device.
+# The Chebyshev filter works on whole functions, and Rayleigh–Ritz works on all functions on a part of the grid. The
+# vectors are therefore redistributed twice per round. The result consists of slabs across the first axis, one on each
+# device.
 
 # %%
 box = hj.Grid((2 * mesh.size, 8, 6), 0.1)
@@ -97,9 +98,10 @@ assert difference(hj.hks(together, [0.1, 1.0]), hj.hks(one, [0.1, 1.0])) < 1e-8
 # %% [markdown]
 # ## Space
 #
-# For a field larger than a device: slabs of the grid, and two planes of nodes exchanged at every product with the
-# stiffness matrix. Here for columns of the heat kernel. Heat does not get eight nodes far in this time, so that sources
-# eight nodes apart share a column, and 512 columns hold the signature of all nodes.
+# For a field larger than a device, each device holds a slab of the grid. Every product with the stiffness matrix
+# exchanges two planes of nodes. This example computes columns of the heat kernel. In this time heat does not spread
+# over eight nodes. Therefore sources with a spacing of eight nodes share a column, and 512 columns contain the
+# signature of all nodes.
 
 # %%
 tall = hj.Grid((5 * mesh.size - 2, 16, 10), 1.0)  # the last slab is padded
@@ -124,10 +126,11 @@ assert difference(heat, columns_on(alone)[1]) < 1e-12
 assert difference(of_nodes, hj.hks_spectrum_free(pencil, [time], tolerance=1e-6)[0]) < 1e-5
 
 # %% [markdown]
-# ## What each device does
+# ## The work of each device
 #
-# Flops of one device's program for a stencil product, as the compiler counts them, and the planes that it sends. The
-# first divides by the number of devices, the second does not: a slab has two neighbours however thin it is.
+# This cell prints the flops of one device's program for a stencil product, as the compiler counts them, and the
+# numbers that the device sends. The flops are inversely proportional to the number of devices. The number of planes
+# is constant, because each slab has two neighbours.
 
 # %%
 sizes = [p for p in (1, 2, 4, 8) if p <= mesh.size]
@@ -170,12 +173,12 @@ hj.plot.save_figure(figure, "devices.png")
 # %% [markdown]
 # ## On GPUs
 #
-# - **dtype.** JAX's default is float32, and so is the library's: signatures to about 1e-3. `jax_enable_x64` makes it
-#   float64, which many GPUs compute far more slowly; the Chebyshev filter runs its polynomials in float32 either way,
-#   and corrects by residuals.
-# - **Solvers.** `"shift-invert"` works on the host, where the vectors then travel. `"dense"`, `"block-lanczos"` (2D)
-#   and `"chebyshev-filter"` (3D) stay on the device. `"auto"` does not look at the device: name the solver.
-# - **jit.** One `jax.jit` around everything, from tensors to loss, keeps all values on the device. Compiling takes
-#   seconds; `jax_compilation_cache_dir` keeps what was compiled.
-# - **Memory.** JAX takes three quarters of it at the start; `XLA_PYTHON_CLIENT_PREALLOCATE=false` stops that. An
-#   eigensolver wants two to three copies of its vectors, which docs/devices.md counts.
+# - **dtype.** The default of JAX and of this library is float32, with errors of about 1e-3 in signatures.
+#   `jax_enable_x64` selects float64, in which many GPUs are far slower. The Chebyshev filter always evaluates its
+#   polynomials in float32, and corrects the result with residuals.
+# - **Solvers.** `"dense"`, `"block-lanczos"` (2D) and `"chebyshev-filter"` (3D) run on the device. `"shift-invert"`
+#   runs on the host and requires transfers. `"auto"` never chooses it on a GPU.
+# - **jit.** If one `jax.jit` contains all steps from tensors to loss, all values stay on the device. Compilation
+#   takes seconds; `jax_compilation_cache_dir` stores the compiled programs.
+# - **Memory.** JAX allocates three quarters of the memory at the start; `XLA_PYTHON_CLIENT_PREALLOCATE=false`
+#   prevents this. An eigensolver needs two to three times the memory of its vectors (see docs/devices.md).

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Differentiate the heat kernel signature
 #
-# Which tensor, changed in which direction, drives the signature at a point? One gradient answers for all of them.
+# How does the signature at one point depend on each tensor of the field? One gradient has all these derivatives.
 
 # %%
 import jax
@@ -16,7 +16,7 @@ grid = hj.Grid.from_bounds(-2.0, 2.0, shape=(41, 41))
 k, x0 = 120, (26, 20)
 
 
-def bump(u):  # a hill in the middle of the flat square
+def bump(u):  # a hill in the middle of a flat square
     return (1 + 3 * jnp.exp(-2 * (u @ u))) * jnp.eye(2)
 
 
@@ -30,14 +30,14 @@ def signature(tensors):
 
 
 # %% [markdown]
-# The field has the symmetries of the square, so that many eigenvalues are double. Differentiating `eigh` gives NaN
-# here; the derivative of the signature does not depend on the basis that a solver happens to return, and is exact.
+# The field has the symmetries of the square, so many eigenvalues have multiplicity two. Differentiating `eigh` gives
+# NaN here. The derivative of the signature is exact, because it does not depend on the basis that a solver returns.
 
 # %%
 gradients = jax.jacrev(signature)(tensors)  # (2, 41, 41, 2, 2)
 
 # %% [markdown]
-# Check one direction against differences:
+# Compare the derivative in one direction with finite differences:
 
 # %%
 rng = np.random.default_rng(0)
@@ -51,8 +51,9 @@ assert np.allclose(slope, difference, rtol=1e-5)
 assert np.allclose(jnp.einsum("tijab,ijab->t", gradients, direction), slope, rtol=1e-9)
 
 # %% [markdown]
-# The picture: red where lengthening the metric along the bar raises HKS(t, x₀), blue where it lowers it. Along the rays
-# from x₀ longer ways keep the heat from leaving; across them they give it more room. The larger t, the farther it goes.
+# In the picture, a bar is red where increasing the length along the bar raises HKS(t, x₀), and blue where it lowers
+# HKS(t, x₀). On rays from x₀, longer distances keep the heat near x₀. Perpendicular to the rays, longer distances
+# give the heat more room. The affected region grows with t.
 
 # %%
 figure = hj.plot.new_figure(10, 4.6)

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # The paper, figure by figure
 #
-# V. Zobel, J. Reininghaus and I. Hotz, *Visualization of Two-Dimensional Symmetric Positive Definite Tensor Fields
-# Using the Heat Kernel Signature* (2014), at sizes that take seconds; `hks-jax paper` writes its table and figures at
-# larger ones, with `--full` at its own. At the end, what its outlook asks for: the signature beside scalars that are
-# smoothed.
+# This notebook reproduces V. Zobel, J. Reininghaus and I. Hotz, *Visualization of Two-Dimensional Symmetric Positive
+# Definite Tensor Fields Using the Heat Kernel Signature* (2014), at sizes that take seconds. `hks-jax paper` writes
+# the table and the figures at larger sizes, and with `--full` at the paper's sizes. The last part compares the
+# signature with smoothed scalars, which the paper's outlook proposes.
 
 # %%
 import warnings
@@ -23,9 +23,9 @@ from hks_jax.paper.signature import enough_pairs
 jax.config.update("jax_enable_x64", True)
 
 
-@partial(jax.jit, static_argnums=(0, 3, 4))  # one function for each grid compiles sooner than its pieces
+@partial(jax.jit, static_argnums=(0, 3, 4))  # compiling one function per grid is faster than compiling its parts
 def heat(grid, tensors, times, k, boundary="neumann", functions=None):
-    """4πt·HKS, which is 1 where a metric is flat and has no boundary; and functions that diffuse."""
+    """Return 4πt·HKS, and the given functions after heat flow."""
     pairs = hj.eigenpairs(hj.TensorField(grid, tensors), k, boundary)
     return hj.hks(pairs, times, "flat"), None if functions is None else hj.heat_flow(pairs, times, functions)
 
@@ -33,9 +33,9 @@ def heat(grid, tensors, times, k, boundary="neumann", functions=None):
 # %% [markdown]
 # ## Table 1 and Figure 1: a surface and its metric
 #
-# A bumpy torus as a triangulated surface in space, and the metric that it pulls back to its parameters, on a grid. The
-# signature belongs to the metric: both have the same, up to the discretisation. Compared are the metric on n² nodes and
-# a surface with 400² vertices.
+# The surface is a bumpy torus, given as a triangulation in space. Its metric in the parameter domain is a tensor
+# field on a grid. The signature depends only on the metric, so both have the same signature up to discretisation
+# errors. We compare the metric on n² nodes with a surface of 400² vertices.
 
 # %%
 reference, time = table1.stored_reference(), jnp.array([1.0])
@@ -64,8 +64,8 @@ hj.plot.save_figure(figure, "paper-figure1.png")
 # %% [markdown]
 # ## Figure 2: boundaries
 #
-# A natural boundary doubles the signature at an edge, and makes it four times as large at a corner. The paper reflects
-# a strip of the field; `"mirror"` reflects all of it, which leaves a flat metric without any effect of its boundary.
+# A natural boundary doubles the signature at an edge, and makes it four times as large at a corner. The paper
+# reflects a strip of the field. `"mirror"` reflects the whole field, so that a flat metric shows no boundary effect.
 
 # %%
 n, k = 31, 300
@@ -92,10 +92,10 @@ along.legend(frameon=False)
 hj.plot.save_figure(figure, "paper-figure2.png")
 
 # %% [markdown]
-# ## Figure 3: what trace and determinant show, and the signature does not
+# ## Figure 3: trace and determinant vary, the signature does not
 #
-# T¹ = diag(f(u₁), 1) varies elevenfold and is flat: another scale along u₁, nothing else. Its signature is constant.
-# The other three are curved.
+# T¹ = diag(f(u₁), 1) varies by a factor of eleven, but it is flat: only the scale along u₁ changes. Its signature is
+# constant. The other three metrics are curved.
 
 # %%
 fields = hj.examples.figure3_fields(n)
@@ -116,12 +116,12 @@ assert spreads.pop("T¹") < 0.05
 assert min(spreads.values()) > 0.15
 
 # %% [markdown]
-# ## Figure 4: what trace and determinant do not show, and the signature does
+# ## Figure 4: the signature varies, trace and determinant do not
 #
-# Constant eigenvalues: trace, determinant and anisotropy are the same everywhere, and in all five fields. Straight
-# lines, circles and spirals are flat; waves and cells are not. The signature shows their curvature, 4πt·HKS = 1 + Kt/3
-# + …; no smoothing of constants could. So that there is no boundary in the picture, the formulas are continued beyond
-# it.
+# The eigenvalues are constant. Trace, determinant and anisotropy are therefore the same at all points of all five
+# fields. Straight lines, circles and spirals are flat; waves and cells are curved. The signature shows their
+# curvature, 4πt·HKS = 1 + Kt/3 + …, and smoothing of constant scalars cannot show it. The formulas are extended
+# beyond the domain, so that the pictures show no boundary effect.
 
 
 # %%
@@ -161,8 +161,8 @@ assert min(of_curved) > 0.9
 # %% [markdown]
 # ## Figure 5: degenerate points
 #
-# Where the eigenvalues are equal, eigenvectors turn by multiples of one half around the point. The signature has a
-# pattern for each index.
+# At a degenerate point the eigenvalues are equal. Around the point, the eigenvectors rotate by multiples of a half
+# turn. The signature has a different pattern for each index.
 
 # %%
 time, width, images = jnp.array([0.2]), 8, {}
@@ -186,11 +186,12 @@ for ax, (index, values) in zip(figure.subplots(1, 5), images.items(), strict=Tru
 hj.plot.save_figure(figure, "paper-figure5.png")
 
 # %% [markdown]
-# ## A tunnel: what small perturbations change
+# ## A tunnel: the effect of small perturbations
 #
-# Two halls with a wall between them, joined at one end; and the same with a tunnel through the wall, one element wide.
-# Distances become much shorter: here by Varadhan's formula, d² = lim −4t log k_t as t → 0. The signature hardly minds,
-# but around the tunnel's mouths: little heat gets through.
+# Two halls are separated by a wall and connected at one end. The second domain also has a tunnel through the wall,
+# one element wide. The tunnel makes distances much shorter; here we compute them by Varadhan's formula, d² = lim −4t
+# log k_t as t → 0. The signature hardly changes, except near the ends of the tunnel, because little heat passes
+# through it.
 
 
 # %%
@@ -205,7 +206,7 @@ grids, times = (halls(0), halls(1)), jnp.array([16.0, 64.0])
 identity, source = jnp.broadcast_to(jnp.eye(2), (37, 27, 2, 2)), (5, 8)
 spectra = [hj.eigenpairs(hj.TensorField(grid, identity), 200) for grid in grids]
 signatures = [np.asarray(hj.hks(pairs, times, "flat")) for pairs in spectra]
-with warnings.catch_warnings():  # it says how many nodes are too far for the kernel at this t
+with warnings.catch_warnings():  # some nodes are too far away for the kernel at this t
     warnings.simplefilter("ignore", hj.AccuracyWarning)
     distances = [np.asarray(hj.varadhan_distance(pairs, [40.0], source))[0, 0] for pairs in spectra]
 both = grids[0].inside
@@ -223,18 +224,18 @@ for row, grid, values, distance in zip(figure.subplots(2, 2), grids, signatures,
 hj.plot.save_figure(figure, "paper-tunnel.png")
 
 # %% [markdown]
-# ## Figure 6: a brain over t
+# ## Figure 6: a brain at several times
 #
-# Here an analytic phantom; notebooks/brain.py has a scan. The paper takes the diffusion tensor for the metric, T = D,
-# and then strong diffusion makes long distances; g = D⁻¹ is the metric of the diffusion itself. Where tissue is
-# concerned, their signatures are nearly opposites.
+# This example uses an analytic phantom; notebooks/brain.py uses a scan. The paper uses the diffusion tensor as the
+# metric, T = D, in which strong diffusion makes distances long. The metric of the diffusion itself is g = D⁻¹. In
+# tissue the two signatures are nearly opposite.
 
 # %%
 tensors, mask, spacing = phantom((38, 44))
 brain = hj.Grid(mask.shape, spacing, mask=mask, components="largest")
 deep = hj.io.erode(brain.inside, 4)
 mean = float(np.median(np.trace(tensors, axis1=-2, axis2=-1)[brain.inside])) / 2
-lengths = np.array([8.0, 16.0, 32.0])  # mm: how far heat gets, √(Dt)
+lengths = np.array([8.0, 16.0, 32.0])  # √(Dt) in mm, the distance that heat travels
 of_brain = {}
 figure = hj.plot.new_figure(11, 7)
 for row, (metric, name, scale) in zip(
@@ -252,13 +253,14 @@ print(f"correlation of the two at the smallest t: {relation:.2f}")
 assert relation < -0.5
 
 # %% [markdown]
-# ## The outlook: beside smoothed scalars
+# ## The outlook: comparison with smoothed scalars
 #
-# Trace, determinant and anisotropy can be blurred by Gaussians (`gaussian_scale_space`), or diffuse as the metric says
-# (`heat_flow`), as far as heat gets in the time of the signature. Smoothing shows where a scalar was large, less and
-# less sharply: of trace and determinant the ventricles, of anisotropy the fibres, and at last a constant. Diffusion
-# along fibres does it in other shapes. The signature does not fade: at small t it shows the tissue, the ventricles low
-# and the fibres' middle high; at large t it shows how far every point is from the others, and from the rim.
+# Trace, determinant and anisotropy can be smoothed by Gaussians (`gaussian_scale_space`), or by heat flow in the
+# metric (`heat_flow`), over the distance that heat travels in the time of the signature. Smoothed scalars show where
+# a scalar was large, and become constant as t grows. Trace and determinant show the ventricles, and anisotropy shows
+# the fibres. Heat flow along fibres gives other shapes. The signature does not become constant in this way. At small
+# t it shows the tissue: ventricles are low and the centres of fibres are high. At large t it shows how far every
+# point is from the others and from the rim.
 
 # %%
 scalars = hj.tensor_invariants(hj.TensorField(brain, tensors))
@@ -291,10 +293,10 @@ assert min(ranges["4πt·HKS"]) > 0.5
 # %% [markdown]
 # ### The same surface in other coordinates
 #
-# A torus of revolution, and the same in coordinates y that are bent: x = ψ(y). Nothing about the surface has changed,
-# and the signature moves along with its points. So does a function that diffuses; one that is blurred does not. But
-# trace, determinant and anisotropy are scalars of the matrix, not of the metric: in other coordinates they are others
-# from the start, and no smoothing mends that. Here the trace.
+# We compute on a torus of revolution, and on the same surface in curvilinear coordinates y with x = ψ(y). The surface
+# is the same, so the signature at each point does not change. The same holds for a function smoothed by heat flow,
+# but not for a function smoothed by a Gaussian. Trace, determinant and anisotropy are scalars of the matrix and not
+# of the metric. They differ between coordinates before any smoothing. This example shows the trace.
 
 # %%
 n, times = 50, jnp.array([0.4, 1.2])
@@ -334,7 +336,7 @@ assert max(changes["4πt·HKS"], changes["a function, diffused"]) < 0.05
 assert min(changes["trace, diffused"], changes["trace, blurred"], changes["a function, blurred"]) > 0.3
 
 # %% [markdown]
-# Above, what there is in coordinates x, moved to y; below, what is computed in y.
+# The upper row is computed in coordinates x and then transformed to y. The lower row is computed in y.
 
 # %%
 figure = hj.plot.new_figure(14, 5.4)

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Recover a potential from a signature
 #
-# A particle on a curved surface feels a potential V. Its heat kernel signature, that of −Δ + V, is known at a few
-# times, with noise. Which potential was it?
+# A particle moves on a curved surface in a potential V. We know the heat kernel signature of −Δ + V at a few times,
+# with noise, and recover the potential.
 
 # %%
 import jax
@@ -28,7 +28,7 @@ x, y = np.moveaxis(grid.nodes, -1, 0)
 truth = -60 * np.exp(-12 * ((x - 0.4) ** 2 + y**2)) + 40 * np.exp(-16 * ((x + 0.3) ** 2 + (y - 0.3) ** 2))
 
 # %% [markdown]
-# The well has a bound state: its eigenvalue is negative, and inertia proves that none was missed.
+# The well has a bound state: one eigenvalue is negative. The inertia proves that no eigenvalue is missing.
 
 # %%
 pairs = hj.eigenpairs(hj.assemble(field, potential=truth), k, multiplet="complete")
@@ -40,8 +40,9 @@ target = hj.hks(pairs, times) * np.exp(noise * rng.standard_normal((len(times), 
 assert pairs.eigenvalues[0] < 0 < pairs.eigenvalues[1]
 
 # %% [markdown]
-# Least squares, by Levenberg and Marquardt of optimistix: the signature's logarithm, and a penalty on differences of
-# neighbouring values that says that a potential is smooth. The unknowns stand on a coarser grid and are interpolated.
+# The potential is the solution of a least-squares problem, which Levenberg–Marquardt of optimistix solves. The
+# residuals are differences of the signature's logarithm and a penalty on differences between neighbouring values,
+# because the potential is smooth. The unknowns are values on a coarser grid, which are interpolated.
 
 # %%
 coarse = 9
@@ -74,7 +75,8 @@ print(f"{int(found.stats['num_steps'])} steps; error {error(recovered):.1%} of t
 assert error(recovered) < 0.2
 
 # %% [markdown]
-# Truth, what was found, and the lowest eigenfunction, which lives in the well:
+# The figure shows the true potential, the recovered potential, and the lowest eigenfunction, which is localised in
+# the well:
 
 # %%
 figure = hj.plot.new_figure(12, 3.6)

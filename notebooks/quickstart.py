@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Quick start
 #
-# From a tensor field to its heat kernel signature, and what the signature sees that the tensors' invariants do not.
-# This file is a notebook in the percent format: open it in Jupyter (with jupytext) or an editor, or run it as a script.
+# This notebook computes the heat kernel signature of a tensor field. The signature shows curvature that the
+# invariants of the tensors do not show. The file is a notebook in the percent format: open it in Jupyter (with
+# jupytext) or in an editor, or run it as a script.
 
 # %%
 import jax
@@ -16,8 +17,9 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## Two fields with the same eigenvalues
 #
-# Both fields have eigenvalues 4 and 1 at every point: the same trace, determinant and anisotropy. In one the major
-# direction is constant, in the other it swings to and fro. The first is flat; the second is curved.
+# Both fields have the eigenvalues 4 and 1 at every point, and therefore the same trace, determinant and anisotropy.
+# In one field the major direction is constant; in the other it oscillates. The first field is flat, the second is
+# curved.
 
 # %%
 fields = hj.examples.figure4_fields(41)
@@ -39,7 +41,7 @@ print(pairs["cells"].summary())
 # %% [markdown]
 # ## Signatures
 #
-# Multiplied by 4πt, the signature of a flat metric without boundary is 1.
+# 4πt·HKS is 1 for a flat metric without boundary.
 
 # %%
 times = jnp.array([0.03, 0.06, 0.12])
@@ -63,9 +65,9 @@ print("bias of the grid:  ", report.resolution_bias)
 assert report.tail.max() < 0.01
 
 # %% [markdown]
-# ## Small times see the curvature
+# ## Curvature from small times
 #
-# Inside, 4πt·HKS = 1 + K t/3 + … What the expansion leaves unexplained here is the grid's bias, 0.05·h²/t.
+# Inside, 4πt·HKS = 1 + K t/3 + … The remaining difference from this expansion is the bias of the grid, 0.05·h²/t.
 
 # %%
 t = 0.01

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Train a network through the signature
 #
-# A network sees the heat kernel signature of a domain and returns a metric: an SPD tensor at every node. No true metric
-# is shown to it. The loss compares the signature of what it returns with the one that it saw, and the gradient goes
-# through the eigenpairs of a whole batch of fields. It needs optax.
+# The input of the network is the heat kernel signature of a domain. Its output is a metric: an SPD tensor at every
+# node. The training uses no true metric. The loss compares the signature of the output with the input signature, and
+# the gradient passes through the eigenpairs of a batch of fields. This notebook needs optax.
 
 # %%
 import time
@@ -28,7 +28,7 @@ def signature(tensors):  # (16, 16, 2, 2) → (3, 16, 16), 0 where it is as in t
 
 
 # %% [markdown]
-# Hills and valleys in random places are what it learns on.
+# The training data are signatures of metrics with smooth bumps at random positions.
 
 # %%
 rng = np.random.default_rng(0)
@@ -47,8 +47,8 @@ flat = signature(jnp.broadcast_to(jnp.eye(2), (*grid.shape, 2, 2)))
 seen, unseen = (signatures(jnp.stack([random_metric() for _ in range(count)])) for count in (32, 8))
 
 # %% [markdown]
-# Any symmetric matrix has an SPD exponential: `matrix_function` differentiates it right also where eigenvalues are
-# equal, as they are at the start, when the network returns nearly nothing and every tensor is nearly the identity.
+# The exponential of any symmetric matrix is SPD. `matrix_function` has exact derivatives also at equal eigenvalues.
+# These occur at the start, when the network returns nearly zero and every tensor is nearly the identity.
 
 
 # %%
@@ -76,7 +76,7 @@ def loss(network, seen):
 
 
 # %% [markdown]
-# A step is the usual one. Nothing is compiled after the first.
+# The training step is the usual one. Only the first step compiles.
 
 # %%
 optimiser = optax.adam(1e-2)
@@ -102,7 +102,7 @@ for number in range(120):
 print(f"{(time.perf_counter() - start) / 119 * 1e3:.0f} ms a step later")
 
 # %% [markdown]
-# How much of the signature does it explain, also of fields that it never saw?
+# We measure how much of the signature the network explains, also for fields outside the training data.
 
 # %%
 before, after = jnp.mean((unseen - flat) ** 2), loss(network, unseen)

@@ -1,12 +1,13 @@
 # %% [markdown]
 # # Volumes, and small times
 #
-# What slices of a volume lose; and signatures at times so small that no spectrum could be long enough.
+# This notebook shows the information that slices of a volume lose, and signatures at times that are too small for any
+# computed spectrum.
 #
 # ## What slices lose
 #
-# A metric on a volume whose slices are all flat, and which is not flat: g = dx² + dy² + f(x, y)² dz². No slice z =
-# const can tell; the volume's heat kernel signature does.
+# The metric g = dx² + dy² + f(x, y)² dz² on a volume is curved, but all its slices z = const are flat. Only the heat
+# kernel signature of the volume shows the curvature.
 
 # %%
 import warnings
@@ -32,12 +33,12 @@ field = hj.TensorField.from_function(metric, grid)
 plane = hj.TensorField(hj.Grid((n, n), 1 / n), field.tensors[:, :, n // 2, :2, :2])
 
 # %% [markdown]
-# The torus is closed, so that no boundary hides the curvature. 180 pairs resolve t = 0.01 to a few per cent.
+# The torus has no boundary, so no boundary effect hides the curvature. 180 pairs resolve t = 0.01 to a few per cent.
 
 # %%
 t = 0.01
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore", hj.AccuracyWarning)  # the flat slice has multiple eigenvalues, and one is cut
+    warnings.simplefilter("ignore", hj.AccuracyWarning)  # k cuts a multiple eigenvalue of the flat slice
     of_slice = hj.hks(hj.eigenpairs(plane, 120, boundary="periodic"), [t])[0]
     of_volume = hj.hks(hj.eigenpairs(field, 180, boundary="periodic"), [t])[0][:, :, n // 2]
 
@@ -51,7 +52,8 @@ assert spread(of_slice) < 0.01
 assert spread(of_volume) > 0.1
 
 # %% [markdown]
-# For small t the volume's signature is (4πt)^(−3/2) (1 + Rt/6 + …), R the scalar curvature, −2 ∇²f/f here.
+# For small t the volume's signature is (4πt)^(−3/2) (1 + Rt/6 + …), where R is the scalar curvature; here R = −2
+# ∇²f/f.
 
 # %%
 curvature = np.asarray(hj.scalar_curvature(field))[:, :, n // 2]
@@ -74,9 +76,9 @@ hj.plot.save_figure(figure, "volumes.png")
 # %% [markdown]
 # ## Small times without a spectrum
 #
-# At the time t the signature consists of the eigenvalues up to 5/t or so, and there are ever more of them: k grows like
-# 1/t in the plane and like t^(−3/2) in a volume. `hks_spectrum_free` computes the same without any: what all eigenpairs
-# of the grid would give. On a small grid one can have them all, and see.
+# At time t, the signature needs the eigenvalues up to about 5/t. Their number grows like 1/t in the plane and like
+# t^(−3/2) in a volume. `hks_spectrum_free` computes the signature without eigenpairs. The result equals the sum over
+# all eigenpairs of the grid. On a small grid we can compute them all and compare.
 
 # %%
 field = hj.examples.figure4_fields(41)["cells"]
@@ -84,13 +86,14 @@ times = np.geomspace(6e-4, 0.02, 12)
 free = np.asarray(hj.hks_spectrum_free(field, times))
 every = hj.eigenpairs(field, field.grid.size, solver="dense")
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore", hj.AccuracyWarning)  # of what the grid's spacing does to it, which is to be seen
+    warnings.simplefilter("ignore", hj.AccuracyWarning)  # the bias of the grid, which is shown below
     of_all = hj.hks(every, times)
 print(f"spectrum-free against all {every.k} pairs: {np.abs(free / of_all - 1).max():.1e}")
 assert np.allclose(free, of_all, rtol=1e-4)
 
 # %% [markdown]
-# A truncated spectrum falls short, by more than half at the smallest time. It says so.
+# The sum over a truncated spectrum is too small, by more than half at the smallest time. A warning reports this
+# error.
 
 # %%
 k = 100
@@ -107,9 +110,9 @@ assert lacking[0] > 0.5
 assert lacking[times > 1.2 * limit].max() < 0.01
 
 # %% [markdown]
-# Colouring, the method for volumes, comes with a bound: heat that starts at many nodes at once, so far apart that it
-# does not get from one to the next. Here with the lumped mass, for which it is quick, against selected inversion, which
-# is exact to ten digits.
+# Colouring, the method for volumes, has an error bound. Heat starts at many nodes at once, so far apart that it does
+# not reach the next source. This cell compares colouring with selected inversion, which is exact to ten digits. Both
+# use the lumped mass, for which colouring is fast.
 
 # %%
 small = times[:4]
@@ -123,9 +126,9 @@ assert np.all(error < settings.error)
 assert max(settings.error) < 1e-4
 
 # %% [markdown]
-# At such times the signature is its expansion, 4πt·HKS = 1 + Kt/3 + …, from which the curvature can be read off, until
-# at smaller ones yet the grid's spacing h biases it, by up to 0.06 h²/t. That is of the grid, not of the method: a
-# finer one moves it to the left, where no spectrum follows.
+# At such times the signature agrees with its expansion, 4πt·HKS = 1 + Kt/3 + …, from which the curvature can be
+# computed. At still smaller times the spacing h of the grid causes a bias of up to 0.06 h²/t. This bias comes from
+# the grid and not from the method. A finer grid moves it to smaller times.
 
 # %%
 series = np.asarray(hj.hks_expansion(field, times, order=2))

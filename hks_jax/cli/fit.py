@@ -123,7 +123,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
         "parametrisation": args.parametrisation,
-        "settings": plain({name: getattr(args, name) for name in names if name != "k"}),
+        "settings": plain({name: getattr(args, name) for name in names}),
     }
     return _write(args, fit, target, report, progress)
 

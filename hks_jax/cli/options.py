@@ -1,8 +1,8 @@
 """The options of all commands in one table, from which parsers, settings, the columns of studies and pages follow.
 
 A line of the table is an option: its flags, its value, its default, and after two spaces its help, which goes on in
-indented lines. ``N...`` is one or more, ``N!`` must be given, ``a|b`` is one of these, and an option that
-takes nothing is a switch. A line ``[name] title: text`` begins a section, and ``@name`` stands for a whole section in
+indented lines. ``N...`` is one or more, ``N!`` must be given, ``a|b`` is one of these, and an option without a value
+is a switch. A line ``[name] title: text`` begins a section, and ``@name`` stands for a whole section in
 the options of a command (`OPTIONS` in its module, whose docstring is the help).
 """
 
@@ -79,7 +79,7 @@ file FILE...
     neumann; mean, of Neumann and Dirichlet, under which the rim of a mask hardly shows; dirichlet, dirichlet-rim (the
     rim of a mask, too), periodic or mirror; one for all axes, or one per axis as in neumann,periodic, and then one for
     the rim of a mask; low:high for the two sides, as in neumann:dirichlet,neumann (default: mean where the domain has a
-    mask, else neumann; of a mesh, and for a spectrum, neumann; of a study its first one, else mean)
+    mask, else neumann; of a mesh, and for a spectrum, neumann; of a study the one it began with, else mean)
 -k K
     number of eigenpairs, under the mean of both problems together (default 200, for a volume 100, or a quarter of the
     unknowns if that is less)

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hks_jax.atomic import atomic_folder
 from hks_jax.cli.progress import Progress
 from hks_jax.io.result import Result, plain, signature_file
 from hks_jax.io.tables import write_json
+from hks_jax.storage import atomic_folder
 
 REPORT = "report.json"
 PAIRS = "pairs.npz"

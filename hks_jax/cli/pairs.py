@@ -17,7 +17,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.io.result import plain, recorded_boundary
-from hks_jax.npz import load_npz
+from hks_jax.storage import load_npz
 
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")

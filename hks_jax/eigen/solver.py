@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -10,10 +10,7 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_number
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
-from hks_jax.linear.pencil import SymmetricPencil
-
-P = TypeVar("P", bound=SymmetricPencil)
-"""What a method can solve: any pencil, or those of a domain, or of a grid."""
+from hks_jax.linear.pencil import P
 
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
 

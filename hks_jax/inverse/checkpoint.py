@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from hks_jax.inverse.metric_fit import Step
-from hks_jax.npz import load_npz, write_npz
+from hks_jax.storage import load_npz, write_npz
 
 
 @dataclasses.dataclass

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
 from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
-from hks_jax.npz import load_npy, load_npz, write_npz
+from hks_jax.storage import load_npy, load_npz, write_npz
 
 
 def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:

@@ -34,8 +34,7 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
     missing = [os.path.basename(each) for each in names if not os.path.isfile(each)]
     if missing:
         raise FileNotFoundError(
-            f"{os.fspath(path)}: by its name it holds the component {component_of(path)} of tensors. Six are needed; "
-            f"not beside it: {', '.join(missing)}"
+            f"{os.fspath(path)}: one of six components by its name; not beside it: {', '.join(missing)}"
         )
     return names
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from hks_jax.io.mesh_formats import Loaded
 from hks_jax.optional import optional
-from hks_jax.reading import reading
+from hks_jax.storage import reading
 
 _TRIANGLES = b"\xff\xff\xfe"
 """What FreeSurfer's files of triangles begin with."""
@@ -47,8 +47,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
         end = start + 8 + 12 * (n_vertices + n_faces)
         if min(n_vertices, n_faces) < 0 or end > len(content):
             raise ValueError(
-                f"it declares {n_vertices} vertices and {n_faces} triangles, which end at byte {end}, and has "
-                f"{len(content)} bytes"
+                f"it declares {n_vertices} vertices and {n_faces} triangles, {end} bytes, and has {len(content)} bytes"
             )
         vertices, faces = library.freesurfer.read_geometry(path)
     vertices = np.asarray(vertices, np.float64)

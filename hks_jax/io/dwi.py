@@ -18,7 +18,7 @@ from hks_jax.io.tensor_order import Matrices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
 from hks_jax.io.volume import TensorVolume, as_mask, digest, placed
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 _LENGTH = 0.05
 """By how much the length of a direction may differ from 1: it is rounding then."""

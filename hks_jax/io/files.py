@@ -21,7 +21,7 @@ from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
 from hks_jax.io.volume import TensorVolume, as_mask, describe, digest
 from hks_jax.io.vtk_image import by_time
-from hks_jax.npz import write_npz
+from hks_jax.storage import write_npz
 
 
 def read_tensors(
@@ -75,7 +75,7 @@ def read_tensors(
             converted to mm²/s. None: the numbers are taken as they are.
 
     Returns:
-        The tensors along the voxel axes. What about them gives reason to doubt frame or unit, `questions` asks.
+        The tensors along the voxel axes; `questions` asks about a frame or a unit that looks wrong.
 
     Raises:
         FileNotFoundError: no such file.
@@ -188,8 +188,8 @@ def save_tensors(
 
     ``.npz``: the arrays that `read_tensors` documents.
 
-    Where the tensors came from is said as by `save`, with the order and the frame that they have in the file: what is
-    read back needs neither `order` nor `frame`. Units are kept but in VTK's files, which have none.
+    The file says where the tensors came from, as `save` has it, and their order and frame: reading them back needs
+    neither `order` nor `frame`. Units are kept but in VTK's files, which have none.
 
     Raises:
         ValueError: an unknown suffix; NIfTI for a slice; unsymmetric tensors in NIfTI or NRRD.

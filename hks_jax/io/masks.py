@@ -11,8 +11,9 @@ from scipy import ndimage
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
+from hks_jax.io.tables import read_table
 from hks_jax.io.volume import TensorVolume, as_mask, corners
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -83,25 +84,18 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
 def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
     """Read names of labels: a table with the columns ``index`` and ``name`` (BIDS), or lines of a number and a name.
 
-    Of a line without such a table, the name is what follows the number: up to the next tab if there is one before it,
-    and without the four numbers of a colour that FreeSurfer's tables end in.
+    Of a line, the name goes from the number to the next tab, if there is one, and is without the four numbers of a
+    colour that FreeSurfer's tables end in.
     """
     file = existing(path)
     with reading(file, "a text in UTF-8"):
         lines = [line.strip("\r\n") for line in file.read_text(encoding="utf-8-sig").splitlines()]
-    names = {}
-    header = lines[0].split("\t") if lines else []
-    if {"index", "name"} <= set(header):
-        at = header.index("index"), header.index("name")
-        for line in lines[1:]:
-            cells = line.split("\t")
-            if len(cells) > max(at) and cells[at[0]].strip().lstrip("-").isdecimal():
-                names[int(cells[at[0]])] = cells[at[1]].strip()
+    if lines and {"index", "name"} <= set(lines[0].split("\t")):
+        rows = [(row.get("index", ""), row.get("name", "")) for row in read_table(file)]
     else:
-        for line in lines:
-            number, *words = line.split(None, 1)[:2] or [""]
-            if number.lstrip("-").isdecimal() and words:
-                names[int(number)] = re.sub(r"(\s+\d+){4}$", "", words[0].split("\t")[0].strip())
+        pairs = [words for line in lines if len(words := line.split(None, 1)) == 2]
+        rows = [(number, re.sub(r"(\s+\d+){4}$", "", name.split("\t")[0].strip())) for number, name in pairs]
+    names = {int(number): name for number, name in rows if name and number.lstrip("-").isdecimal()}
     if not names:
         raise ValueError(f"{file}: no line has a number and a name; expected lines such as '17 left hippocampus'")
     return names

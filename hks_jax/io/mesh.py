@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, SurfaceMesh, TetMesh
 from hks_jax.domain.triangulation import Triangulation
@@ -21,7 +20,7 @@ from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, throu
 from hks_jax.io.tables import write_json
 from hks_jax.io.vtk_image import holds_dataset
 from hks_jax.optional import optional
-from hks_jax.reading import existing
+from hks_jax.storage import atomic_path, existing
 
 READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", ".gii.gz")
 """The suffixes of meshes; FreeSurfer's surfaces, which have none of their own, are known by their first bytes."""

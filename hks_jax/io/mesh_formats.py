@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
-from hks_jax.reading import reading
+from hks_jax.storage import reading
 
 
 class Loaded(NamedTuple):

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hks_jax.io.tensor_order import FRAMES, matrices
 from hks_jax.io.volume import Format, TensorVolume, placed
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}

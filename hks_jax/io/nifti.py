@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.atomic import atomic_path
 from hks_jax.checks import require_real
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
@@ -20,7 +19,7 @@ from hks_jax.io.tensor_order import FRAMES, matrices, pack
 from hks_jax.io.units import by_axis, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
 SYMMETRIC_MATRIX = 1005
@@ -99,8 +98,7 @@ def _encoding(path: str) -> dict[str, Any]:
     reference = encoding.get("Reference")
     if reference is not None and not (isinstance(reference, str) and reference in _REFERENCES):
         raise ValueError(
-            f"{sidecar}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Correct it, or "
-            "remove it and pass frame"
+            f"{sidecar}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Edit or remove it"
         )
     return encoding
 

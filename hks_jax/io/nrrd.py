@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import PATIENT, check_data, check_header, space_of
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, reading
 
 KINDS = {
     f"{d}D-{masked}{symmetric}matrix": (d * (d + 1) // 2 if symmetric else d * d) + bool(masked)
@@ -209,8 +208,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
     directions = rows[domain].T
     if directions.shape != (d, d) or not np.isfinite(directions).all() or np.linalg.norm(directions, axis=0).min() == 0:
         raise ValueError(
-            f"{name}: space directions {rows[domain].tolist()} of the {d} voxel axes; expected {d} vectors of {d} "
-            "finite numbers, none of them zero"
+            f"{name}: space directions {rows[domain].tolist()}; expected {d} of {d} finite numbers, none of them zero"
         )
     origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
     signs = PATIENT.get(space_of(header)) if d == 3 else None

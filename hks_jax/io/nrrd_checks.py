@@ -62,7 +62,7 @@ def space_of(header: Mapping[str, Any]) -> str:
     """Return the space in full and in lower case, without its time; the empty text if there is none."""
     space = str(header.get("space", "")).lower()
     name = _SHORT.get(space.removesuffix("t"), space.removesuffix("-time"))
-    if name and name not in _SPACES:
+    if "space" in header and name not in _SPACES:
         raise ValueError(f"space: {space!r} is none of the format's, such as left-posterior-superior")
     return name
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.npz import load_npz, write_npz
+from hks_jax.storage import load_npz, write_npz
 
 ARRAYS = (
     "eigenvalues",

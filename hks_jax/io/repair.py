@@ -136,8 +136,8 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     elif method == "clip":
         if report["not_finite"]:
             raise ValueError(
-                f"repair: {report['not_finite']} tensors are NaN or infinite and have no eigenvalues to clip; "
-                'choose "mask" or "nearest"'
+                f"repair: {report['not_finite']} tensors are NaN or infinite and have no eigenvalues to clip; choose "
+                '"mask" or "nearest"'
             )
         if floor is None:
             typical = np.trace(tensors[inside & ~bad], axis1=-2, axis2=-1) / volume.dimension
@@ -209,8 +209,7 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
         return None
     what = f"have the same isotropic tensor, {filled:.3g}·I" if found is same else "have tensors near zero"
     return found, (
-        f"no mask: {int(found.sum())} of {found.size} voxels {what}, as programs write what is outside the object, and "
-        "count as inside"
+        f"no mask: {int(found.sum())} of {found.size} voxels {what}, as programs write background, and count as inside"
     )
 
 

@@ -17,7 +17,7 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.volume import TensorVolume
-from hks_jax.npz import load_npz
+from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
 

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hks_jax.atomic import atomic_path
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, reading
 
 MISSING = "n/a"
 

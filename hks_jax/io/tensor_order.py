@@ -164,7 +164,7 @@ def matrices(name: str, components: Float[np.ndarray, "*shape n"], order: str | 
             raise ValueError(f"order: {name} holds whole matrices; leave this out")
         return Matrices(components.reshape(*components.shape[:-1], math.isqrt(n), -1), "matrix", None)
     used = order or declared
-    choices = ", ".join(f'"{name}" ({" ".join(components)})' for name, components in ORDERS.items())
+    choices = ", ".join(f'"{known}" ({" ".join(parts)})' for known, parts in ORDERS.items())
     if not used:
         raise ValueError(
             f"{name}: it has {n} components of each tensor and does not declare their order, and programs differ. "

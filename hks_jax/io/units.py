@@ -80,9 +80,8 @@ def length_question(volume: TensorVolume) -> str:
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""
     return (
-        f"Wrong unit of length? Voxels of {by_axis(volume.spacing)} mm are none that scans "
-        f"have, {low:g} to {high:g} mm, and t goes with the square. Correct the unit in the header (NIfTI: xyzt_units; "
-        "NRRD: space units), or the voxel sizes"
+        f"Wrong unit of length? Voxels of {by_axis(volume.spacing)} mm: scans have {low:g} to {high:g} mm, and t goes "
+        "with the square. Correct the unit in the header (NIfTI: xyzt_units; NRRD: space units), or the voxel sizes"
     )
 
 

@@ -14,12 +14,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from hks_jax.atomic import atomic_path
 from hks_jax.io.tensor_order import matrices, nearest_rotation
 from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors, placed
-from hks_jax.npz import load_npz
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, load_npz, reading
 
 _ROOM, _RATIO = 8 << 30, 200
 """Bytes of memory that VTK may take in reading a file, and how many more for each byte of the file."""
@@ -100,9 +98,7 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
     """Write tensors, along the axes of space; those of a slice with zeros out of its plane."""
     tensors = volume.tensors
     if volume.dimension == 2:
-        keep = [a for a in range(3) if a != volume.thin_axis]
-        tensors = np.zeros((*volume.shape, 3, 3), tensors.dtype)
-        tensors[..., np.ix_(keep, keep)[0], np.ix_(keep, keep)[1]] = volume.tensors
+        tensors = np.insert(np.insert(tensors, volume.thin_axis, 0, axis=-1), volume.thin_axis, 0, axis=-2)
     rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
     record = describe_tensors(volume, "matrix", "world", provenance)
     _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record, {})

@@ -11,6 +11,7 @@ from hks_jax.linear.products import matmul, products_with_columns
 
 Array = Any
 """NumPy's or JAX's, the same for all arguments and the result."""
+
 _MOST_STEPS = 200
 _RESTARTS = 3
 _KEPT, _MEMORY = 400, 4e8

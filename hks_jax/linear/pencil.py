@@ -67,6 +67,7 @@ class SymmetricPencil(eqx.Module):
 
 
 P = TypeVar("P", bound=SymmetricPencil)
+"""Any pencil, or those of a domain, or of a grid."""
 
 
 def tabulated(pencil: P) -> P:

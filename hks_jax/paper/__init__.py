@@ -11,8 +11,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from hks_jax import plot
-from hks_jax.atomic import atomic_path
 from hks_jax.paper import fields, figure1, figure2, figure6, table1, triangles
+from hks_jax.storage import atomic_path
 
 Echo = Callable[[str], None]
 

@@ -17,7 +17,7 @@ from jaxtyping import Array
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import real_array, require_count, require_number
 from hks_jax.domain import spd
-from hks_jax.npz import load_npz, write_npz
+from hks_jax.storage import load_npz, write_npz
 from hks_jax.traced import is_traced
 from hks_jax.uncertainty.noise import TensorNoise
 from hks_jax.uncertainty.result import Uncertainty

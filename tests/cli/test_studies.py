@@ -20,7 +20,6 @@ import pytest
 from annotations import unchecked
 
 import hks_jax as hj
-from hks_jax.atomic import claim
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.job import Settings
 from hks_jax.cli.progress import StudyProgress
@@ -32,6 +31,7 @@ from hks_jax.io.components import component_of
 from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.pairs import pairs_of
 from hks_jax.io.tables import read_table, write_table
+from hks_jax.storage import claim
 
 ROOT = Path(__file__).resolve().parents[2]
 BRAINS = ROOT.parent / "shared" / "data"
@@ -101,8 +101,9 @@ def test_names_are_read_from_what_there_is(tmp_path):
     assert names("color\tname\tindex\n#ff\tleft thalamus\t10\n") == {10: "left thalamus"}
     assert names("# No. Name: R G B A\n10  Left-Thalamus  0 118 14 0\n") == {10: "Left-Thalamus"}
     assert names("10 left thalamus\n4\tbelow it\tB\n") == {10: "left thalamus", 4: "below it"}
-    with pytest.raises(ValueError, match="no line has a number and a name"):
-        names("index\tname\n")
+    for text, message in (("index\tname\n", "index, name and 0 rows"), ("left\n", "no line has a number and a name")):
+        with pytest.raises(ValueError, match=message):
+            names(text)
     assert names_beside(tmp_path / "n.nii.gz") == str(tmp_path / "n.tsv")
     assert names_beside(tmp_path / "m.nii.gz") is None
 
@@ -529,7 +530,7 @@ def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypat
 @pytest.mark.slow
 def test_a_claim_is_free_again_when_its_process_dies(tmp_path):
     file = tmp_path / "deep" / "claim"
-    code = f"from hks_jax.atomic import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
+    code = f"from hks_jax.storage import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
         assert process.stdout.readline() == "mine\n"

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from hks_jax import __version__
-from hks_jax.atomic import atomic_folder, atomic_path
 from hks_jax.cli.job import Settings
 from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS
@@ -25,7 +24,7 @@ from hks_jax.io.nifti import is_nifti, sidecar_of
 from hks_jax.io.result import Result, plain
 from hks_jax.io.tables import read_json, read_table, write_json, write_table
 from hks_jax.io.volume import digest
-from hks_jax.reading import existing
+from hks_jax.storage import atomic_folder, atomic_path, existing
 
 MAP = "_model-tensor_param-hks_dwimap"
 REGIONS = "_model-tensor_param-hks_regions"

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hks_jax.atomic import claim
 from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.job import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import signature_of
@@ -26,6 +25,7 @@ from hks_jax.cli.values import Times
 from hks_jax.io.tables import write_table
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
+from hks_jax.storage import claim
 
 FORGETFUL = 8
 """Subjects after which compiled programs are forgotten: domains differ, and each leaves 70 MiB that no other uses."""

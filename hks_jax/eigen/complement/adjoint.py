@@ -10,7 +10,7 @@ polynomial instead.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from hks_jax.checks import require_number
 from hks_jax.linear.operators import OfColumns
-from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.pencil import P, SymmetricPencil
 from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
 
 Array = Any
@@ -45,9 +45,6 @@ _FACTORISATION = 200
 _MOST_GROUPS = 16
 _ROWS = 128
 """Rows that the known eigenvectors are taken out of at once: fewer read them more often from memory."""
-
-P = TypeVar("P", bound=SymmetricPencil)
-"""What it solves with: any pencil, or those of a domain, or of a grid."""
 
 
 class Adjoint(eqx.Module, Generic[P]):

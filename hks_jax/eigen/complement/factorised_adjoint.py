@@ -79,11 +79,8 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     def solve(self, prepared: Shifted, pencil: SymmetricPencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         factors, shifts = prepared
-        k, tolerance, clean = (
-            len(rhs),
-            complement.attainable(self.tolerance, rhs.dtype),
-            complement.without_known(pencil, vectors),
-        )
+        k, tolerance = len(rhs), complement.attainable(self.tolerance, rhs.dtype)
+        clean = complement.without_known(pencil, vectors)
 
         def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
             fields = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.pivots))
@@ -101,12 +98,8 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         left, wanted = complement.projected(pencil, vectors, rhs, tolerance, self._amplified(pencil, values, k))
         first, _ = self.groups(factors.dissection, len(values), k, values.dtype)
         x = complement.solve_in_blocks(of_group, solve_block, BLOCK, first, left, wanted, values[:k])
-        definite = not isinstance(self, InteriorAdjoint)
-        return (
-            x
-            if definite and _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance
-            else complement.cleaned(pencil, vectors, x)
-        )
+        clean_enough = not isinstance(self, InteriorAdjoint) and _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance
+        return x if clean_enough else complement.cleaned(pencil, vectors, x)
 
     def groups(self, dissection: Dissection, p: int, k: int, dtype: np.dtype) -> Groups:
         """Group blocks of the first k of p rows, each by the distance that its middle row has; see `group_numbers`."""
@@ -136,16 +129,9 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those next
     # to σ above all, which is why no others are taken out before the end, or before that makes it start again.
     def _solve_block(
-        self,
-        pencil: Any,
-        values: Values,
-        without_near: OfColumns,
-        without_known: OfColumns,
-        factor: Factorisation,
-        b: Columns,
-        wanted: Float[Array, " b"],
-        shifts: Float[Array, " b"],
+        self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
+        factor, b, wanted, shifts = of_block
         stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
 
         def precondition(r: Columns) -> Columns:

@@ -16,13 +16,13 @@ from jaxtyping import Bool, Real
 from matplotlib import colormaps
 
 from hks_jax import __version__
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh
 from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
 from hks_jax.plot.orientation import LETTERS
 from hks_jax.plot.signature import bounding_box
 from hks_jax.signatures.hks import Normalisation
+from hks_jax.storage import atomic_path
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
 """The page's scripts, in the order in which they need one another."""
