@@ -1,4 +1,4 @@
-"""Figures, axes of grids and colour bars: what all pictures share."""
+"""Figures, axes of grids and colour bars, which all pictures share."""
 
 import math
 import os
