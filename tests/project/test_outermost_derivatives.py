@@ -26,7 +26,8 @@ def close(found, expected, digits=1e-11):
 
 
 @pytest.mark.parametrize(
-    ("boundary", "interpolation"), [(("periodic", "dirichlet"), "linear"), ("neumann", "log-euclidean")]
+    ("boundary", "interpolation"),
+    [(("periodic", "dirichlet"), "linear"), pytest.param("neumann", "log-euclidean", marks=pytest.mark.slow)],
 )
 def test_assembly_is_differentiated_as_within_jit(boundary, interpolation):
     rng = np.random.default_rng(0)
