@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
+from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
@@ -22,6 +23,9 @@ from hks_jax.fem.pencil import Pencil, assembled, gathered, row_sums_of
 from hks_jax.fem.resolution import SampledMetric
 from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator
+
+_ON_HOST = 1 << 17
+"""Numbers in the tensors up to which NumPy integrates, in milliseconds, for which nothing is compiled."""
 
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
@@ -68,7 +72,60 @@ def _points_from(
     return jnp.asarray(origin + spacing * (low[..., None, :] + inner))
 
 
-@jit_quickly(static_argnames=("periodic", "interpolation", "operator"))
+def _on_host(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return by NumPy the integrals of the Laplace–Beltrami operator, their change, or cotangents of the tensors."""
+    tensors, domain, elements, couplings, gradients, weights, _, _, fields, periodic, interpolation, operator = args
+    plain = operator == WeakForm(lumped=operator.lumped) and interpolation == "linear" and not fields
+    if not plain or tensors.size > _ON_HOST or (x is not None and len(jax.tree.leaves(x)) > 1):
+        return None
+    d, n, dtype, shape = len(periodic), 2 ** len(periodic), tensors.dtype, domain.shape
+    h, nodes = tensor_product_element(d).values.astype(dtype), np.asarray(tensors).reshape(-1, d, d)
+    corners = np.array(list(product((0, 1), repeat=d)))
+    offsets = (corners[None] - corners[:, None] + 1) @ 3 ** np.arange(d)[::-1]
+    numbers = wrap_nodes(np.arange(domain.size).reshape(shape), periodic)
+    cells = [numbers[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
+    cells = np.stack(cells, axis=-1)[np.asarray(elements)]
+    places = cells[:, :, None] + offsets * domain.size
+    of_stiffness = np.einsum("q,qia,qjb->qabij", weights, gradients, gradients).reshape(-1, n * n)
+    of_mass = np.einsum("q,qi,qj->qij", weights, h, h).reshape(-1, n * n)
+    coupled = np.ones((), bool) if couplings is None else couplings
+    known = np.where(spd.is_spd(nodes), 1, np.nan).astype(dtype)[:, None, None]
+
+    def inside(nodal: np.ndarray) -> np.ndarray:
+        at_corners = (nodal * known)[cells].reshape(-1, n, d * d)
+        return np.matmul(h, at_corners).reshape(-1, n, d, d)
+
+    def integrals(flux: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, ...]:
+        of_elements = flux.reshape(len(cells), -1) @ of_stiffness, root @ of_mass
+        sums = (np.bincount(places.ravel(), each.ravel(), 3**d * domain.size) for each in of_elements)
+        stiffness, mass = (each.astype(dtype).reshape(3**d, *shape) for each in sums)
+        lumped = mass.sum(axis=0)
+        return np.where(coupled, stiffness, 0), np.where(coupled, mass, 0), lumped, lumped.sum()
+
+    # Integrated are √|T| T⁻¹ and √|T|, whose changes are √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and ½√|T| tr(T⁻¹dT).
+    metric = inside(nodes)
+    root, inverse = np.sqrt(spd.determinant(metric)), spd.inverse(metric)
+    flux, across = root[..., None, None] * inverse, np.swapaxes(inverse, -1, -2)
+    if x is None:
+        return integrals(flux, root)
+    if y is None:
+        change = inside(np.asarray(x[0]).reshape(-1, d, d))
+        half = np.sum(across * change, axis=(-2, -1)) / 2
+        return integrals(half[..., None, None] * flux - flux @ change @ inverse, root * half)
+    stiffness, mass = np.where(coupled, y[0], 0), np.where(coupled, y[1], 0) + y[2] + y[3]
+    of_flux, of_root = (
+        each.ravel()[places].reshape(-1, n * n) @ table.T
+        for each, table in ((stiffness, of_stiffness), (mass, of_mass))
+    )
+    of_flux = of_flux.reshape(metric.shape)
+    half = (np.sum(flux * of_flux, axis=(-2, -1)) + root * of_root) / 2
+    of_metric = half[..., None, None] * across - root[..., None, None] * across @ of_flux @ across
+    of_corners = np.matmul(h.T, of_metric.reshape(-1, n, d * d)).reshape(-1, d * d)
+    sums = [np.bincount(cells.ravel(), each, domain.size) for each in of_corners.T]
+    return [(np.stack(sums, axis=-1).reshape(-1, d, d) * known).astype(dtype).reshape(tensors.shape)]
+
+
+@jit_quickly(static_argnames=("periodic", "interpolation", "operator"), on_host=_on_host)
 def _grid_integrals(
     tensors: Float[Array, "*shape d d"],
     domain: Bool[np.ndarray | Array, "*shape"],

@@ -16,7 +16,7 @@ from hks_jax.fem.space import FunctionSpace, MeshSpace, VectorSpace
 from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
 from hks_jax.linear.pattern import SparsePattern
 from hks_jax.linear.pencil import NullSpace, SymmetricPencil
-from hks_jax.traced import is_traced
+from hks_jax.traced import is_staged
 
 
 class Pencil(SymmetricPencil):
@@ -203,13 +203,13 @@ def _least(potential: Field, space: FunctionSpace, operator: WeakForm) -> Float[
 
 def _constants(space: FunctionSpace, values: Array) -> NullSpace:
     """Return what every stiffness of a Laplace–Beltrami operator annihilates: constants on natural components."""
-    n_null, labels, numbers = space.n_null, space.null_labels, jnp if is_traced(values) else np
+    n_null, labels, numbers = space.n_null, space.null_labels, jnp if is_staged() else np
     if n_null == 0 or (n_null == 1 and (labels == 0).all()):
         vectors = numbers.ones((n_null, space.n_dof), values.dtype)
     else:
         number = numbers.arange(n_null, dtype=np.int32)[:, None]
         vectors = (numbers.asarray(labels, np.int32) == number).astype(values.dtype)
-    return NullSpace(jnp.asarray(vectors), fixed=True)
+    return NullSpace(jnp.asarray(vectors) if is_staged() else jax.device_put(vectors), fixed=True)
 
 
 def gathered(space: MeshSpace | VectorSpace, matrices: Float[Array, "E m m"]) -> SparseOperator:

@@ -15,7 +15,7 @@ from hks_jax.domain.components import active_elements, element_nodes, label_node
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
-from hks_jax.traced import is_traced
+from hks_jax.traced import is_staged, is_traced
 
 _COPIED = 1 << 22
 """Numbers that NumPy copies in less time than it takes to compile that."""
@@ -288,7 +288,7 @@ def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
 
 def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray | Array, "*shape"]:
     """Return a mask for a computation with some values."""
-    axes = _box(mask) if is_traced(values) else None
+    axes = _box(mask) if is_traced(values) and is_staged() else None
     return mask if axes is None else _outer([axis[None] for axis in axes])[0]
 
 
@@ -297,7 +297,7 @@ def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "of
 
     None where these are traced and all nodes of the domain are free, so that nothing is to be eliminated.
     """
-    if not is_traced(values):
+    if not (is_traced(values) and is_staged()):
         return free_couplings(space)
     if (space.free == space.domain).all():
         return None

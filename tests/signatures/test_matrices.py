@@ -151,14 +151,13 @@ def test_potentials_from_every_solver(rng):
     np.testing.assert_allclose(K, np.asarray(pencil.stiffness.to_dense()) + np.diag(V), rtol=1e-13)
     exact = scipy.linalg.eigvalsh(K, M)[:8]
     assert exact[0] < 0
-    for solver in ("auto", "dense", "block-lanczos"):
+    for solver in ("auto", "dense", "shift-invert", "block-lanczos"):
         pairs = hj.eigenpairs(moved, 8, solver=solver)
         np.testing.assert_allclose(pairs.eigenvalues, exact, rtol=1e-9)
         assert pairs.converged.all()
         assert pairs.complete_below >= pairs.eigenvalues[-1]
-    for solver in ("shift-invert", "chebyshev-filter"):
-        with pytest.raises(ValueError, match=f"solver: '{solver}' needs a stiffness that is positive semidefinite"):
-            hj.eigenpairs(moved, 8, solver=solver)
+    with pytest.raises(ValueError, match="solver: 'chebyshev-filter' needs a stiffness that is positive semidefinite"):
+        hj.eigenpairs(moved, 8, solver="chebyshev-filter")
     with pytest.raises(ValueError, match=r"null_vectors: the stiffness does not annihilate vector 0: .*with_stiffness"):
         hj.eigenpairs(eqx.tree_at(lambda p: p.stiffness, pencil, moved.stiffness), 8)
 
