@@ -46,7 +46,7 @@ class Point(eqx.Module):
         """Return a field at this point."""
         if name not in self.fields:
             there = ", ".join(map(repr, self.fields)) or "none"
-            raise ValueError(f"fields: a form reads {name!r}; got only {there}. Pass fields={{{name!r}: …}}")
+            raise ValueError(f"fields: a form reads {name!r}; the fields are {there}. Pass fields={{{name!r}: …}}")
         return self.fields[name]
 
 

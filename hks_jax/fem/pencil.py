@@ -69,7 +69,7 @@ class Pencil(SymmetricPencil):
         return functions if self.row_sums is None else _read(self.mass, self.row_sums, functions)
 
     def integrals(self, values: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
-        """Return the weights w of ∫φu = w·φ, where φ has the nodal values from `read`, and u has the nodal ``values``."""
+        """Return the weights w of ∫φu = w·φ, where φ has nodal values from `read`, and u has the nodal ``values``."""
         if self.row_sums is None:
             return self.mass.apply(values)
         return jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums) * values

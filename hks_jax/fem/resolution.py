@@ -30,7 +30,7 @@ class SampledMetric(eqx.Module):
 
 
 class Resolution(eqx.Module):
-    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`); derivatives treat it as constant.
+    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`), without derivatives.
 
     Attributes:
         mesh_width: (*shape) the local distance between neighbouring nodes in the units of the metric.

@@ -227,8 +227,8 @@ def _of_bcoo(name: str, matrix: BCOO) -> _Entries:
     _check_square(name, matrix.shape)
     if is_traced(matrix.indices):
         raise ValueError(
-            f"{name}: its indices are traced; expected a known pattern. Make the array of indices outside jax.jit and the "
-            "matrix from it inside, or make the pencil outside with `sparse_pencil` and pass it"
+            f"{name}: its indices are traced; expected a known pattern. Make the array of indices outside jax.jit and "
+            "the matrix from it inside, or make the pencil outside with `sparse_pencil` and pass it"
         )
     rows, cols = np.asarray(matrix.indices).T
     valid = (rows < matrix.shape[0]) & (cols < matrix.shape[1])  # other indices are padding
@@ -262,7 +262,7 @@ def _pattern(n: int, *matrices: _Entries) -> SparsePattern:
 
 
 def _operator(pattern: SparsePattern, matrix: _Entries) -> SparseOperator:
-    """Return the symmetric part of a matrix: half of each entry is added at its place, and half at the transposed one."""
+    """Return the symmetric part of a matrix: half of each entry is added at its place, and half at the mirrored one."""
     n = pattern.size
     places = pattern.rows.astype(np.int64) * n + pattern.cols
     rows, cols = matrix.rows.astype(np.int64), matrix.cols.astype(np.int64)

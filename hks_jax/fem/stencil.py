@@ -112,7 +112,7 @@ class Stencil(eqx.Module):
 
     Attributes:
         coefficients: (3^d, *shape), with the offsets o in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i)
-            couples node i to node i + o. Or (1, *shape), a diagonal. Couplings across a side that is not periodic are 0.
+            couples node i to node i + o. Or (1, *shape), a diagonal. Couplings across non-periodic sides are 0.
         periodic: for each axis, whether node n is node 0; static.
         slabs: the cut of the grid, if this is one device's slab inside `shard_map`; static.
     """
