@@ -9,7 +9,6 @@ _CENTRE = 12
 
 
 def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
-    """Return the vertices of an icosahedron in the unit sphere, and its faces."""
     golden = (1 + np.sqrt(5)) / 2
     one = [(0, a, b * golden) for a, b in product((-1, 1), repeat=2)]
     vertices = np.array([np.roll(v, turn) for turn in range(3) for v in one], dtype=float)

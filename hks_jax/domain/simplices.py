@@ -158,11 +158,10 @@ def check_metric(metric: Float[np.ndarray, "n d d"], vertices: Float[np.ndarray,
     longest = max(np.linalg.norm(a - b) for a, b in combinations(corners, 2))
     height = np.abs(signed_measure(vertices, cells[first : first + 1])[0][0]) / longest ** (cells.shape[1] - 1)
     raise ValueError(
-        f"{words.argument}: {int(thin.sum())} of {len(cells)} {words.simplices} are so thin that their metric "
-        f"lost to rounding in {metric.dtype} (the first is {words.one} {first}, vertices {cells[first].tolist()}, "
-        f"{height:.1e} high if its longest edge is 1); move vertices"
-        + ", or use float64"
-        * (metric.dtype != np.float64)
+        f"{words.argument}: {int(thin.sum())} of {len(cells)} {words.simplices} are so thin that their metric is lost "
+        f"to rounding in {metric.dtype} (the first is {words.one} {first}, vertices {cells[first].tolist()}, with a "
+        f"height of {height:.1e} if its longest edge is 1); merge or move their vertices"
+        f"{', or use float64' * (metric.dtype != np.float64)}"
     )
 
 

@@ -165,7 +165,6 @@ def _checked_operator(
     density: Any,
     fields: Mapping[str, Any] | None,
 ) -> tuple[WeakForm, dict[str, Any]]:
-    """Return the weak forms to assemble, and the fields that are given for them."""
     if mass not in ("consistent", "lumped") and not callable(mass):
         raise ValueError(f'mass: got {mass!r}; expected "consistent", "lumped" or a form')
     if stiffness is not None and not callable(stiffness):

@@ -48,7 +48,6 @@ class GridPattern(ByKey, Pattern):
 
 @lru_cache(maxsize=16)
 def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the index into the coefficients, the row and the column of each coupling between free nodes."""
     own = space.degrees_of_freedom.reshape(space.node_shape).astype(np.int32)
     rimmed = own
     for axis, wraps in enumerate(space.periodic):
