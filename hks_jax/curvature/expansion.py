@@ -41,28 +41,28 @@ def hks_expansion(
 
         k_t(x, x) ≈ (1 + u₁t + u₂t² + u₃t³)/(4πt)^(d/2).
 
-    On a surface with the Gaussian curvature K and ∇² = div grad (Polterovich 2000; McKean and Singer 1967 up to u₂),
+    On a surface with the Gaussian curvature K, where ∇² = div grad, the coefficients are (Polterovich 2000)
 
         u₁ = K/3,   u₂ = (K² + ∇²K)/15,   u₃ = 4K³/315 + 2|∇K|²/105 + K∇²K/30 + ∇⁴K/140.
 
-    In three dimensions, up to u₂, with the Ricci tensor Ric and the scalar curvature R,
+    In three dimensions, with the Ricci tensor Ric and the scalar curvature R, the coefficients up to u₂ are
 
         u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120.
 
-    This u₂ is McKean and Singer's (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, since |Riem|² = 4|Ric|² − R². The expansion
-    ignores the boundary: it holds at distances from it that are well above 3√t.
+    These are the coefficients of McKean and Singer (1967), u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, by
+    |Riem|² = 4|Ric|² − R². The expansion ignores the boundary: it holds at distances from it well above 3√t.
 
-    If the field was made from a function, the coefficients are exact, by JAX derivatives. Otherwise they use finite
-    differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask. There u₂ is of
-    fourth order and u₃ of second order in the spacing h, measured as a length. The relative rounding error of u₃ is
-    about ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim. In float32 keep t below 30 h², or
-    the order below 3.
+    If the field was made from a function, the coefficients are exact, from JAX derivatives. Otherwise they are from
+    finite differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask. There u₂ is
+    of fourth order and u₃ of second order in the spacing h, measured as a length. For the machine precision ε, the
+    relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim.
+    In float32 keep t below 30 h², or the order below 3.
 
     Args:
         field: the metric, d = 2 or 3.
         times: (n_times,) positive times, in length².
-        order: the highest power of t in the bracket, 0 … 3 on a surface, 0 … 2 in three dimensions; None: the highest.
-        periodic: whether the axes are periodic, one value for all or one per axis.
+        order: the highest power of t in brackets, 0 … 3 on a surface, 0 … 2 in three dimensions; None is the highest.
+        periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Returns:
         The expansion (n_times, *shape) in 1/lengthᵈ; NaN outside the mask, and where no stencil fits into the mask.

@@ -29,8 +29,8 @@ from hks_jax.domain.tensor_field import TensorField
 def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the scalar curvature R of a metric at the nodes; on a surface R = 2K for the Gaussian curvature K.
 
-    If the field was made from a function, R is exact, by JAX derivatives. Otherwise it uses finite differences of sixth
-    order of the nodal tensors (see `gaussian_curvature`).
+    If the field was made from a function, R is exact, from JAX derivatives. Otherwise it is from finite differences of
+    sixth order of the nodal tensors (see `gaussian_curvature`).
 
     Args:
         field: the metric, d = 2 or 3.
@@ -49,8 +49,8 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
 def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
 
-    If the field was made from a function, K is exact, by JAX derivatives. Otherwise it uses finite differences of sixth
-    order of the nodal tensors, which are one-sided near the edges of the grid and the mask.
+    If the field was made from a function, K is exact, from JAX derivatives. Otherwise it is from finite differences of
+    sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask.
 
     Args:
         field: the metric, d = 2.
@@ -146,7 +146,7 @@ def laplace_beltrami(
     f: Float[Array, "*shape"] | Callable[[Array], Array],
     periodic: bool | Sequence[bool] = False,
 ) -> Float[Array, "*shape"]:
-    """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes: the −Δf of geometers, negative at a peak.
+    """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes, negative at a peak of f (geometers' −Δf).
 
     Derivatives of functions, be it the metric or `f`, are exact. Derivatives of nodal values are finite differences of
     sixth order (see `gaussian_curvature`).

@@ -23,8 +23,8 @@ MINIMUM_NODES = 8
 def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the stencils of sixth order for the derivative of the given order, 1 or 2, in order of preference.
 
-    They are offsets (n, 8) and weights (n, 8) for unit spacing; shorter stencils are padded with offset 0 and weight 0.
-    For the second derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.
+    A stencil is a row of the offsets (n, 8) and the weights (n, 8) for unit spacing, padded with zeros. For the second
+    derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.
     """
     width = 6 + order
     centred = np.arange(-3, 4)

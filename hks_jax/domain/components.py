@@ -39,7 +39,7 @@ def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarra
 
 
 def rim_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes on the rim of a mask: nodes of the domain with an adjacent element of the grid outside it."""
+    """Mark the nodes on the rim of a mask: nodes of the domain with an adjacent grid element outside the domain."""
     count = np.zeros([n + (not wraps) for n, wraps in zip(elements.shape, periodic, strict=True)], dtype=int)
     beside = elements
     for axis, wraps in enumerate(periodic):

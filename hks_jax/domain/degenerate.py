@@ -27,7 +27,7 @@ class DegeneratePoints(NamedTuple):
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     """Find the points of a 2D field where the eigenvalues are equal, with their index.
 
-    At these points the vector (T₁₁ − T₂₂, 2T₁₂) vanishes, which turns twice as fast as the eigenvectors. It is
+    At these points the vector (T₁₁ − T₂₂, 2T₁₂) vanishes. It turns twice as fast as the eigenvectors, and is
     interpolated bilinearly. A cell around which it turns has one zero with the index ±½, a wedge or a trisector. Nearby
     zeros are merged into one point with the sum of their indices (Tricoche, Scheuermann and Hagen 2001).
 

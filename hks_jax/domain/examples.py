@@ -77,8 +77,8 @@ def ball_mesh(n: int) -> TetMesh:
     Layer j has the 10j² + 2 vertices of `sphere_mesh` on the sphere of radius j/n; for n = 24 the ball has 49 049
     vertices. Dihedral angles are between 36° and 130°.
 
-    Let jₗ be the spherical Bessel functions. With Neumann conditions the eigenvalues of the ball are 0 and the squares
-    of the positive zeros of jₗ'; with Dirichlet conditions, of jₗ. Each has the multiplicity 2l + 1.
+    Let jₗ be the spherical Bessel functions. With Dirichlet conditions the eigenvalues of the ball are the squares of
+    the positive zeros of jₗ; with Neumann conditions they are 0 and those of jₗ'. Each has the multiplicity 2l + 1.
     """
     require_count("n", n)
     return TetMesh(*geodesic(n, 3))
@@ -153,7 +153,7 @@ def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, 
     """Return fields of constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
 
     All fields have the same constant trace, determinant and anisotropy; only the directions differ. The centre of the
-    circles and spirals is (−0.3, −0.3), outside of the square. These and the straight field are flat, the others not.
+    circles and spirals is (−0.3, −0.3), outside the square. These and the straight field are flat, the others are not.
     """
 
     def polar(u: Point) -> Array:

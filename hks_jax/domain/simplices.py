@@ -11,9 +11,9 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
-"""The area (volume), relative to the square (cube) over the longest edge, up to which a simplex is degenerate."""
+"""A simplex is degenerate up to this area (volume), relative to the square (cube) over its longest edge."""
 _ON_EDGE = 1e-6
-"""The distance of a vertex from an edge, relative to the edge's length, up to which the vertex is on the edge."""
+"""A vertex is on an edge up to this distance from the edge, relative to the edge's length."""
 
 
 class Words(NamedTuple):
@@ -62,7 +62,7 @@ def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> 
 def checked_mask(
     mask: Any, cells: Int[np.ndarray, "n corners"], n_vertices: int, dimension: int
 ) -> Bool[np.ndarray, " n"]:
-    """Return the simplices that are inside a mask of simplices, or all of whose vertices are inside one of vertices.
+    """Return the simplices inside a mask of simplices, or the simplices with all vertices inside a mask of vertices.
 
     Raises:
         ValueError: another shape; values other than 0 and 1; a mask that may be either; a mask without a simplex.

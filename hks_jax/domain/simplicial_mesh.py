@@ -62,9 +62,9 @@ class SimplicialMesh(eqx.Module):
         default (see `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``,
         g = |D| D⁻¹. On a surface D stands for its tangential part. If D is the identity, g is the metric of space.
 
-        If tensors are at the vertices, a cell takes the mean of its own, or with ``"log-euclidean"`` the exponential of
-        the mean of their logarithms. This is the interpolant at the centre, with an error of second order like that of
-        the elements. The metric is differentiable with respect to tensors and vertices.
+        With tensors at the vertices, a cell takes the mean of the tensors at its vertices, or with ``"log-euclidean"``
+        the exponential of the mean of their logarithms. This is the interpolant at the centre, with an error of second
+        order like that of the elements. The metric is differentiable with respect to tensors and vertices.
 
         Args:
             vertices: positions (V, 3).

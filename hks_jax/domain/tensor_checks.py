@@ -20,7 +20,7 @@ MANY = 0.05
 
 
 def check_metric_choice(metric: str | None) -> None:
-    """Raise ValueError unless it is the name of a metric that diffusion tensors can define."""
+    """Raise ValueError unless ``metric`` names one of the metrics that diffusion tensors can define."""
     if metric not in ("tensor", "inverse", "adjugate"):
         raise ValueError(
             f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, the distances of diffusion), '
@@ -122,15 +122,15 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
-        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # others fail with the metric
+        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # the check of the metric finds others
         determinants = np.linalg.det(np.where(finite[..., None, None], known, np.eye(d)))
         bad = finite & (determinants <= 0)
         if bad.any():
             first = tuple(int(i) for i in np.argwhere(bad)[0])
             raise ValueError(
                 f"{name}: {int(bad.sum())} of {int(grid.inside.sum())} gradients have a determinant that is not "
-                f"positive (the first at node {first}, {determinants[first]:.3g}); expected deformations that keep "
-                f"the orientation. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
+                f"positive (the first at node {first}, {determinants[first]:.3g}); expected deformations that preserve "
+                f"orientation. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
             )
     inside = grid.inside[..., None, None]
     safe = jnp.where(inside, gradients, jnp.eye(m, d, dtype=gradients.dtype))

@@ -113,7 +113,7 @@ class TensorField(eqx.Module):
         """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
 
         ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, where y is the position to which the point x moves, or would move without
-        constraints. Lengths are those after the deformation. Rotations of F change nothing, even if they vary.
+        constraints. Lengths are those after the deformation. Rotations after F do not change the metric.
 
         If F is the gradient of a map, the metric is flat, and the signature is that of the deformed body. For growth,
         plastic or elastic strain, the curvature of C is the incompatibility, or residual strain. See docs/strain.md.

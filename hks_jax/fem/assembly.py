@@ -47,8 +47,9 @@ def assemble(
     multilinearly. On meshes the elements are P1 or P2, and T is constant on each triangle or tetrahedron.
 
     A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
-    trace. An array over the nodes is interpolated. An array over the elements has n − 1 entries along each axis of a
-    grid (n if the axis is periodic), or an entry for each cell of a mesh. An array that fits both is taken as nodal.
+    trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries
+    along each axis of a grid (n if the axis is periodic), or an entry for each cell of a mesh. An array that fits both
+    is taken as nodal.
 
     Args:
         domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
@@ -57,7 +58,7 @@ def assemble(
             ``"mean"`` (two copies of the domain are glued along the whole rim). On grids give one name for all axes, or
             one entry per axis, which may be a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"``. The
             rim of a mask is natural, except under ``"mean"`` and ``"dirichlet-rim"``, which act on the rim and on all
-            sides. A further entry after those of the axes also sets its condition: ``("periodic", "periodic",
+            sides. It has its own condition in a further entry after those of the axes: ``("periodic", "periodic",
             "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
         mass: ``"consistent"``, ``"lumped"`` (the diagonal matrix of row sums), or your own form.
         potential: a field V of either sign; the operator becomes −Δ + V.
@@ -99,7 +100,7 @@ def assemble(
     if quadrature == "cancelling":
         for what, is_given in (
             ("a mesh, for which no such points are known", isinstance(domain, SimplicialMesh)),
-            ("a lumped mass, whose error cancels for no points", operator.lumped),
+            ("a lumped mass, for which no such points exist", operator.lumped),
             ("your own form, whose error is not known", operator.own),
         ):
             if is_given:
@@ -127,7 +128,7 @@ def assemble(
         pencils = [assemble_mesh(domain, nodes, held, each, operator, curved) for each in spaces]
         if curved and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
             raise ValueError(
-                "midpoints: got positions that fold or invert cells; move them nearer to those of straight edges"
+                "midpoints: got positions that fold or invert cells; move them closer to the straight edges"
             )
         return _joined(pencils, operator)
     if not isinstance(domain, TensorField):
@@ -138,7 +139,7 @@ def assemble(
         raise ValueError(f"degree, midpoints: got degree {degree!r} for a grid; leave both out, as elements are Q1")
     sides = normalise_boundary(boundary, domain.grid.dimension)
     if components > 1 and any("mirror" in pair for pair in sides):
-        raise ValueError('boundary: got "mirror" with components, which a mirror would reflect; use "periodic"')
+        raise ValueError('boundary: got "mirror" with components; it is for scalar functions only. Use another')
     problems = doubled_problems(sides)
     spaces = [grid_space(domain.grid, problem) for problem in problems]
     space, held = spaces[0], {}
@@ -151,7 +152,7 @@ def assemble(
         where = (
             'acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "dirichlet-rim"'
             if sides[-1] == ("neumann", "neumann")
-            else "acts nowhere: there is no mask, and so no rim"
+            else "acts nowhere: there is no mask, and so no rim. Leave it out"
         )
         warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
     return _joined(pencils, operator)

@@ -20,7 +20,7 @@ BoundarySpec: TypeAlias = str | tuple[str | Sides, ...]
 _SIDE_BY_SIDE = ("neumann", "dirichlet", "mean")
 _CONDITIONS = (*_SIDE_BY_SIDE, "periodic", "mirror")
 _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
-"""The names that, given alone, also set the condition on the rim of a mask, with this condition."""
+"""The condition on the rim of a mask that each of these names sets, if it is given alone."""
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
@@ -66,7 +66,7 @@ def _pair(entry: str | Sides) -> Sides:
         alone = ', or "dirichlet-rim" alone, which is for all sides and the rim of a mask'
         raise ValueError(f"boundary: got {unknown[0]!r}; expected one of {known}{alone}")
     if low != high and not {low, high} <= set(_SIDE_BY_SIDE):
-        raise ValueError(f'boundary: got {entry!r} for one axis; expected "periodic" or "mirror" on both sides')
+        raise ValueError(f'boundary: got {entry!r} for one axis; "periodic" and "mirror" must be on both sides')
     return low, high
 
 
@@ -85,7 +85,7 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     elements = active_elements(inside, every_axis)
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
     if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet problem eliminates the grid's sides, too
-        return "neumann", "the mask is so thin that all of its voxels are on the rim, and the mean needs others"
+        return "neumann", "the mask is so thin that all of its voxels are on the rim, and the mean needs voxels off it"
     return "mean", 'the domain has a mask; pass boundary="neumann" for a natural rim'
 
 
@@ -103,7 +103,7 @@ def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) 
 
 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
-    """Return the problems whose spectra together are that of the domain doubled by ``"mirror"`` or ``"mean"``.
+    """Return the problems whose spectra together form that of the domain doubled by ``"mirror"`` or ``"mean"``.
 
     Functions on the doubled, periodic axis are even or odd about both mirrors. Even functions satisfy the Neumann
     condition there, and odd functions vanish. So a mirror axis gives a Neumann and a Dirichlet problem, and m mirror

@@ -126,7 +126,7 @@ class _State(eqx.Module):
     """A factorised operator.
 
     Attributes:
-        factor: the factorisation of A if A is real, otherwise of the real symmetric matrix of its two parts.
+        factor: the factorisation of A or, if A is complex, of the real symmetric matrix of its real and imaginary part.
         hermitian: whether a complex A is Hermitian and not symmetric; None if A is real.
         conjugate: whether the state stands for the conjugate of A.
     """
@@ -167,7 +167,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         definite = lx.is_positive_semidefinite(operator) or lx.is_negative_semidefinite(operator)
         if not (lx.is_symmetric(operator) or definite):
             raise ValueError(
-                "operator: got one that is not known to be symmetric or Hermitian; add a tag, such as "
+                "operator: it is not known to be symmetric or Hermitian; if it is, add a tag, such as "
                 "`lineax.TaggedLinearOperator(operator, lineax.symmetric_tag)`, or use `lineax.LU`"
             )
         if not jnp.issubdtype(jnp.result_type(*jax.tree.leaves(operator.in_structure())), jnp.complexfloating):
@@ -178,7 +178,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         return _State(factorised(_full(jnp.block([[real, -imaginary], below])), "operator"), hermitian)
 
     def compute(self, state: _State, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        """Solve with a factorised operator; the result is NaN, an error of lineax, if the operator is singular."""
+        """Solve with a factorised operator; for a singular operator it is NaN, which lineax reports as singular."""
         flat, unflatten = ravel_pytree(vector)
         return unflatten(state.solve(flat)), lx.RESULTS.successful, {}
 

@@ -84,7 +84,7 @@ def checked_field(
 def _placed(
     name: str, given: Any, space: FunctionSpace, positions: Callable[[], Float[Array, "*elements q m"]]
 ) -> tuple[Array, Place, Bool[np.ndarray, "..."] | None]:
-    """Return the values of a field, the kind of places that have them, and which of these are in the domain."""
+    """Return the values of a field, the kind of places that have them, and which places are in the domain."""
     nodes, elements = space.node_shape, space.elements
     if callable(given):
         x = positions()

@@ -1,7 +1,7 @@
 """Weak forms, the integrands of stiffness and mass, and their integrals over one element.
 
-A form is a function of two shape functions u and v and of a point w, which is bilinear and symmetric in u and v. It is
-written as in scikit-fem, and integrated over the domain with the volume element √|T| dx.
+A form is a function of two shape functions u and v and of a point w. It is bilinear and symmetric in u and v, written
+as in scikit-fem, and integrated over the domain with the volume element √|T| dx.
 """
 
 from collections.abc import Callable, Mapping
@@ -102,7 +102,7 @@ def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
     return ShapeFunction(value.reshape(q, n, components), grad.reshape(q, n, components, -1))
 
 
-# A form is linear in u, so that form(u, v, w) is the inner product of flux(v) and the value and gradient of u. The
+# A form is linear in u, so that form(u, v, w) is the inner product of flux(v) with the value and gradient of u. The
 # transpose of the form gives the flux; for T⁻¹∇u·∇v it is T⁻¹∇v. So n evaluations suffice for n² pairs.
 def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, points: Point) -> Float[Array, "n n"]:
     """Integrate a form over one element, for all pairs of n shape functions: value (q, n, *c), grad (q, n, *c, d).
@@ -132,7 +132,7 @@ def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, 
 
 
 def _reads(form: Form, functions: ShapeFunction, w: Point) -> tuple[bool, ...]:
-    """Return whether a form depends on the value of u, and on its gradient; `integrate` skips the other."""
+    """Return whether a form depends on the value of u, and whether it depends on the gradient of u."""
     u = jax.tree.map(lambda leaf: leaf[0], functions)
     traced = jax.make_jaxpr(lambda *leaves: form(ShapeFunction(*leaves), u, w))(*u)
     if [(result.shape, result.dtype) for result in traced.out_avals] != [((), u.value.dtype)]:

@@ -1,4 +1,4 @@
-"""Stiffness and mass on grids: the integrals of one element are mapped over all elements, and form stencils."""
+"""Stiffness and mass on grids: the integrals over all elements, which are assembled into stencils."""
 
 from dataclasses import replace
 from functools import partial

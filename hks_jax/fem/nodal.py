@@ -73,7 +73,7 @@ class NodalPencil(eqx.Module):
 
         return both
 
-    # P is p(D⁻¹M)D⁻¹ with a fixed polynomial p, and so linear and symmetric. On the spectrum [low, 1] of D⁻¹M it has
+    # P is p(D⁻¹M)D⁻¹ with a fixed polynomial p, and so linear and symmetric. On the spectrum [low, 1] of D⁻¹M,
     # |1 − μ p(μ)| ≤ 1/T_m(σ), where σ = (1 + low)/(1 − low). The upper end is 1 by Gershgorin's theorem, since the
     # entries of M are not negative.
     def mass_solve(

@@ -111,7 +111,7 @@ class MirrorPencil(eqx.Module):
     the restriction of an eigenfunction of the doubled domain to the original domain.
 
     Attributes:
-        parts: the mixed problems; the first has Neumann conditions everywhere.
+        parts: the mixed problems; the first has Neumann conditions wherever the domain is doubled.
         including: for each part, the earlier parts whose function space includes its own, and the part itself. By the
             min–max principle, eigenvalue i of a part is not less than eigenvalue i of a part that includes it. So a
             part that c parts include has at most the fraction 1/c of the lowest eigenvalues of all parts.

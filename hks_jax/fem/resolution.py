@@ -30,12 +30,12 @@ class SampledMetric(eqx.Module):
 
 
 class Resolution(eqx.Module):
-    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`), without derivatives.
+    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`); not differentiated.
 
     Attributes:
         mesh_width: (*shape) the local distance between neighbouring nodes in the units of the metric.
-        dispersion: (*shape) the number a in the bias (a/t)^order of constant tensors, in (metric length)².
-        turning: (*shape) the relative error of all eigenvalues because tensors rotate or stretch between neighbours.
+        dispersion: (*shape) the number a in the relative bias (a/t)^order for constant tensors, in (metric length)².
+        turning: (*shape) the relative error of every eigenvalue from tensors that rotate or stretch between neighbours.
         swelling: the relative error of the domain's area or volume.
         order: 2 if the leading error cancels, else 1.
     """
@@ -110,7 +110,7 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> 
 
 
 # The error of interpolation along axis a is −ξ(h − ξ)/2 times the second derivative, on average −h²/12 times it. The
-# relative error of the density √|T| is half the trace of T⁻¹ times the error of T. This trace has tr T⁻¹∂ₐ²T if T is
+# relative error of the density √|T| is half the trace of T⁻¹ times the error of T. This gives tr T⁻¹∂ₐ²T if T is
 # interpolated, and ∂ₐ²log|T| if its logarithm is interpolated.
 def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
     """Return the relative error of the domain's volume due to the interpolation between the nodes."""
@@ -160,7 +160,7 @@ def _of_grid(
 
 
 _BIAS = (0.03, 0.22)
-"""The constant c in the relative bias c·h²/t of P1 elements, with consistent and with lumped mass, for longest edges h.
+"""The constant c in the relative bias c·h²/t of P1 elements with consistent and lumped mass; h is the longest edge.
 
 The medians of c over the nodes of regular and perturbed meshes of squares, spheres, boxes and balls were 0.008 … 0.028
 and 0.03 … 0.14.

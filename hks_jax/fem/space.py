@@ -32,7 +32,7 @@ class FunctionSpace:
         boundary: the conditions (low, high) of each axis and, last, those on the rim of a mask; for a mesh one pair,
             such as ``(("neumann", "neumann"),)``.
         n_components: the number of connected components of the domain.
-        elements: which elements are in the domain, bool; a grid has n − 1 per axis, or n if periodic, a mesh its cells.
+        elements: the elements of the domain, bool: n − 1 along each axis of a grid (n if periodic), or all cells.
     """
 
     node_shape: tuple[int, ...]
@@ -137,7 +137,7 @@ def _by_numpy(values: Array) -> bool:
     return np.size(values) <= _COPIED and known_here(values)
 
 
-# The indices are passed as arrays, so that equally many indices share one compilation.
+# The indices are passed as arrays, so that sets of equally many indices share one compilation.
 @jax.jit
 def _taken(values: Float[Array, "... n"], indices: Int[np.ndarray | Array, " m"]) -> Float[Array, "... m"]:
     return values[..., indices]
@@ -155,7 +155,7 @@ def _spread_by_jax(
 class GridSpace(FunctionSpace):
     """The Q1 space on a grid with given boundary conditions, as `normalise_boundary` writes them.
 
-    Spacing and origin of the grid are not part of the space, so that they may change without a compilation.
+    Spacing and origin of the grid are not part of the space, so that they can change without recompilation.
 
     Attributes:
         inside: the nodes inside the mask, bool (*shape).
@@ -169,7 +169,7 @@ class GridSpace(FunctionSpace):
         *axes, rim = boundary
         self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)
         if any(wraps and n < 3 for wraps, n in zip(self.periodic, grid.shape, strict=True)):
-            raise ValueError(f"boundary: got shape {grid.shape} of the grid; a periodic axis needs at least 3 nodes")
+            raise ValueError(f'boundary: got "periodic" for shape {grid.shape}; a periodic axis needs at least 3 nodes')
         self.elements = active_elements(grid.inside, self.periodic)
         self.domain = element_nodes(self.elements, self.periodic)
         if not self.domain.any():
@@ -293,7 +293,7 @@ def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray |
 
 
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
-    """Mark the offsets and nodes of couplings with two free ends, for a computation with some values.
+    """Mark the offsets and nodes of couplings with two free ends, for a computation with ``values``.
 
     None where these are traced and all nodes of the domain are free, so that nothing is to be eliminated.
     """

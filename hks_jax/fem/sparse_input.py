@@ -77,7 +77,7 @@ def sparse_pencil(
     pencil = _pencil(K, M)
     n, dtype = pencil.size, pencil.stiffness.dtype
     if dimension not in (None, 2, 3):
-        raise ValueError(f"dimension: got {dimension!r}; expected 2 or 3, or None without a manifold")
+        raise ValueError(f"dimension: got {dimension!r}; expected 2 or 3, or None if there is no manifold")
     if shape is not None:
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
         if math.prod(shape) != n or min(shape) < 1:
@@ -120,11 +120,11 @@ def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[A
         sizes = np.linalg.svd(np.asarray(vectors) / np.where(lengths > 0, lengths, 1), compute_uv=False)
         if sizes[-1] < np.finfo(vectors.dtype).eps ** 0.25:
             raise ValueError(
-                f"null_vectors: got dependent vectors, with the least singular value {sizes[-1]:.2g} at length 1; "
+                f"null_vectors: got dependent vectors, whose least singular value is {sizes[-1]:.2g} at length 1; "
                 "expected a basis. Orthogonalise the vectors, and leave out zero vectors"
             )
     require_null_space(SymmetricPencil(pencil.stiffness, pencil.mass, null_space=NullSpace(vectors)))
-    # They are made orthonormal here, so that they can be made M-orthonormal up to rounding later.
+    # The vectors are made orthonormal, so that they can be made M-orthonormal up to rounding.
     return vectors if is_traced(vectors) else jnp.asarray(np.linalg.qr(np.asarray(vectors).T)[0].T)
 
 
@@ -163,7 +163,7 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
     for name, matrix in (("K", K), ("M", M)):
         if isinstance(matrix, LinearOperator):
             raise TypeError(
-                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full, to factorise it"
+                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full, as it is factorised"
             )
     if np.ndim(M) == 0 and isinstance(M, numbers.Number):
         raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If it is k, pass k={M}")
@@ -262,7 +262,7 @@ def _pattern(n: int, *matrices: _Entries) -> SparsePattern:
 
 
 def _operator(pattern: SparsePattern, matrix: _Entries) -> SparseOperator:
-    """Return the symmetric part of a matrix: half of each entry is added at its place, and half at the mirrored one."""
+    """Return the symmetric part of a matrix: half of each entry at its place, and half at the transposed place."""
     n = pattern.size
     places = pattern.rows.astype(np.int64) * n + pattern.cols
     rows, cols = matrix.rows.astype(np.int64), matrix.cols.astype(np.int64)

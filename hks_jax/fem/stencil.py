@@ -94,7 +94,7 @@ def _bisect(space: GridSpace) -> Parts:
         if d == 2:  # with an even number of lines, two cut lines leave equal halves, and so batches without padding
             even = (highest - lowest) % 2 == 1
             separates |= (beyond == -1) & even[q]
-        if depth == 0:  # a second cut, after which the parts are not periodic
+        if depth == 0:  # also cut at node 0, so that the parts are not periodic
             separates |= np.any(x[list(space.periodic)] == 0, axis=0)
         cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
         level[left[cutting]], part[left[cutting]] = depth, q[cutting]
@@ -111,7 +111,7 @@ class Stencil(eqx.Module):
 
     Attributes:
         coefficients: (3^d, *shape), with the offsets o in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i)
-            couples node i to node i + o. Or (1, *shape), a diagonal. Couplings across non-periodic sides are 0.
+            couples node i to node i + o. A diagonal is (1, *shape). Couplings across non-periodic sides are 0.
         periodic: for each axis, whether node n is node 0; static.
         slabs: the cut of the grid, if this is one device's slab inside `shard_map`; static.
     """
@@ -176,7 +176,7 @@ class Stencil(eqx.Module):
         return of_row
 
     def outer(self, p: Float[Array, "*shape b"], x: Float[Array, "*shape b"]) -> Float[Array, "offsets *shape"]:
-        """Return Σ_b p[i, b] x[i + o, b] for every offset o: the derivative of Σ_b pᵀCx by the coefficients of C."""
+        """Return Σ_b p[i, b] x[i + o, b] for every offset o: the derivative of Σ_b pᵀCx with respect to C."""
         shifts = [x] if self.is_diagonal else neighbours(with_rim(x, self.periodic), len(self.periodic))
         return jnp.stack([jnp.sum(p * shifted, axis=-1) for shifted in shifts])
 
