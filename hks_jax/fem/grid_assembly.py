@@ -1,4 +1,4 @@
-"""Stiffness and mass on grids: one element's integrals, mapped over all elements, as stencils."""
+"""Stiffness and mass on grids: the integrals over all elements, which are assembled into stencils."""
 
 from dataclasses import replace
 from functools import partial
@@ -29,9 +29,9 @@ _ON_HOST = 1 << 17
 
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
-    """Return the pencil of a field, of one problem of a doubled domain."""
-    # Masks, element and spacing go in as arrays, so that problems that differ only in them share one compilation. The
-    # element is made in double precision: its rounding would scale the whole metric.
+    """Return the pencil of a field, or of one problem of a doubled domain."""
+    # Masks, element and spacing are passed as arrays, so that problems that differ only in them share one compilation.
+    # The element is computed in double precision, since its rounding would scale the whole metric.
     tensors, spacing = field.tensors, field.grid.spacing
     element = tensor_product_element(space.dimension).stretched(spacing)
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
@@ -51,7 +51,7 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
-    """Return the positions of the quadrature points; those of an element that exists in place of those of others."""
+    """Return the positions of the quadrature points; elements outside the domain get those of one inside."""
     first = np.argwhere(space.elements)[0].astype(dtype)
     corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
     inner = tensor_product_element(space.dimension).values @ corners
@@ -142,13 +142,13 @@ def _grid_integrals(
 ) -> tuple[Array, Array, Array, Array]:
     """Return stiffness and mass as stencils, the row sums of the mass at all nodes, and the volume.
 
-    Of functions with several components the matrices of all elements in place of stencils.
+    If functions have several components, return the matrices of all elements in place of stencils.
     """
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 
-    # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them
-    # into everything that reads a component, and compute them again for each.
+    # Logarithms are computed at the nodes, and exponentials at the quadrature points. The barriers keep the compiler
+    # from fusing the exponentials into each use of a component, and so from repeating them.
     nodal = tensors if interpolation == "linear" else spd.log(tensors)
     metric = jax.vmap(lambda corners: at_quadrature(corners, element))(_at_corners(nodal, periodic))
     if interpolation == "log-euclidean":
@@ -176,7 +176,7 @@ def _grid_integrals(
     if operator.components > 1:
         return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
     stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
-    # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
+    # The sums include the couplings to eliminated nodes, because only all basis functions add up to one.
     lumped = volumes = jnp.sum(mass, axis=0)
     if "density" in fields:
         volumes = kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None])
@@ -187,7 +187,7 @@ def _grid_integrals(
 
 
 def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ...]) -> Float[Array, "E n ..."]:
-    """Gather what is at the nodes at the corners of every element."""
+    """Gather nodal values at the corners of every element."""
     d, rest = len(periodic), nodal.shape[len(periodic) :]
     nodes = jnp.pad(nodal, [*[(0, int(wraps)) for wraps in periodic], *[(0, 0)] * len(rest)], mode="wrap")
     corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
@@ -195,19 +195,19 @@ def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ..
 
 
 def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
-    """Add up element matrices into 3^d coefficients a node.
+    """Assemble element matrices into 3^d coefficients per node.
 
-    Local pair (a, b) of corners couples the element's node at corner a to the node at offset b − a.
+    Entry (a, b) of an element matrix couples the node at corner a to the node at offset b − a.
     """
     d = len(periodic)
     couplings = jnp.moveaxis(matrices, (-2, -1), (0, 1)).reshape(2**d, *(2,) * d, *matrices.shape[:d])
-    # For all corners b at once: one pad for each a, and not one for each pair, is half as long to compile in 3D.
+    # One pad for each a, with all corners b at once, compiles twice as fast in 3D as one for each pair.
     total = jnp.zeros((), matrices.dtype)
     for a, node in enumerate(product((0, 1), repeat=d)):
         total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
     total = total.reshape(3**d, *total.shape[d:])
     for axis, wraps in enumerate(periodic, start=1):
-        if wraps:  # the last node is the first again
+        if wraps:  # the last node is the first node
             inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
             last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
