@@ -86,7 +86,7 @@ def colouring(
 ) -> Colouring:
     """Choose spacing and degree from the error bound, for these arguments of `hks_spectrum_free`.
 
-    Needs concrete values.
+    Values must be concrete.
 
     Args:
         memory: the maximum size of the working vectors in bytes, which limits the number of vectors at once.
