@@ -51,13 +51,11 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
     lacking = {"mark", *(field.name for field in dataclasses.fields(Checkpoint))} - set(data)
     if lacking:
         names = ", ".join(sorted(lacking))
-        raise ValueError(
-            f"checkpoint: {path} lacks {names}; expected the file of a fit. Use another name, or remove the file"
-        )
+        raise ValueError(f"checkpoint: {path} is no file of a fit, it lacks {names}. Use another name, or remove it")
     if str(data["mark"]) != mark:
         raise ValueError(
             f"checkpoint: {path} belongs to another fit (another target, initial field or setting). Use another name, "
-            "or remove the file"
+            "or remove it"
         )
     history = [Step(*row) for row in data["history"].tolist()]
     start, stage, step_size = (data[name].item() for name in ("start", "stage", "step_size"))

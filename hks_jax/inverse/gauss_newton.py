@@ -87,11 +87,9 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
             `Search`.
         damping: the damping μ of the first step, relative to the scale of the data.
         growth: the divisor of μ after a step that reduces the misfit as much as its linearisation predicts.
-        inner_product: the inner product B, whose norm of the steps is damped.
-        inner_tolerance: the reduction of the linear residual in each step, 30 times smaller in steps that may be the
-            last.
-        inner_steps: the maximum number of products with JᵀJ in each step, three times larger in steps that may be the
-            last.
+        inner_product: the inner product B, in whose norm steps are damped.
+        inner_tolerance: the reduction of the linear residual in a step; 30 times smaller if it may be the last.
+        inner_steps: the maximum number of products with JᵀJ in a step; three times larger if it may be the last.
         preconditioner: the preconditioner of the conjugate gradients; B by default.
     """
 
@@ -211,7 +209,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     def terminate(
         self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        """Return whether the unknowns have converged, and the reason."""
+        """Return whether the unknowns have converged, and whether the last step is finite."""
         successful, not_finite = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
         return self._done(state.step_size, state.descent), optx.RESULTS.where(state.finite, successful, not_finite)
 

@@ -23,8 +23,8 @@ class Identifiability(eqx.Module):
     """The directions that noisy data determine near a solution, to first order.
 
     For independent residuals with standard deviation σ the information about the unknowns is JᵀJ/σ². With a prior of
-    standard deviation τ the data determine an eigenvector of JᵀJ with eigenvalue s² to the share s²/(s² + σ²/τ²). The
-    prior determines the rest. The prior is white, so it does not couple neighbours.
+    standard deviation τ the data determine the share s²/(s² + σ²/τ²) of an eigenvector of JᵀJ with eigenvalue s², and
+    the prior determines the rest. The prior is white, so it does not couple neighbours.
 
     Attributes:
         strengths: (n,) the largest eigenvalues s² of JᵀJ in descending order, for unit residual variance.
@@ -35,8 +35,7 @@ class Identifiability(eqx.Module):
             data determine.
         deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
             directions. To first order it is an upper bound on the exact one under a white prior, which means
-            independent unknowns with standard deviation τ. The deviation is smaller under a prior that couples
-            neighbours.
+            independent unknowns with standard deviation τ. A prior that couples neighbours reduces it.
         effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
         noise: the standard deviation σ of the residuals.
         prior: the standard deviation τ of the prior.

@@ -141,9 +141,7 @@ class MetricFit:
         """
         noise = self.noise if noise is None else noise
         if noise is None:
-            raise ValueError(
-                "noise: got None for a fit without noise; expected the standard deviation of the residuals"
-            )
+            raise ValueError("noise: got None for a fit without noise; expected the residuals' standard deviation")
         require_number("noise", noise)
         require_number("prior", prior)
         require_count("draws", draws)

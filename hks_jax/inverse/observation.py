@@ -63,9 +63,7 @@ class Data:
         if not callable(self.loss):
             named("loss", self.loss, LOSSES, "or a function of predicted and target values")
         elif self.deviation is not None:
-            raise ValueError(
-                "deviation: got a value with a function as loss; expected a named loss. Use weights and noise instead"
-            )
+            raise ValueError("deviation: got a value with a function as loss; use weights and noise instead")
         if self.noise is not None:
             require_number("noise", self.noise)
         for name in ("weights", "deviation"):
@@ -185,9 +183,7 @@ def _weights(values: np.ndarray, data: Data) -> tuple[np.ndarray, float | None]:
     """Return the weights, including factors from the deviation, and the mean deviation of a residual."""
     given = np.ones(values.shape) if data.weights is None else _broadcast("weights", data.weights, values.shape)
     if not (np.isfinite(given) & (given >= 0)).all():
-        raise ValueError(
-            "weights: got negative, infinite or NaN weights; expected numbers ≥ 0, where 0 means not observed"
-        )
+        raise ValueError("weights: got negative, infinite or NaN weights; expected numbers ≥ 0 (0: not observed)")
     if data.deviation is None:
         return given, data.noise
     size = _broadcast("deviation", data.deviation, values.shape)

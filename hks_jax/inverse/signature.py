@@ -112,7 +112,7 @@ def unknowns_of(pencil: AnyPencil) -> int:
 def _require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
     """Warn if more eigenpairs are needed than approximate those of the manifold; raise an error beyond twice as many.
 
-    The tolerance of twice as many lets a fit start from a metric of more volume, which needs more eigenpairs.
+    The margin exists because a fit must be able to start from a metric of more volume, which needs more eigenpairs.
     """
     most = _most_pairs(n_dof)
     if wanted <= most:

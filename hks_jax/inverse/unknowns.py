@@ -120,8 +120,7 @@ def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
 
 
 PARAMETRISATIONS = {
-    # The formulas are T = exp S, T = LLᵀ, T = e^u T₀, T = V diag(e^uᵢ λᵢ) Vᵀ with eigenvectors V of T₀, and T = R T₀
-    # Rᵀ.
+    # The tensors are exp S, LLᵀ, e^u T₀, V diag(e^uᵢ λᵢ) Vᵀ with the eigenvectors V of T₀, and R T₀ Rᵀ.
     "log-euclidean": Parametrisation(_logarithm, _exponential),
     "cholesky": Parametrisation(_cholesky, _from_cholesky),
     "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),
@@ -143,10 +142,7 @@ class Unknowns(eqx.Module):
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
         """Return the slopes of the values along the grid's edges for each axis; 0 if an end is outside the domain."""
-        raise ValueError(
-            "regularisers: got a penalty on slopes, which parameters of a function do not have; expected Prior or "
-            "LogDeterminant"
-        )
+        raise ValueError("regularisers: got slopes of a function's parameters; expected Prior or LogDeterminant")
 
 
 class Nodal(Unknowns):

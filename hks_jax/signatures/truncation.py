@@ -39,8 +39,8 @@ class Truncation(eqx.Module):
         lasting_bias: (n,) the part of this error that does not decrease with t, because tensors turn or stretch between
             nodes.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
-        smallest_time: the least time that the k pairs resolve to 1 % of the mean. The worst node then lacks up to 6 %,
-            or up to 20 % beside a Dirichlet side.
+        smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or up to 20 %
+            beside a Dirichlet side.
         order: the power of 1/t with which the rest of the discretisation error decreases.
     """
 
