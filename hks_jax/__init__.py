@@ -95,7 +95,7 @@ _LATER = dict.fromkeys(("fit_metric", "identifiability"), "hks_jax.inverse") | d
 
 def __getattr__(name: str) -> Any:
     # These modules (several devices, fits with lineax, files, figures) are imported on first use, because their import
-    # is slow and often not needed.
+    # is slow.
     if name in ("devices", "inverse", "io", "plot"):
         return importlib.import_module(f"hks_jax.{name}")
     if name in _LATER:

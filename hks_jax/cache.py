@@ -11,7 +11,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Let JAX store compiled programs in a folder, from which later processes read them instead of compiling again.
 
     Call this function once, before any computation. JAX has one such cache per process, so your own programs are stored
-    there as well. It is your setting, so importing the package does not change it. A folder that is already set by
+    there as well. Importing the package does not change this setting. A folder that is already set by
     ``jax_compilation_cache_dir`` or the environment is kept.
 
     Args:
@@ -31,7 +31,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if not os.access(path, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # By default JAX stores programs whose compilation takes a second or more. Reading a small program takes a tenth of
-    # the time of compiling it.
+    # By default JAX stores programs whose compilation takes a second or more. Reading is ten times as fast as
+    # compiling.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return path

@@ -20,8 +20,8 @@ from hks_jax.traced import is_traced
 def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
     """Apply a function to each entry of a batch, where every device processes its share sequentially.
 
-    The devices do not communicate. The result is differentiable if the function is. Calls with the same function object
-    do not compile again.
+    The devices do not communicate. The result is differentiable if the function is. The same function object is
+    compiled once.
 
     Args:
         function: a traceable function of one entry, such as ``lambda T: hj.hks(hj.eigenpairs(hj.TensorField(grid, T),
@@ -75,15 +75,15 @@ def heat_columns(
         columns: nodal values with the column as the last axis, ``slabs.split(...)``.
         times: (n_times,), nonnegative.
         tolerance: a bound on the truncation error of the expansion, relative to the columns, in the norm of D.
-        degree: the degree of the polynomial, by default the one that the tolerance needs. It is required if matrices or
-            times are traced.
+        degree: the degree of the polynomial, by default the one that the tolerance needs. It is required for traced
+            arrays.
 
     Returns:
         Values in the layout of the columns. ``slabs.join(result, 1)`` removes the padding.
 
     Raises:
-        ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if arrays are traced
-            without a degree.
+        ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if traced arrays lack a
+            degree.
     """
     slabs.check("stiffness", stiffness, 1)
     slabs.check("lumped", lumped, 0)

@@ -183,8 +183,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     ) -> tuple[Values, _Progress, Any]:
         """Accept or reject the trial, and choose the next; return the unknowns and the auxiliary output.
 
-        Choosing the next trial is most of the work. It is skipped if the option ``"enough"``, a function of the
-        auxiliary output, returns true.
+        Choosing the next trial is most of the work. It is skipped if the option ``"enough"``, a function of that
+        output, is true.
         """
         linearised, aux = _linearise(fn, state.trial, args)
         # Traces are compared by identity, so the trace of the state is used in all states.

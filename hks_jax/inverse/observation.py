@@ -46,8 +46,8 @@ class Data:
             follows from it. Correlations of the noise are ignored.
 
     Raises:
-        ValueError: if the signature or loss is unknown, if the noise is not positive, or if a deviation is given with a
-            function as loss.
+        ValueError: if the signature or loss is unknown, if the noise is not positive, or if a function as loss has a
+            deviation.
     """
 
     signature: str | Signature | Callable[[Eigenpairs], Array] = "hks"

@@ -40,7 +40,7 @@ class Search:
         max_steps: the maximum number of steps in each stage.
         continuation: the number of stages. The first fits only the largest times, the last fits all times.
         starts: the number of starts, first from the initial field and then from random smooth changes of it. The best
-            result is returned.
+            is returned.
         spread: the root mean square of the random changes, in the parameters' units.
         seed: the seed of the random changes.
 

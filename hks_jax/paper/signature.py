@@ -30,8 +30,8 @@ def signature(
 ) -> Float[np.ndarray, "n_times *shape"]:
     """Return the HKS from k eigenpairs at the given times."""
     with warnings.catch_warnings():
-        # These domains are symmetric, so k often cuts a multiple eigenvalue. At all times here exp(−λₖt) makes the last
-        # pairs negligible.
+        # These domains are symmetric, so k often cuts a multiple eigenvalue. The last pairs are negligible at all times
+        # here.
         warnings.filterwarnings("ignore", "k = .* cuts a multiple eigenvalue", AccuracyWarning)
         pairs = eigenpairs(domain, k, boundary)
     return np.asarray(hks(pairs, np.asarray(times), normalisation))

@@ -1,7 +1,6 @@
 """Violations of the triangle inequality by edge lengths in the metric, a remark of the paper.
 
-The paper makes this remark about discrete exterior calculus. The grid's cells are cut by their diagonals, and every
-edge has a length in the metric by one of the rules `LENGTHS`.
+The remark concerns discrete exterior calculus. Diagonals cut the grid's cells, and `LENGTHS` gives rules for lengths.
 """
 
 from collections.abc import Callable
@@ -63,8 +62,7 @@ def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
     violating = 2 * lengths.max(axis=1) > lengths.sum(axis=1)
     squared, half = lengths[~violating] ** 2, lengths[~violating].sum(axis=1, keepdims=True) / 2
     area = np.sqrt(half[:, 0] * np.prod(half - lengths[~violating], axis=1))
-    # A triangle contributes (b² cot B + c² cot C)/8 to the dual cell of its corner A, and cot A = (b² + c² −
-    # a²)/4·area.
+    # A triangle adds (b² cot B + c² cot C)/8 to the dual cell of its corner A, where cot A = (b² + c² − a²)/4·area.
     weighted = squared * (squared.sum(axis=1, keepdims=True) - 2 * squared) / (4 * area[:, None])
     cells = np.zeros(len(tensors))
     np.add.at(cells, faces[~violating], (weighted.sum(axis=1, keepdims=True) - weighted) / 8)

@@ -47,9 +47,7 @@ def lic_texture(
     """
     direction = DirectionField(field, which)
     if pixels < 2 or length < 1:
-        raise ValueError(
-            f"pixels, length: got {pixels}, {length}; expected at least 2 pixels and a length of at least 1"
-        )
+        raise ValueError(f"pixels, length: got {pixels}, {length}; expected at least 2 pixels and a length ≥ 1")
     x0, x1, y0, y1 = field.grid.extent
     side = max(x1 - x0, y1 - y0) / pixels
     shape = (max(2, round((x1 - x0) / side)), max(2, round((y1 - y0) / side)))
@@ -101,11 +99,9 @@ def line_integral_convolution(
         ax: the axes to draw on.
         field: a 2D field.
         which: ``"major"`` or ``"minor"``.
-        values: (*shape,) a scalar such as the HKS, drawn by `scalar_image`. None shades the present image of `ax`, or
-            grey.
+        values: (*shape,) a scalar such as the HKS, drawn by `scalar_image`; by default the image on `ax`, or grey.
         contrast: the maximum opacity of black and white, in (0, 1].
-        pixels: the texture's pixels along the longer side. The default is about 110 per inch of the axes, for a fixed
-            grain size on paper.
+        pixels: the texture's pixels along the longer side. The default is about 110 per inch of the axes.
         length: the same as for `lic_texture`.
         seed: the seed of the noise.
         **kwargs: arguments of `scalar_image` for `values`.
@@ -128,8 +124,7 @@ def line_integral_convolution(
     shift = contrast * (2 * texture.T - 1)
     shade = np.zeros((*shift.shape, 4))
     if ax.images:
-        # Black at opacity p multiplies a colour by 1 − p, and white at opacity p multiplies its distance to white by 1
-        # − p.
+        # Black at opacity p multiplies a colour by 1 − p. White multiplies the colour's distance to white by 1 − p.
         shade[..., :3] = (shift > 0)[..., None]
         shade[..., 3] = np.abs(shift)
     else:

@@ -101,9 +101,7 @@ def _nearest_nodes(points: np.ndarray, grid: Grid) -> list[tuple[int, ...]]:
     on_grid = np.all((index >= 0) & (index < grid.shape), axis=1)
     for point, node, on in zip(points, index, on_grid, strict=True):
         if not (on and grid.inside[tuple(node)]):
-            raise ValueError(
-                f"points: got {tuple(point.tolist())} outside the grid or its mask; expected points inside"
-            )
+            raise ValueError(f"points: got {tuple(point.tolist())} outside the grid or its mask; choose one inside")
     return [tuple(node) for node in index.tolist()]
 
 

@@ -32,8 +32,7 @@ def new_figure(width: float, height: float) -> Figure:
 def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) -> Path:
     """Write a figure to `path` atomically, in the format of the suffix, and return the path.
 
-    A temporary file is written and then moved to `path`, so no incomplete file is visible. Missing parent directories
-    are created.
+    A temporary file is written and then moved to `path`, so no incomplete file is visible. Missing parents are created.
 
     Raises:
         ValueError: if matplotlib cannot write the format of the suffix.
@@ -70,13 +69,13 @@ def require_plane(name: str, grid: Grid) -> None:
 
 
 def cell_extent(grid: Grid) -> tuple[float, float, float, float]:
-    """Return (x_min, x_max, y_min, y_max) of the nodes' cells, which extend half a spacing beyond the outermost nodes."""
+    """Return (x_min, x_max, y_min, y_max) of the nodes' cells, which extend half a spacing beyond the nodes."""
     (x0, x1, y0, y1), (hx, hy) = grid.extent, grid.spacing
     return x0 - hx / 2, x1 + hx / 2, y0 - hy / 2, y1 + hy / 2
 
 
 def panel_size(grid: Grid, side: float, steepest: float = 4.0) -> tuple[float, float]:
-    """Return an image's width and height: the longer is `side`, or more if their ratio would exceed `steepest`."""
+    """Return an image's width, `side` or less for tall images, and height. Their ratio is at most `steepest`."""
     x0, x1, y0, y1 = cell_extent(grid)
     aspect = min(max((y1 - y0) / (x1 - x0), 1 / steepest), steepest)
     width = side / max(1.0, aspect**0.5)

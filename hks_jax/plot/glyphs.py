@@ -37,15 +37,13 @@ def ellipses(
     Args:
         ax: the axes to draw on.
         field: the field; nodes outside its mask are omitted.
-        every: the step between drawn nodes, one number or one per axis; by default about 24 nodes along the longer
-            side, or fewer on small axes.
+        every: the step between drawn nodes, one number or one per axis; by default about 24 nodes on the longer side,
+            or fewer on small axes.
         kind: ``"metric"`` draws the unit circle {v : vᵀTv = const} of the metric, with half axes ∝ 1/√λ for the
             eigenvalues λ of T. ``"tensor"`` draws the image of a circle under T^(1/2), with half axes ∝ √λ, as is usual
             for diffusion tensors.
-        sizes: ``"common"`` uses one scale, so that sizes are comparable; ``"fit"`` makes each ellipse as large as its
-            cell.
-        color: ``"anisotropy"`` (λ₁ − λ₂)/(λ₁ + λ₂), ``"orientation"`` of the longer axis in degrees, or a colour's
-            name.
+        sizes: ``"common"`` uses one scale, so that sizes are comparable; ``"fit"`` fills each cell with its ellipse.
+        color: ``"anisotropy"`` (λ₁ − λ₂)/(λ₁ + λ₂), ``"orientation"`` of the longer axis in degrees, or a colour.
         cmap: the colour map, by default viridis for anisotropy and the cyclic twilight for orientation.
         fill: the relative size of the largest ellipse in its cell, at most 1.
         colorbar: whether to add a colour bar.
@@ -169,7 +167,7 @@ def sensitivity(
     if not np.isfinite(matrices).all():
         bad = int((~np.isfinite(matrices)).any(axis=(1, 2)).sum())
         raise ValueError(
-            f"gradient: got {bad} NaN or infinite tensors among {len(matrices)} drawn tensors; expected finite tensors"
+            f"gradient: got {bad} NaN or infinite tensors of {len(matrices)} drawn; expected finite tensors"
         )
     eigenvalues, vectors = np.linalg.eigh((matrices + np.swapaxes(matrices, 1, 2)) / 2)
     lengths = np.abs(eigenvalues) ** power

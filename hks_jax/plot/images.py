@@ -53,8 +53,7 @@ def scalar_image(
             prevents colours from showing rounding or discretisation errors of a constant.
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
-        orientation: the orientation of the grid in space, by which the image is turned. It then has space coordinates
-            and letters at its edges.
+        orientation: the orientation of the grid in space, which turns the image and adds space coordinates and letters.
         z: (*shape,) the distance of the values from a null value in standard deviations of noise
             (`hks_jax.Uncertainty.z`). Values below `FADED` fade to grey, which they reach at 0.
         **kwargs: arguments of `Axes.imshow`.

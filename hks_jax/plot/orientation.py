@@ -22,7 +22,7 @@ class Orientation(NamedTuple):
 
     The image does not depend on the storage order of the voxels. In the order left–right, back–front, foot–head its
     horizontal axis precedes its vertical axis, and letters at its edges name the directions. The radiological view
-    exchanges left and right.
+    swaps left and right.
 
     Attributes:
         axes: the array's axis for each axis of the image.
@@ -55,9 +55,7 @@ class Orientation(NamedTuple):
         """
         matrix = np.asarray(affine, dtype=np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
-            raise ValueError(
-                f"affine: got shape {matrix.shape}; expected a finite (4, 4) matrix with three independent axes"
-            )
+            raise ValueError(f"affine: got shape {matrix.shape}; expected finite (4, 4) with independent axes")
         if slice_axis not in (None, 0, 1, 2):
             raise ValueError(f"slice_axis: got {slice_axis}; expected 0, 1, 2, or None for a volume")
         if view not in get_args(View):

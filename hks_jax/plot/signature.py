@@ -31,7 +31,7 @@ LABELS = {
 LEAST_RANGE = 0.01
 """The least range of the colours relative to the values, below which contrast is not enhanced."""
 RIM = 5
-"""The distance from the boundary, in nodes, of values that set the colours. At small t it raises the HKS up to fourfold."""
+"""The least distance, in nodes, of values that set the colours from the boundary, which can raise the HKS fourfold."""
 
 
 def signature_panels(
@@ -47,8 +47,8 @@ def signature_panels(
     """Return a figure of a signature on a slice, or on three slices of a volume, with separate colours for each time.
 
     The colours span the values away from the boundary, and a colour bar has arrows if other values lie beyond. With
-    "flat" normalisation they diverge from 1, the value for a flat metric. With error bars, deviations from flat space
-    within the noise fade.
+    "flat" normalisation they diverge from 1, the value for a flat metric. With error bars, deviations within the noise
+    fade.
 
     Args:
         result: the signature to draw.
@@ -147,7 +147,7 @@ def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[s
 
 
 def away_from_rim(inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes more than `RIM` nodes from the boundary, or the third of the nodes that is furthest from it."""
+    """Mark the nodes at least `RIM` nodes from the boundary, or closer if less than a third would remain."""
     deep = inside
     for _ in range(RIM):
         smaller = ndimage.binary_erosion(deep)

@@ -83,9 +83,7 @@ def surface(
     thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # a flat surface also needs a box
     low, high = low - thin, high + thin
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(
-        tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom
-    )  # the corners of a flat surface are visible
+    ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # a flat surface shows its corners
     ax.set_axis_off()
     return mappable
 

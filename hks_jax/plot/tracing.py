@@ -1,8 +1,8 @@
 """Integral lines of the eigenvector fields of a 2D tensor field.
 
 An eigenvector has no sign, but the tensor is unambiguous. So the tensors at the nodes are interpolated bilinearly. The
-direction at a point follows from the interpolated tensor in closed form, and its sign from the previous direction of
-the line.
+direction at a point follows from the interpolated tensor in closed form, and its sign from the line's previous
+direction.
 """
 
 from typing import Any, Literal
@@ -238,8 +238,8 @@ def integral_lines(
         field: a 2D field.
         which: ``"major"``, the eigenvector of the larger eigenvalue of T, or ``"minor"``.
         seeds: (n, 2) points on the lines, by default the seeds of evenly spaced lines.
-        density: the density of evenly spaced lines. At 1 their distance is 1/25 of the longer side, or more on small
-            axes.
+        density: the density of evenly spaced lines. At 1 their distance is 1/25 of the longer side or, on small axes,
+            more.
         step: the arc length of an integration step, by default half the smaller grid spacing.
         max_length: the maximum arc length of a line, by default eight times the longer side.
         **kwargs: arguments of `matplotlib.collections.LineCollection` (``colors``, ``linewidths``, ``alpha``).

@@ -58,10 +58,9 @@ def orthogonal_slices(
         grid: the 3D grid of the values, whose spacing determines the aspect.
         node: the indices (i, j, k) of the node, by default `middle_node` of the finite values.
         cross: whether thin lines show the positions of the other two slices.
-        orientation: the orientation of the grid in space, by which the slices are turned. They then have space
-            coordinates and letters at their edges.
-        **kwargs: arguments of `scalar_image` that apply to the whole volume, such as cmap, vmin, vmax, centre and
-            quantiles.
+        orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
+            letters.
+        **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
         ValueError: if there are not three axes, if the grid is not 3D, if the values have another shape or none is

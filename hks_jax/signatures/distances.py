@@ -109,15 +109,16 @@ def varadhan_distance(
 
     Small times need fine grids and many pairs: linear elements with node spacing h have the relative error h²d²/48t² of
     d², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated relative
-    error of the kernel or the grid's relative error of d² exceeds 0.1. Larger times reach further with a larger error.
+    error of the kernel or the grid's relative error of d² exceeds 0.1. Larger times reach further, but with larger
+    errors.
 
     Args:
         pairs: the result of `eigenpairs`; more pairs reach further. Paths stay in the domain: they go around holes of
             its mask and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
         times: (n_times,) positive, in (metric length)²; a time of about d·h suits the distance d.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
-        normalised: whether to divide by the diagonal. Without it the result depends on the unit of length and is NaN
-            where k_t > 1.
+        normalised: whether to divide by the diagonal. Otherwise the result depends on the length unit and is NaN where
+            k_t > 1.
 
     Returns:
         (n_times, n_sources, *shape) in metric length. Normalised distances are 0 at the source. NaN outside the mask,
@@ -175,10 +176,7 @@ def _least_kernels(
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
-        raise ValueError(
-            "pairs: got eigenpairs without a node spacing, which the distance needs; expected those of a grid or of "
-            "linear elements"
-        )
+        raise ValueError("pairs: got eigenpairs without the needed node spacing; expected a grid or linear elements")
     weights = jnp.where(pairs.kept[None], jnp.exp(-times[:, None] * pairs.eigenvalues[None]), 0)
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
@@ -206,6 +204,6 @@ def _warn_of_distance(
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
             f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
-            f"{float(times[worst]):.4g}, because the heat kernel is not resolved so far from a source. Use larger "
-            f"times or {remedy}"
+            f"{float(times[worst]):.4g}, too far from a source for the heat kernel to be resolved. Use larger times "
+            f"or {remedy}"
         )

@@ -72,8 +72,7 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
         enough = np.log(share / TAIL_LIMIT) / rate
         warn_of_accuracy(
             f"times: the heat flow at t = {float(jnp.min(times)):.4g} lacks up to {left:.1%} of a function's norm, "
-            f"because that part lies beyond the computed eigenpairs. Use times of at least about {enough:.4g}, or "
-            "more eigenpairs",
+            f"which lies beyond the computed eigenpairs. Use times of at least {enough:.4g}, or more eigenpairs",
         )
 
 

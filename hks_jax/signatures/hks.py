@@ -37,7 +37,7 @@ class AutomaticHKS(eqx.Module):
         times: (n_times,).
         spectral: (n_times,) bool, true at times computed from eigenpairs, false at spectrum-free times.
         tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), by which the method was chosen.
-        method: the method of the spectrum-free times: ``"colouring"``, ``"selected-inversion"`` or, without such times,
+        method: the method of the spectrum-free times: ``"colouring"``, ``"selected-inversion"`` or, without any,
             ``"none"``.
         overlap_time: the shortest time of the eigenpairs, which was computed by both methods; NaN if no time was.
         overlap_difference: the greatest difference of the two methods at that time, relative to (4πt)^(−d/2).
@@ -184,7 +184,7 @@ def hks_auto(
 def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, values: Array) -> Array:
     if normalisation == "heat-trace":
         raise ValueError(
-            'normalisation: got "heat-trace", which needs eigenvalues; expected "raw", "volume" or "flat". Or use '
+            'normalisation: "heat-trace" needs all eigenvalues; expected "raw", "volume" or "flat", or '
             'method="spectral"'
         )
     return values * normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))

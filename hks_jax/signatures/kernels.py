@@ -96,9 +96,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
         ValueError: if only one of energies and sigma is given or one is invalid, or if no eigenvalue is positive.
     """
     if (energies is None) != (sigma is None):
-        raise ValueError(
-            "energies, sigma: got only one; expected both, as `default_energies(pairs, n)` returns them, or neither"
-        )
+        raise ValueError("energies, sigma: got only one; expected both, as from `default_energies`, or neither")
     positive_range(pairs)
     if energies is None:
         energies, sigma = default_energies(pairs)

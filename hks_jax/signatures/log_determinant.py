@@ -32,10 +32,9 @@ class LogDeterminant(NamedTuple):
 
     Attributes:
         value: log det′ Δ.
-        error: an estimate of the discretisation error and of the heat trace's terms without a coefficient. Derivatives
-            treat it as a constant.
-        time: T. The heat trace is computed from its coefficients up to T, and from the eigenvalues after T. Derivatives
-            treat it as a constant.
+        error: an estimate of the discretisation error and of omitted terms of the heat trace; constant to derivatives.
+        time: T. The heat trace is computed from its coefficients up to T and from eigenvalues after T. T is constant to
+            derivatives.
     """
 
     value: Float[Array, ""]
@@ -141,8 +140,7 @@ def log_determinant(
     if not is_traced(result) and not float(result.error) <= _DOUBTFUL:
         warn_of_accuracy(
             f"pairs: log det′ = {float(result.value):.4g} has the estimated error {float(result.error):.2g}. Use a "
-            "finer grid, more pairs or more coefficients, or name the powers of t without a coefficient in "
-            "`extrapolate`"
+            "finer grid, more pairs or coefficients, or name the powers of t without one in `extrapolate`"
         )
     return result
 

@@ -19,8 +19,7 @@ class RegionStatistics:
         coverage: (r,) the share of such nodes among all nodes of the region; nodes outside the mask have no value.
         volume: (r,) the number of nodes times the volume (in 2D, the area) of one node.
         mean: (n_times, r) the unweighted mean over the nodes.
-        deviation: (n_times, r) the standard deviation within the region, with the number of nodes (not one less) as
-            divisor.
+        deviation: (n_times, r) the standard deviation within the region, with the number of nodes as divisor.
         median: (n_times, r) the median over the nodes.
     """
 

@@ -19,8 +19,7 @@ def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
         raise TypeError(f"pairs: got {type(pairs).__name__}; expected the result of `eigenpairs`")
     if pairs.eigenvalues.ndim != 1:
         raise ValueError(
-            f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap for "
-            "a batch"
+            f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap"
         )
     return pairs
 
@@ -59,8 +58,8 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     """
     if _n_positive(require_pairs(pairs)) < 1:
         raise ValueError(
-            f"pairs: got {pairs.k} eigenvalues, none of them positive (each Neumann component has one zero). Compute "
-            "more eigenpairs"
+            f"pairs: got {pairs.k} eigenvalues, none positive (each Neumann component has a zero). Compute more "
+            "eigenpairs"
         )
     return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance)
 
@@ -86,8 +85,7 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
     At the first time the last mode has decayed by the factor 1e-4. At the last, which is not before the first, all
-    modes except the constant have decayed by `decay`. The command line uses 1e-2, at which a picture still shows
-    variation.
+    modes except the constant have decayed by `decay`. The command line uses 1e-2, which is still visible.
     """
     if n < 1:
         raise ValueError(f"n: got {n}; expected at least 1")
@@ -107,7 +105,7 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
         raise ValueError(f"n: got {n}; expected at least 29, so that the range of energies exceeds 4σ")
     if _n_positive(pairs) < 2:
         raise ValueError(
-            f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two. Compute more eigenpairs"
+            f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two, from more eigenpairs"
         )
     first, last = (jnp.log(value) for value in positive_range(pairs))
     sigma = 7 * (last - first) / n

@@ -36,8 +36,7 @@ class Truncation(eqx.Module):
         tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. It is a mean over the domain; single
             nodes lack more (`truncation_map`).
         resolution_bias: (n,) the relative discretisation error at the median node.
-        lasting_bias: (n,) the part of this error that does not decrease with t, because tensors turn or stretch between
-            nodes.
+        lasting_bias: (n,) the part of this error that does not decrease with t, due to tensors that turn or stretch.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
         smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or up to 20 %
             beside a Dirichlet side.
@@ -197,9 +196,7 @@ def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, 
     """Return pairs and times as constants to derivatives; raise ValueError if the pairs allow no estimate."""
     at = times_of(pairs, times)
     if not pairs.lowest:
-        raise ValueError(
-            "pairs: got eigenpairs in an interval; expected the lowest, for which the error can be estimated"
-        )
+        raise ValueError("pairs: got eigenpairs in an interval; expected the lowest, which allow an estimate")
     return jax.lax.stop_gradient((pairs, at))
 
 

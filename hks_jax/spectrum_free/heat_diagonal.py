@@ -41,16 +41,15 @@ def hks_spectrum_free(
     the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md derives the bounds.
 
     Args:
-        domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or the pencil that `assemble` makes of
-            either.
+        domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
         times: (n_times,) positive, in (metric length)².
         boundary: see `assemble`; a given pencil already contains it.
         mass: the same. With colouring, ``"lumped"`` is 50 to 100 times as fast.
         method: ``"colouring"`` (on grids) applies Chebyshev polynomials to sums of distant point sources, with the same
             vectors for all times. ``"selected-inversion"`` uses a rational approximation with an error of about 1e-10.
             For n nodes each time takes O(n^1.5) operations in 2D, O(n²) in 3D, and memory for complex factors.
-            ``"auto"`` chooses the method with less work. A `Colouring` from `colouring` is also accepted, and needed
-            for colouring under `jax.jit`.
+            ``"auto"`` chooses the method with less work. Under `jax.jit`, colouring needs a `Colouring` from
+            `colouring`.
         tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
             largest possible value at a node; with a potential, times exp(−vt), where v is its least value. See
             `Colouring.error` for proofs. Selected inversion does not use it.

@@ -174,6 +174,6 @@ def require_fewer_vectors(settings: Colouring, pencil: AnyPencil) -> None:
         other = 'method="selected-inversion", ' if affordable else ""
         raise ValueError(
             f"times: heat spreads so far at the largest time that sources must be {settings.spacing} nodes apart, "
-            f"which takes {vectors} vectors for {space.n_dof} unknowns. Use {other}eigenpairs, smaller times, or a "
+            f"which takes {vectors} vectors for {space.n_dof} unknowns. Use {other}eigenpairs, smaller times or a "
             "larger tolerance"
         )

@@ -57,7 +57,7 @@ def explore(
     click or the arrow keys choose a point, whose signature is drawn over t. All other points are coloured by the
     distance between their curves and the curve of this point (Sun, Ovsjanikov and Guibas 2009): the root mean square
     over log t of the difference of the two signatures, each relative to the mean over the domain. Two points can be
-    compared. A lasso, a maximum distance or a label define a region, whose mean curve and spread are drawn. Curves can
+    compared. A lasso, a maximum distance or a label defines a region, whose mean curve and spread are drawn. Curves can
     be saved as CSV.
 
     The file contains the numbers in single precision, with 5⅓ bytes for each inside node at each time and in each map.
@@ -103,18 +103,13 @@ def explore(
     inside, surface, place = np.isfinite(array).all(axis=0), {}, {}
     if isinstance(grid, SurfaceMesh):
         if not (inside.all() and tensors is None and world is None):
-            raise ValueError(
-                "values, tensors, world: got invalid arguments for a surface; expected finite values, and no tensors "
-                "or world"
-            )
+            raise ValueError("values, tensors, world: expected finite values, no tensors and no world for a surface")
         surface = {"vertices": np.asarray(grid.vertices, "<f4"), "faces": grid.faces.astype("<i4")}
     else:
         inside &= grid.inside
         place = {"spacing": grid.spacing, "origin": grid.origin}
     if not inside.any():
-        raise ValueError(
-            "values: got no node inside the grid's mask that is finite at all times; expected at least one"
-        )
+        raise ValueError("values: got no node inside the mask that is finite at all times; expected one")
     spread = None if lengths is None else np.asarray(lengths, dtype=np.float64)
     if spread is not None and (spread.shape != t.shape or not np.isfinite(spread).all()):
         raise ValueError(f"lengths: got shape {spread.shape}; expected {t.shape}, one finite number per time")
