@@ -96,11 +96,11 @@ def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(
     [
         ({"times": TIMES[::-1]}, "times: got"),
         ({"values": signature()[1:]}, r"values: got shape \(6, 24, 18\)"),
-        ({"values": np.full((7, *SHAPE), np.nan)}, "nothing to show"),
+        ({"values": np.full((7, *SHAPE), np.nan)}, "finite at all times"),
         ({"tensors": tensors()[1:]}, r"tensors: got shape"),
-        ({"tensors": np.full((*SHAPE, 2, 2), np.nan)}, "tensors: some inside"),
+        ({"tensors": np.full((*SHAPE, 2, 2), np.nan)}, "tensors: got NaN or infinite"),
         ({"maps": {"age": np.ones(3)}}, r"maps\['age'\]: got shape \(3,\)"),
-        ({"labels": np.ones(SHAPE) / 2}, "labels: got numbers with a fraction"),
+        ({"labels": np.ones(SHAPE) / 2}, "labels: got fractional numbers"),
         ({"labels": np.zeros(SHAPE)}, "labels: 0 everywhere"),
         ({"labels": np.zeros((3, 3))}, "labels: got shape"),
         ({"normalisation": "flatt"}, "normalisation: got 'flatt'"),
@@ -180,7 +180,7 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
 
     moved = nib.load(tmp_path / "labels.nii.gz")
     nib.save(nib.Nifti1Image(np.asarray(moved.dataobj), moved.affine + 0.9 * np.eye(4, k=3)), tmp_path / "moved.nii.gz")
-    assert "other voxels than the image's" in error(result, "--labels", tmp_path / "moved.nii.gz")
+    assert "labels and the image on different voxels" in error(result, "--labels", tmp_path / "moved.nii.gz")
     np.save(tmp_path / "labels.npy", np.zeros((3, 3)))
     assert "got labels of shape (3, 3)" in error(result, "--labels", tmp_path / "labels.npy")
     np.save(tmp_path / "labels.npy", np.full(SHAPE, 0.5))
@@ -191,7 +191,7 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
     np.savez(
         tmp_path / "mesh.npz", hks=np.ones((1, 4)), times=[1.0], vertices=np.eye(4, 3), cells=np.array([[1, 0, 2, 3]])
     )
-    assert "is on tetrahedra" in error(tmp_path / "mesh.npz")
+    assert "got a result on tetrahedra" in error(tmp_path / "mesh.npz")
     assert not (result / "explore.html").exists()
 
 
