@@ -28,13 +28,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from hks_jax import SurfaceMesh, TetMesh, assemble
+from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
-from hks_jax.cli.noise import require_spectral, signature_of
+from hks_jax.cli.noise import Noisy, noise_of_volume, require_spectral, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
@@ -64,7 +64,7 @@ OPTIONS = f"""
 
 _OF_TENSORS = ("metric", "order", "interpolation")
 """Options that refer to tensors at the vertices of a mesh."""
-_NO_NOISE = "this option is for tensors on a grid; leave it out for meshes and for eigenpairs"
+_NO_NOISE = "this option needs tensors, which eigenpairs and meshes with the metric of space do not have; leave it out"
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -120,14 +120,18 @@ def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
 def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
     _check_mesh_options(args)
     with progress.stage("reading", str(args.file)):
-        mesh = _read_domain(args, progress)
+        mesh, noisy = _read_domain(args, progress)
     boundary = settings.boundary or "neumann"
     settings = replace(settings, boundary=boundary)
     with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
         pencil = assemble(mesh, boundary)
     pairs = solve(pencil, settings, progress)
     described = {"source": str(args.file), **describe_mesh(args.file, mesh)}
-    result = result_of(mesh, described, pairs, settings, progress)
+    of_pairs = partial(result_of, mesh, described, pairs)
+    if noisy is None:
+        result = of_pairs(settings, progress)
+    else:
+        result = with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
     image = args.file.suffix.lower()
     if image not in WRITTEN or (image == ".ply" and isinstance(mesh, TetMesh)):  # formats without values at vertices
         image = ".vtu"
@@ -135,8 +139,7 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that only grids have, and if the metric of given tensors is not chosen."""
-    refuse(args, ("noise",), _NO_NOISE)
+    """Raise ValueError for options that are for grids alone, and for tensors whose metric is open."""
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
@@ -148,37 +151,63 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
     if not (args.array or args.tensors):
         why = "this option needs tensors, but without --array and --tensors a mesh has the metric of space"
         refuse(args, _OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
+        refuse(args, ("noise",), _NO_NOISE)
     elif args.metric is None:
         raise ValueError("--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate")
 
 
-def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:
-    """Read the mesh in the chosen precision, with the metric of tensors at its vertices if there are any."""
+def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
+    """Read the mesh in the chosen precision, with the metric of tensors at its vertices if there are any.
+
+    For error bars, return the tensors and their noise, too: those of the volume if the tensors come from one.
+    """
     use_dtype(args.dtype)
     mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))
     vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
     inside = None if args.inside is None else _inside(args.inside, len(vertices))
+    settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
+
+    def domain(tensors: Any) -> SurfaceMesh | TetMesh:
+        return kind.from_tensors(vertices, cells, tensors, args.metric, **settings)
+
     if args.tensors:
         volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
         require_valid(volume, "--repair")
         at = np.arange(len(vertices)) if inside is None else np.flatnonzero(inside)
-        tensors = np.zeros((len(vertices), 3, 3), args.dtype)
-        tensors[at] = sample_tensors(volume, np.asarray(mesh.vertices)[at])
-    elif args.array:
-        arrays = read_mesh_arrays(args.file, clean=args.clean)
-        if args.array not in arrays:
-            there = ", ".join(arrays) or "none"
-            raise ValueError(f"--array: got {args.array!r}; expected an array at the vertices: {there}")
-        values = arrays[args.array].reshape(len(vertices), -1)
-        if values.shape[1] != (9 if args.order is None else 6):
-            n = values.shape[1]
-            raise ValueError(f"--array: got {args.array!r} with {n} components; expected 9, or 6 with --order")
-        tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
-    else:
-        return kind(vertices, cells, mask=inside)
-    settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
-    return kind.from_tensors(vertices, cells, tensors, args.metric, **settings)
+
+        def sampled(values: Any) -> SurfaceMesh | TetMesh:
+            tensors = np.zeros((len(vertices), 3, 3), args.dtype)
+            tensors[at] = sample_tensors(replace(volume, tensors=np.asarray(values)), np.asarray(mesh.vertices)[at])
+            return domain(tensors)
+
+        if args.noise is None:
+            return sampled(volume.tensors), None
+        noise = noise_of_volume(args, volume, volume.grid("all"), progress)
+        return sampled(volume.tensors), Noisy(volume.tensors, noise, sampled, traceable=False)
+    if not args.array:
+        return kind(vertices, cells, mask=inside), None
+    arrays = read_mesh_arrays(args.file, clean=args.clean)
+    if args.array not in arrays:
+        there = ", ".join(arrays) or "none"
+        raise ValueError(f"--array: got {args.array!r}; expected an array at the vertices: {there}")
+    values = arrays[args.array].reshape(len(vertices), -1)
+    if values.shape[1] != (9 if args.order is None else 6):
+        n = values.shape[1]
+        raise ValueError(f"--array: got {args.array!r} with {n} components; expected 9, or 6 with --order")
+    tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
+    return domain(tensors), None if args.noise is None else Noisy(tensors, _relative(args.noise, tensors), domain)
+
+
+def _relative(noise: str, tensors: Float[np.ndarray, "V 3 3"]) -> TensorNoise:
+    try:
+        level = float(noise)
+    except ValueError:
+        raise ValueError(
+            f"--noise: got {noise!r}; expected a number, relative to the mean diffusivity, for tensors at the "
+            "vertices of a mesh"
+        ) from None
+    return TensorNoise.relative(tensors, level)
 
 
 def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:

@@ -21,7 +21,9 @@ from hks_jax.optional import optional
 from hks_jax.storage import existing, reading
 
 _LENGTH = 0.05
-"""The largest difference of a direction's length from 1 that is attributed to rounding."""
+"""By how much the length of a direction may differ from 1: it is rounding then."""
+_SEEN = 0.01
+"""The share of an image's noise that its residual has at least, to tell it."""
 
 
 class ExampleBrain(NamedTuple):
@@ -63,25 +65,26 @@ def fit_dwi(
     """Fit diffusion tensors to diffusion-weighted images by weighted least squares on log signals (DIPY's TensorModel).
 
     Args:
-        path: a NIfTI image (nx, ny, nz, n). Voxels with a NaN or infinite signal are left out.
-        bval: a text file of the n b-values, in s/mm² unless `unit` is given.
-        bvec: a text file of the n directions of length 1, 3 × n or n × 3. Directions at b = 0 are ignored.
-        mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If None, DIPY's
-            median_otsu finds the brain in the mean of the unweighted images, and a note reports this.
-        b_max: the largest b-value used, in s/mm²; None uses all images. A tensor is a model for b ≲ 1000–1500 s/mm².
-        bvec_frame: the axes of the directions. ``"fsl"`` is the convention of dcm2niix and FSL: the voxel axes, the
-            first reversed if the affine's determinant is positive. ``"voxel"`` means the voxel axes. ``"world"`` means
-            the scanner's axes, as in MRtrix.
-        unit: a unit of diffusivity whose reciprocal is the unit of the b-values: ``"m2/s"`` for b-values in s/m²,
-            ``"um2/ms"`` for ms/µm². None means mm²/s.
-        noise: the standard deviation of the images' noise, in the images' unit, from which the tensors' covariance is
-            computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit, which have
-            n − 7 degrees of freedom. If None, no covariance is computed.
+        path: NIfTI (nx, ny, nz, n). Voxels where a signal is NaN or infinite are left out.
+        bval: text file of the n b-values, in s/mm² unless `unit` says otherwise.
+        bvec: text file of the n directions, 3 × n or n × 3, of length 1; those at b = 0 mean nothing.
+        mask: a file (see `read_mask`) or a bool array (nx, ny, nz): fit inside only; outside, tensors are zero. None:
+            what DIPY's median_otsu takes for the brain in the mean of the unweighted images, as a note says.
+        b_max: leave out images with larger b, in s/mm²; None: use all. A tensor describes b ≲ 1000–1500 s/mm² only.
+        bvec_frame: the axes of the directions: ``"fsl"``, voxel axes, the first reversed where the affine's determinant
+            is positive, as dcm2niix and FSL write them; ``"voxel"``, the voxel axes; ``"world"``, the scanner's, as
+            MRtrix has them.
+        unit: of diffusivity, whose reciprocal is the b-values' unit: ``"m2/s"`` for b-values in s/m², ``"um2/ms"`` for
+            ms/µm². None: mm²/s.
+        noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
+            ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
+            for n images; these also tell what voxels share of an image's noise (24 bytes for each voxel and image).
+            None: no covariance.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s, and with `noise` their covariance to first order in the noise. DIPY
-        raises eigenvalues that are not positive to about 1e-9 mm²/s, and a note reports the number of such voxels. Most
-        of them are at the boundary of the mask, so eroding the mask removes them.
+        Tensors along the voxel axes, in mm²/s, and with `noise` theirs, to first order (`TensorVolume.noise`). DIPY
+        replaces eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at
+        the rim: erode the mask).
 
     Raises:
         ImportError: DIPY or nibabel is missing.
@@ -119,9 +122,9 @@ def fit_dwi(
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
     fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
-    covariance = None
+    covariance = modes = None
     if noise is not None:
-        covariance = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
+        covariance, modes = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
     notes = [
         f"weighted least-squares fit to {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
@@ -137,7 +140,7 @@ def fit_dwi(
         notes.append(f"covariances of the tensors computed from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
-    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance)
+    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance, modes=modes)
     return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
@@ -145,6 +148,9 @@ def fit_dwi(
 # squares minimise Σ w²(y − Xβ)². To first order, a log signal has the variance σ²/w², so β has the covariance
 # σ²(XᵀW²X)⁻¹. The estimate of σ² is the sum of squared residuals of the signals, divided by the number of images minus
 # the number of unknowns (Koay, Chang, Pierpaoli and Basser 2007).
+# The residual rₙ of the signal of image n changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ. It has the variance σ²(1 − h), where
+# h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2). Random signs of
+# whole images preserve the noise that voxels share.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],
@@ -152,8 +158,11 @@ def _covariance(
     noise: float | Literal["residuals"],
     frame: str,
     affine: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "nx ny nz 6 6"]:
-    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes; it is zero outside the mask."""
+) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask.
+
+    And, from residuals, the part of each image in the noise of the tensors.
+    """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
     y = np.log(np.maximum(data, positive.min() if positive.size else 1.0))
@@ -170,7 +179,8 @@ def _covariance(
             )
         # The residuals are those of the signals, because logarithms of small signals have large errors.
         fitted = np.exp(np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True))
-        variance = np.sum((data - fitted) ** 2, axis=1) / freedom
+        left = data - fitted
+        variance = np.sum(left**2, axis=1) / freedom
         if (zero := variance <= 1e-20 * weights.mean(axis=1)).any():
             raise ValueError(
                 f'noise: got "residuals", which are zero in {int(zero.sum())} of {len(zero)} voxels; expected images '
@@ -182,7 +192,17 @@ def _covariance(
     turned = pack(to_voxel_axes(unpack(np.eye(6), "nifti"), frame, affine), "nifti").T
     covariance = np.zeros((*inside.shape, 6, 6))
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
-    return covariance
+    if noise != "residuals":
+        return covariance, None
+    # An image that its own unknown follows, as the only one without weighting, has no residual: a sign by chance.
+    unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
+    modes = np.zeros((*inside.shape, len(design), 6), np.float32)
+    for i, x in enumerate(design):  # to need no more memory than the result
+        change = inverse @ x * np.sqrt(weights[:, i, None])
+        rest = 1 - np.sqrt(weights[:, i]) * (change @ x)
+        size = np.where(rest > _SEEN, left[:, i] / np.sqrt(np.maximum(rest, _SEEN)), unseen[:, i])
+        modes[inside, i] = size[:, None] * change[:, :6] @ turned.T
+    return covariance, modes
 
 
 def _of_length_one(

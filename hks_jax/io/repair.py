@@ -131,7 +131,8 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         )
     wrong = "are not positive definite" if floor is None else f"have an eigenvalue below {floor:g}"
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
-    mask, tensors, covariance = volume.mask, volume.tensors.copy(), volume.covariance
+    mask, tensors = volume.mask, volume.tensors.copy()
+    noise: dict[str, Any] = {"covariance": volume.covariance, "modes": volume.modes}
     if method == "mask":
         mask, done = inside & ~bad, "their voxels are left out"
     elif method == "clip":
@@ -153,11 +154,12 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         )
         source, done = tuple(index[bad] for index in nearest), "they are replaced by the nearest valid tensor"
         tensors[bad] = tensors[source]
-        if covariance is not None:
-            covariance = covariance.copy()
-            covariance[bad] = covariance[source]
+        for name, known in noise.items():
+            if known is not None:
+                noise[name] = known.copy()
+                noise[name][bad] = known[source]
     notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
-    return replace(volume, tensors=tensors, mask=mask, covariance=covariance, repair=report, notes=notes)
+    return replace(volume, tensors=tensors, mask=mask, **noise, repair=report, notes=notes)
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
@@ -251,7 +253,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
     note = f"{formula} of all tensors S, of which {before} of {int(inside.sum())} were not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
-    return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))
+    return replace(volume, tensors=tensors, covariance=None, modes=None, repair=report, notes=(*volume.notes, note))
 
 
 def require_symmetric(volume: TensorVolume) -> None:

@@ -16,6 +16,7 @@ from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
 from hks_jax.domain.grid import Grid
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
+from hks_jax.uncertainty.noise import TensorNoise
 
 AXES = "xyz"
 
@@ -60,6 +61,8 @@ class TensorVolume:
         unit: ``"mm²/s"`` if the tensors' unit is known, as an argument or from a fit; otherwise empty.
         covariance: (*shape, m, m), the covariance of the components xx xy yy (xz yz zz) along the voxel axes, in the
             squared unit of the tensors, if known (`fit_dwi`); otherwise None.
+        modes: (*shape, n, m), the contribution of each of the n images to the noise of these components, if the noise
+            was estimated from residuals (`fit_dwi`, in float32); otherwise None. They hold the noise that voxels share.
 
     Raises:
         ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
@@ -81,6 +84,7 @@ class TensorVolume:
     length_unit: str = ""
     unit: str = ""
     covariance: Float[np.ndarray, "*shape m m"] | None = None
+    modes: Float[np.ndarray, "*shape n m"] | None = None
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
@@ -161,11 +165,13 @@ class TensorVolume:
                 where = f"{AXES[a]} = {filled[0]} … {filled[-1]}" if filled.size else "no slice at all"
                 raise ValueError(f"mask: got no voxels in slice {AXES[a]} = {index}; the mask has voxels at {where}")
         keep = [b for b in range(3) if b != a]
-        affine = covariance = None
+        affine = covariance = modes = None
+        rows, columns = np.tril_indices(3)
+        within = np.flatnonzero((rows != a) & (columns != a))
         if self.covariance is not None:
-            rows, columns = np.tril_indices(3)
-            within = np.flatnonzero((rows != a) & (columns != a))
             covariance = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
+        if self.modes is not None:
+            modes = np.take(self.modes, index, axis=a)[..., within]
         if self.affine is not None:
             affine = self.affine.copy()
             affine[:3, 3] += index * affine[:3, a]
@@ -178,8 +184,24 @@ class TensorVolume:
             affine=affine,
             slice_axis=a,
             covariance=covariance,
+            modes=modes,
             notes=(*self.notes, f"slice {AXES[a]} = {index}: its tensors are the in-plane blocks"),
         )
+
+    def noise(self, grid: Grid) -> TensorNoise:
+        """Return the noise that the fit of the tensors estimated (`fit_dwi`), by images if `modes` are known.
+
+        Raises:
+            ValueError: the fit did not estimate the noise.
+        """
+        if self.modes is not None:
+            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # of a fit, a signal without weighting included
+        if self.covariance is None:
+            raise ValueError(
+                "noise: got a volume without an estimate of its noise; fit the tensors by `fit_dwi` with noise=, or "
+                "give the noise by `TensorNoise.relative`"
+            )
+        return TensorNoise(self.covariance, grid)
 
     @property
     def volume_affine(self) -> Float[np.ndarray, "4 4"]:

@@ -232,17 +232,30 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     assert report["input"]["boundary_vertices"] == 92
     assert (tmp_path / "out" / "hks.png").stat().st_size > 5000
 
+    of_tensors = ["--array", "D", "--metric", "inverse"]
+    assert main([*command, *of_tensors, "--noise", "0.01"]) == 0
+    bars = hj.uncertainty(
+        lambda D: hj.hks(hj.eigenpairs(hj.TetMesh.from_tensors(x, ball.cells, D, "inverse"), 30), [0.3, 0.6]),
+        tensors,
+        hj.TensorNoise.relative(tensors, 0.01),
+        method="resample",
+    )
+    with np.load(tmp_path / "out" / "hks.npz") as found:
+        np.testing.assert_allclose(found["deviation"], bars.deviation, rtol=1e-6)
+
     def refused(message, *more):
         assert main([*command, *more]) == 2
         assert message in capsys.readouterr().err
 
+    refused("--noise: this option needs tensors, which", "--noise", "0.1")
+    refused("--noise: got 'roughness'; expected a number", *of_tensors, "--noise", "roughness")
     refused("--metric: this option needs tensors, but without --array", "--metric", "tensor")
-    refused("--interpolation: a mesh has the metric of space", "--interpolation", "log-euclidean")
-    refused("--metric: choose what the tensors at the vertices stand for", "--array", "D")
+    refused("--interpolation: this option needs tensors", "--interpolation", "log-euclidean")
+    refused("--metric: the tensors at the vertices need a metric", "--array", "D")
     refused("--array: got 'E'; expected an array at the vertices: D", "--array", "E", "--metric", "tensor")
     refused("--slice: this option is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
-    refused("--boundary: got 'mirror'; a mesh takes one of neumann, dirichlet, mean", "--boundary", "mirror")
-    refused("--array: 'D' has 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
+    refused("--boundary: got 'mirror'; expected neumann, dirichlet, mean", "--boundary", "mirror")
+    refused("--array: got 'D' with 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
 
 
 def test_signature_of_a_surface_without_some_vertices(tmp_path):

@@ -84,7 +84,7 @@ def test_region_statistics_are_those_of_the_regions_alone(rng):
     ("labels", "words"),
     [
         (np.zeros((6, 5)), "0 everywhere"),
-        (np.full((6, 5), 0.5), "a fraction"),
+        (np.full((6, 5), 0.5), "fractional numbers"),
         (np.ones((5, 6)), r"got shape \(5, 6\)"),
     ],
 )
@@ -635,7 +635,7 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
         save_tensors(study / "second.nii.gz", TensorVolume(other, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE))
 
     scan_again()
-    words = command(study, "out", "--times", "3e3", "6e3", "--noise", "0.01", "--draws", "4", "--save-pairs")
+    words = command(study, "out", "--times", "3e3", "6e3", "--noise", "0.01", "--draws", "8", "--save-pairs")
     assert main(words) == 0
     rows = table(study / "out" / "group_regions.tsv")
     stem = study / "out" / "sub-01" / "dwi" / "sub-01_model-tensor_param-hks"
@@ -649,8 +649,8 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     ]
     assert [noise["source"] for noise in noises] == ["second.nii.gz", "0.01"]
     before = contents(study / "out")
-    assert main([*words, "--draws", "6"]) == 2
-    assert "differs in --draws: 4, now 6" in capsys.readouterr().err
+    assert main([*words, "--draws", "12"]) == 2
+    assert "differs in --draws: 8, now 12" in capsys.readouterr().err
     scan_again()  # nothing is solved again but the noisy maps, of the one subject
     monkeypatch.setattr("hks_jax.cli.study.tasks.compute_pairs", None)
     assert main(words) == 0

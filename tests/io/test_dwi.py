@@ -144,12 +144,36 @@ def test_covariances_are_those_of_repeated_scans(scan, rng, frame):
     nib.save(nib.Nifti1Image(scan.signal, affine), paths[0])
     stated, found = (fit_dwi(*paths, whole, bvec_frame=frame, noise=noise) for noise in (sigma, "residuals"))
     expected = np.cov(lower(stated.tensors[whole]).T)
-    for fit in (stated, found):
-        mean = fit.covariance[whole].mean(axis=0)
+    assert stated.modes is None
+    # Nodes share nothing here, and residuals of images tell the same covariance as those of a voxel.
+    by_image = np.einsum("...na,...nb->...ab", found.modes, found.modes)
+    for covariance in (stated.covariance, found.covariance, by_image):
+        mean = covariance[whole].mean(axis=0)
         np.testing.assert_allclose(mean, expected, atol=0.08 * np.abs(expected).max())
     assert "computed from the fit's residuals, with 13 degrees of freedom" in " ".join(found.notes)
     plane = found.slice("y", 10)
     np.testing.assert_array_equal(plane.covariance, found.covariance[:, 10][..., [0, 3, 5], :][..., [0, 3, 5]])
+    noise = plane.noise(plane.grid())
+    expected = by_image[:, 10][..., [0, 3, 5], :][..., [0, 3, 5]]
+    np.testing.assert_allclose(noise.covariance, expected, rtol=1e-4, atol=1e-6 * expected.max())
+    assert noise.freedom == 13
+
+
+def test_what_voxels_share_of_an_images_noise_is_found(scan, rng):
+    noisy_scan(scan, 60, rng)
+    drift = 0.02  # the deviation of the brightness of whole images
+    scan.signal *= 1 + drift * rng.standard_normal(60)
+    found = scan.fit(head(), noise="residuals")
+    apart = [1, 3, 4]  # xy xz yz, which the two images without weighting hardly change
+    variance = np.sum(np.square(found.modes[head()].mean(axis=0)[:, apart]))  # of the mean tensor over the head
+    g, b = scan.directions, scan.b
+    rows, columns = np.tril_indices(3)
+    X = np.column_stack([-b[:, None] * g[:, rows] * g[:, columns] * np.where(rows == columns, 1, 2), np.ones(60)])
+    W = np.exp(-2 * b * np.einsum("na,ab,nb->n", g, D, g))
+    pull = np.linalg.solve(X.T * W @ X, X.T * W)[apart]
+    assert 0.6 < variance / np.sum(drift**2 * pull**2) < 1.6
+    alone = found.covariance[head()].mean(axis=0)[apart, apart].sum() / head().sum()
+    assert variance > 20 * alone  # as many voxels would have it, did they share nothing
 
 
 def test_covariances_agree_with_the_wild_bootstrap(scan, rng):
