@@ -270,7 +270,7 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
         if (cut < 0).any():
             bad = which[np.argmax((cut < 0).any(axis=(1, 2)))]
             raise ValueError(
-                f"{file}: face {bad} with {size} corners is not star-shaped from a corner. Cut it into triangles"
+                f"{file}: face {bad} with {size} corners is not star-shaped about a corner. Cut it into triangles"
             )
         order.append(np.repeat(which, size - 2))
         triangles.append(cut.reshape(-1, 3))
