@@ -136,7 +136,7 @@ def assemble(
     if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
         raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch with jax.vmap")
     if degree != 1 or midpoints is not None:
-        raise ValueError(f"degree, midpoints: got degree {degree!r} for a grid; leave both out, as elements are Q1")
+        raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; leave both out")
     sides = normalise_boundary(boundary, domain.grid.dimension)
     if components > 1 and any("mirror" in pair for pair in sides):
         raise ValueError('boundary: got "mirror" with components; it is for scalar functions only. Use another')

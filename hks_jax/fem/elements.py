@@ -119,7 +119,7 @@ def simplex_element(dimension: int, degree: int = 1) -> Element:
     The nodes of P2 are the corners, followed by the midpoints of the edges in the order of `Triangulation.cell_edges`.
     """
     points, weights = (_linear_rule if degree == 1 else _quadratic_rule)(dimension)
-    slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])  # of the barycentric coordinates
+    slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])  # gradients of barycentric coordinates
     if degree == 1:
         return Element(points, np.stack([slopes] * len(points)), weights)
     a, b = np.array(list(combinations(range(dimension + 1), 2))).T

@@ -194,7 +194,7 @@ def test_what_is_refused():
     for given in ((aslinearoperator(K),), (K, aslinearoperator(M))):
         with unchecked(), pytest.raises(TypeError, match=r"[KM]: got a LinearOperator; expected a matrix with entries"):
             hj.eigsh(*given, k=3)
-    with pytest.raises(ValueError, match=r"M: got shape \(59, 59\); expected that of K, \(60, 60\)"):
+    with pytest.raises(ValueError, match=r"M: got shape \(59, 59\); expected \(60, 60\), the shape of K"):
         hj.eigsh(K, sp.eye(59).tocsr() + sp.eye(59, k=1) + sp.eye(59, k=-1), 3)
     with pytest.raises(ValueError, match=r"M: it has \d+ negative eigenvalue"):
         hj.eigsh(M, K, 3)
