@@ -287,7 +287,7 @@ def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
 
 
 def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray | Array, "*shape"]:
-    """Return a mask for a computation with some values."""
+    """Return the mask as an array of NumPy or, for a compiled computation with ``values``, of JAX."""
     axes = _box(mask) if is_traced(values) and is_staged() else None
     return mask if axes is None else _outer([axis[None] for axis in axes])[0]
 
