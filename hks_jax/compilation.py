@@ -1,4 +1,4 @@
-"""Compiling for CPUs in half the time, or not at all."""
+"""Faster compilation for CPUs, and computations by NumPy without compilation."""
 
 import os
 from collections.abc import Callable
@@ -15,7 +15,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
-"""XLA's older code generator for fused loops takes half as long, for code as fast as far as measured here."""
+"""XLA's older code generator for fused loops compiles twice as fast. The measured speed of its code is the same."""
 
 
 def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
@@ -41,14 +41,14 @@ def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[
 
 
 _FEW = 1 << 19
-"""Numbers that NumPy computes with in less time than it takes to compile a program for them, even for many calls."""
+"""The number of values up to which NumPy is faster than compiling a program, even for many calls."""
 
 
 def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Return a decorator for functions that take the module of arrays, NumPy's or JAX's, first.
+    """Return a decorator for functions whose first argument is the array module, NumPy's or JAX's.
 
-    With concrete values on a CPU, if they are few, NumPy computes, for which nothing is compiled; else `jax.jit` with
-    the settings. What comes out are JAX's arrays.
+    NumPy computes with few concrete values on a CPU, so nothing is compiled. Otherwise `jax.jit` with the settings
+    compiles the function. The results are JAX arrays in both cases.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -64,17 +64,17 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
 
 def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
-    """Return what a function makes of NumPy's arrays in place of JAX's, as JAX's arrays."""
+    """Apply a function to NumPy arrays instead of JAX arrays; return its result as JAX arrays."""
     known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
     with np.errstate(all="ignore"):
-        # `asarray` leaves them NumPy's where JAX differentiates.
+        # `jnp.asarray` would return NumPy arrays while JAX differentiates.
         return jax.device_put(jax.tree.map(np.asarray, function(*known)))
 
 
 def known_and_few(args: Any) -> bool:
-    """Return whether values are `known_here` and few: then NumPy computes.
+    """Return whether values are `known_here` and few, so that NumPy computes with them.
 
-    It depends on shapes and devices alone, so that a computation has the same rounding each time.
+    The answer depends only on shapes and devices, so that repeated computations have the same rounding errors.
     """
     return known_here(args) and sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= _FEW
 
@@ -88,7 +88,7 @@ def known_here(args: Any) -> bool:
 
 @cache
 def _understood() -> bool:
-    """Return whether computations run on a CPU whose compiler has these options, and leaves them to us."""
+    """Return whether the default device is a CPU whose compiler accepts the options, none of which XLA_FLAGS sets."""
     if jax.default_backend() != "cpu" or any(option in os.environ.get("XLA_FLAGS", "") for option in _OPTIONS):
         return False
     try:

@@ -1,4 +1,4 @@
-"""Whether values are there to be looked at, or stand for those of a computation to come."""
+"""Tests whether values are concrete or traced."""
 
 from typing import Any
 

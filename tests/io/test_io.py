@@ -437,7 +437,7 @@ def test_a_folder_replaces_its_own_files_only(tmp_path):
         assert (tmp_path / "out" / "file").read_text() == "replaced"
     assert {f.name: f.read_text() for f in (tmp_path / "out").iterdir()} == {"old": "kept", "file": "new"}
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
-    with pytest.raises(NotADirectoryError, match="is a file"), atomic_folder(tmp_path / "out" / "old"):
+    with pytest.raises(NotADirectoryError, match="got a file"), atomic_folder(tmp_path / "out" / "old"):
         pass
 
 
