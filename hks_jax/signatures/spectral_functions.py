@@ -100,13 +100,16 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 # differential is Φ F Φᵀ. With G = Φᵀ dK Φ, H = Φᵀ dM Φ and divided differences of f (Daleckii and Krein 1965),
 #
 #     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
+#
 # This does not depend on the basis chosen within a multiple eigenvalue, and is not singular there. Truncation sets f to
-# zero on all pairs that are not kept. Then F is unchanged among the kept pairs, and the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ
-# − λⱼ) between a kept i and all other j add up to
+# zero on all pairs that are not kept. Then F is unchanged among the kept pairs, and between a kept i and all other j
+# the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
-# where xᵢ is the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept have f =
-# 0. Under "mirror" and "mean" the differential is the sum over the parts, whose pairs do not mix.
+#
+# where xᵢ is the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept have
+# f = 0. Under "mirror" and "mean" the differential is the sum over the parts, whose pairs do not mix.
+#
 # Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ at the nodes (`Pencil.read`). Then R multiplies each φ and x from the left, and
 # f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ) is added to the sum.
 @partial(_kernel.defjvp, symbolic_zeros=True)

@@ -140,7 +140,9 @@ def test_damaged_images_of_mrtrix(tmp_path):
         (whole[7:], "does not begin with"),
     ):
         (tmp_path / "t.mif").write_bytes(content)
-        with pytest.raises(ValueError, match=rf"t\.mif: not a readable image of MRtrix.*{words}"):
+        with pytest.raises(
+            ValueError, match=rf"t\.mif: the file is damaged or not a readable image of MRtrix.*{words}"
+        ):
             hj.io.read_tensors(tmp_path / "t.mif")
     (tmp_path / "t.mih").write_bytes(whole)
     with pytest.raises(ValueError, match=r"MRtrix makes one file of it: mrconvert .*t\.mih .*t\.mif"):
