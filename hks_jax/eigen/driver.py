@@ -12,6 +12,7 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
+from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest, widened
@@ -51,9 +52,10 @@ def eigenpairs(
         solver: ``"auto"`` (by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
             ``"shift-invert"`` (on the host), ``"block-lanczos"`` (2D and surfaces above all),
             ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
-            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``. Of matrices and forms of
-            your own that may be indefinite, and in an interval, only ``"dense"`` and ``"block-lanczos"``; derivatives
-            in an interval take the tolerance of the solver's ``adjoint`` alone.
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``. Matrices and
+            forms of your own that may be indefinite, and intervals, take only ``"dense"`` and ``"block-lanczos"``;
+            the former, where values are concrete, ``"shift-invert"`` too. Derivatives in an interval take the tolerance
+            of the solver's ``adjoint`` alone.
         mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
         multiplet: what to do with a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns;
             ``"drop"`` leaves its copies out of every signature; ``"complete"`` computes 8 pairs more and takes the
@@ -168,6 +170,10 @@ def _lowest(
         pairs = solve_doubled(pencil, solvers, size, extra, throw, report)
     else:
         pairs = solve_lowest(widened(pencil, solvers, size + extra).parts[0], solvers[0], size, extra, throw, report)
+        found = jax.lax.stop_gradient(pairs)
+        doubtful = solver == "auto" and isinstance(solvers[0], ShiftInvert) and not pencil.bounded
+        if doubtful and (found.unconfirmed or not found.converged.all()):  # as where k cuts many copies
+            pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
     return truncate(pairs, k, multiplet)
 
 

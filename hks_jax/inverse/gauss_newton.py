@@ -1,5 +1,6 @@
 """A matrix-free Gauss–Newton method with Levenberg–Marquardt damping and conjugate gradients."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -168,7 +169,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         solution = conjugate_gradients(normal, precondition, column, tolerance[None], most=most, orthogonal=True)
         x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
         promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
-        return -x, eqx.tree_at(lambda s: (s.gradient, s.promised), state, (gradient, promised))
+        # A stationary point needs no step; a step of size zero would show no convergence.
+        stationary = jnp.all(gradient == 0)
+        done, damped = state.done | stationary, jnp.where(stationary, 0, state.damped)
+        return -x, dataclasses.replace(state, gradient=gradient, promised=promised, done=done, damped=damped)
 
     def init(
         self, fn: Callable, y: Values, args: Any, options: _Options, f_struct: Any, aux_struct: Any, tags: _Tags

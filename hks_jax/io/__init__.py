@@ -1,4 +1,4 @@
-"""Files: tensors, masks, meshes and results in many formats; tensors fitted to diffusion-weighted images."""
+"""Read and write files of tensors, masks, meshes and results; fit tensors to diffusion-weighted images."""
 
 from hks_jax.io.dwi import ExampleBrain as ExampleBrain
 from hks_jax.io.dwi import find_example_brain as find_example_brain

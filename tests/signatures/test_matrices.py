@@ -151,14 +151,13 @@ def test_potentials_from_every_solver(rng):
     np.testing.assert_allclose(K, np.asarray(pencil.stiffness.to_dense()) + np.diag(V), rtol=1e-13)
     exact = scipy.linalg.eigvalsh(K, M)[:8]
     assert exact[0] < 0
-    for solver in ("auto", "dense", "block-lanczos"):
+    for solver in ("auto", "dense", "shift-invert", "block-lanczos"):
         pairs = hj.eigenpairs(moved, 8, solver=solver)
         np.testing.assert_allclose(pairs.eigenvalues, exact, rtol=1e-9)
         assert pairs.converged.all()
         assert pairs.complete_below >= pairs.eigenvalues[-1]
-    for solver in ("shift-invert", "chebyshev-filter"):
-        with pytest.raises(ValueError, match=f"solver: '{solver}' needs a stiffness that is positive semidefinite"):
-            hj.eigenpairs(moved, 8, solver=solver)
+    with pytest.raises(ValueError, match="solver: 'chebyshev-filter' needs a stiffness that is positive semidefinite"):
+        hj.eigenpairs(moved, 8, solver="chebyshev-filter")
     with pytest.raises(ValueError, match=r"null_vectors: the stiffness does not annihilate vector 0: .*with_stiffness"):
         hj.eigenpairs(eqx.tree_at(lambda p: p.stiffness, pencil, moved.stiffness), 8)
 
@@ -230,7 +229,7 @@ def test_what_sparse_pencil_refuses():
     bad[1, 1] = 2
     with pytest.raises(ValueError, match=r"null_vectors: the stiffness does not annihilate vector 1: ‖Kv‖ is 0\.\d+"):
         hj.sparse_pencil(K, M, null_vectors=bad)
-    with pytest.raises(ValueError, match="null_vectors: they depend on each other"):
+    with pytest.raises(ValueError, match="null_vectors: got dependent vectors"):
         hj.sparse_pencil(K, M, null_vectors=rigid[[0, 1, 0]])
     with pytest.raises(ValueError, match=r"null_vectors: got shape \(36,\); expected \(m, 36\)"):
         hj.sparse_pencil(K, M, null_vectors=rigid[0])
@@ -368,7 +367,7 @@ def test_pairs_in_an_interval_stay_so_in_files(tmp_path):
     moved = hj.sparse_pencil(path(30) + sp.diags(np.linspace(-1, 1, 30)))
     file = save_pairs(tmp_path / "moved.npz", hj.eigsh(moved, k=3))
     load_pairs(file, moved)
-    with pytest.raises(ValueError, match="these pairs do not solve"):
+    with pytest.raises(ValueError, match="the pairs do not solve"):
         load_pairs(file, hj.sparse_pencil(5 * path(30)))
 
 
