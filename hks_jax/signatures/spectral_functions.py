@@ -1,4 +1,4 @@
-"""Spectral functions Φ f(Λ) Φᵀ, on which every signature stands, and their derivative rule."""
+"""Spectral functions Φ f(Λ) Φᵀ, which all signatures use, and their derivative rule."""
 
 import operator
 from functools import partial, reduce
@@ -162,7 +162,7 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
     return rows, own[rows]
 
 
-# The transpose computes its intermediate results again: kept, they would be two copies of the eigenvectors.
+# The transpose recomputes intermediate results, because storing them would take twice the memory of the eigenvectors.
 @jit_quickly(static_argnames=("fixed", "copies"), linear=("d_frame", "change"), like=like, on_host=on_host)
 @partial(jax.checkpoint, static_argnums=(5, 6))
 def _tangent(
@@ -177,7 +177,7 @@ def _tangent(
     change: Pencil,
     reader: Pencil | None,
 ) -> Array:
-    """Return the derivative by the change of one part: of values, vectors, those kept, and their moving frame."""
+    """Return the derivative by the change of one part, given the pairs and the derivative of their frame."""
     values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
         vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these
@@ -187,7 +187,7 @@ def _tangent(
     size = even_size(len(vectors), _ROWS)
     starts, place = row_blocks(len(vectors), size)
 
-    @jax.checkpoint  # reverse mode would keep a copy of the vectors
+    @jax.checkpoint  # reverse mode would otherwise store a copy of the vectors
     def products(start: Array) -> list[Float[Array, "size k"]]:
         own = space.transfer(jax.lax.dynamic_slice_in_dim(vectors, start, size), change.space)
         images = (change.space.transfer(matrix.apply(own), space) for matrix in (change.stiffness, change.mass))
