@@ -490,8 +490,8 @@ def test_bad_files_are_one_line_and_code_2(npz, nifti, tmp_path, capsys):
     np.savez(tmp_path / "bad.npz", tensors=-metric())
     code = main(["hks", str(tmp_path / "bad.npz"), *out])
     assert one_error(capsys, code, "168 of 168 tensors are not positive definite", "worst eigenvalue") == 2
-    assert one_error(capsys, main(["hks", str(npz), "-o", str(npz)]), "is a file; expected a folder") == 2
-    assert one_error(capsys, main(["hks", str(npz), "-o", str(npz / "out")]), "is a file; expected a folder") == 2
+    assert one_error(capsys, main(["hks", str(npz), "-o", str(npz)]), "got a file; expected a folder") == 2
+    assert one_error(capsys, main(["hks", str(npz), "-o", str(npz / "out")]), "got a file; expected a folder") == 2
     assert not (tmp_path / "out").exists()
 
 
