@@ -101,7 +101,7 @@ def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(
         ({"tensors": np.full((*SHAPE, 2, 2), np.nan)}, "tensors: got NaN or infinite"),
         ({"maps": {"age": np.ones(3)}}, r"maps\['age'\]: got shape \(3,\)"),
         ({"labels": np.ones(SHAPE) / 2}, "labels: got fractional numbers"),
-        ({"labels": np.zeros(SHAPE)}, "labels: 0 everywhere"),
+        ({"labels": np.zeros(SHAPE)}, "labels: got 0 at all nodes"),
         ({"labels": np.zeros((3, 3))}, "labels: got shape"),
         ({"normalisation": "flatt"}, "normalisation: got 'flatt'"),
         ({"lengths": TIMES[1:]}, r"lengths: got shape \(6,\)"),
