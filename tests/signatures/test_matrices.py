@@ -157,7 +157,7 @@ def test_potentials_from_every_solver(rng):
         assert pairs.converged.all()
         assert pairs.complete_below >= pairs.eigenvalues[-1]
     for solver in ("shift-invert", "chebyshev-filter"):
-        with pytest.raises(ValueError, match=f"solver: '{solver}' needs a stiffness that is positive semidefinite"):
+        with pytest.raises(ValueError, match=f"solver: got '{solver}', which needs a positive semidefinite stiffness"):
             hj.eigenpairs(moved, 8, solver=solver)
     with pytest.raises(ValueError, match=r"null_vectors: the stiffness does not annihilate vector 0: .*with_stiffness"):
         hj.eigenpairs(eqx.tree_at(lambda p: p.stiffness, pencil, moved.stiffness), 8)
@@ -214,7 +214,7 @@ def test_a_geometry_that_is_lacking_is_named():
     ):
         with pytest.raises(ValueError, match=f"needs the {lacking} .*; give `sparse_pencil"):
             signature()
-    with pytest.raises(ValueError, match="Weyl's law needs dimension and volume"):
+    with pytest.raises(ValueError, match="problem: got one without dimension or volume"):
         hj.weyl_count(pairs, [1.0])
     with pytest.raises(ValueError, match="domain: nothing is known of the null space"):
         hj.hks(pairs, TIMES, method="spectrum-free")
