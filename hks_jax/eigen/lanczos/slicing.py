@@ -62,9 +62,7 @@ def _consider(
     missing = below - known
     complete = trial.sound & (missing == 0)
     last = jnp.sort(state.values)[plan.wanted - 1]
-    all_wanted = (known >= plan.wanted) | (
-        last * (1 - 2 * _COPY) < state.shift
-    )  # `last` within its own multiplet suffices
+    all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
     finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no more exist
     # If as many are missing at a nearer shift, they are equal eigenvalues. Then search there, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
