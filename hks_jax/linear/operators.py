@@ -1,4 +1,4 @@
-"""Symmetric linear operators: a matrix by its entries at the places of a pattern, or by its diagonal."""
+"""Symmetric linear operators: sparse matrices with a static pattern, and diagonal matrices."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -24,7 +24,7 @@ ROUNDING = 1000
 
 
 class Operator(eqx.Module):
-    """A symmetric matrix, applied without being formed."""
+    """A symmetric matrix, applied without forming the full matrix."""
 
     @property
     @abstractmethod
@@ -37,7 +37,7 @@ class Operator(eqx.Module):
 
     @abstractmethod
     def of_columns(self) -> OfColumns:
-        """Return the product with a block of columns; for products in a loop, call this outside."""
+        """Return the product with a block of columns, as a function; call this outside a loop of products."""
 
     @abstractmethod
     def triplets(self) -> tuple[Float[Array, " nnz"], Places]:
@@ -45,7 +45,7 @@ class Operator(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(n_dof, n_dof)."""
+        """The shape (n_dof, n_dof)."""
         return (self.size, self.size)
 
     @property
@@ -82,25 +82,25 @@ def _scattered(data: Float[Array, " nnz"], rows: Any, cols: Any, shape: tuple[in
 
 
 class PatternedOperator(Operator):
-    """A matrix with entries at the places of a pattern, which can be factorised."""
+    """A matrix with a static sparsity pattern, which can be factorised."""
 
     @property
     @abstractmethod
     def pattern(self) -> Pattern:
-        """Where the entries are; static."""
+        """The sparsity pattern; static."""
 
     @abstractmethod
     def flat(self) -> Float[Array, " m"]:
-        """Return the array of entries into which the pattern's places point."""
+        """Return the array of entries that the pattern's places index."""
 
     @abstractmethod
     def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
         """Return the matrix with other entries at the same places."""
 
     def plus(self, diagonal: Float[Array | np.ndarray, " n"]) -> "PatternedOperator":
-        """Return the sum with a diagonal matrix, (n_dof,)."""
+        """Return the sum with a diagonal matrix, given as an array (n_dof,)."""
         if np.shape(diagonal) != (self.size,):
-            raise ValueError(f"diagonal: got shape {np.shape(diagonal)}; expected {(self.size,)}, one number a row")
+            raise ValueError(f"diagonal: got shape {np.shape(diagonal)}; expected {(self.size,)}, one number per row")
         minus = DiagonalOperator(-jnp.asarray(diagonal, self.dtype))
         return self.with_flat(shifted(self, minus, jnp.ones((), self.dtype)))
 
@@ -111,13 +111,13 @@ class PatternedOperator(Operator):
 
 
 class SparseOperator(PatternedOperator):
-    """A matrix with any pattern.
+    """A sparse matrix with an arbitrary symmetric pattern.
 
     Attributes:
-        entries: (m,) in the order of the pattern.
+        entries: the entries (m,) in the order of the pattern.
         structure: the pattern; static.
-        table: the pattern's table as arrays, which compiled computations take for arguments; None makes constants of
-            it, which the compiler reads. Of a million rows that takes seconds for each computation.
+        table: the pattern's table as arrays, which are arguments of compiled functions. With None, the table is a
+            constant, which for a million rows adds seconds to each compilation.
     """
 
     entries: Float[Array, " m"]
@@ -126,7 +126,7 @@ class SparseOperator(PatternedOperator):
 
     @property
     def pattern(self) -> SparsePattern:
-        """Where the entries are; static."""
+        """The sparsity pattern; static."""
         return self.structure
 
     def flat(self) -> Float[Array, " m"]:
@@ -139,7 +139,7 @@ class SparseOperator(PatternedOperator):
 
     @jax.jit
     def symmetric_part(self) -> "SparseOperator":
-        """Return (A + Aᵀ)/2: an entry and the one across the diagonal become one parameter, in derivatives too."""
+        """Return (A + Aᵀ)/2, so that also in derivatives, entries (i, j) and (j, i) are one parameter."""
         return self.with_flat((self.entries + self.entries[self.pattern.across]) / 2)
 
     @property
@@ -155,7 +155,7 @@ class SparseOperator(PatternedOperator):
         return of_each_row(self.of_columns(), x.reshape(-1, self.size)).reshape(x.shape)
 
     def of_columns(self) -> OfColumns:
-        """Return the product with a block of columns, or with one vector."""
+        """Return the product with a block of columns or with a vector, as a function."""
         table = self._places
         ordered = list(self.entries.at[table.entries].get(mode="fill", fill_value=0, wrap_negative_indices=False))
 
@@ -201,7 +201,7 @@ class DiagonalOperator(Operator):
 
 @jit_quickly()
 def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, ""]) -> Inexact[Array, " m"]:
-    """Return the entries of K − σM at the places of K's pattern, which has those of M; σ may be complex."""
+    """Return the entries of K − σM at the places of K's pattern, which contains M's; σ may be complex."""
     dtype = np.result_type(stiffness.dtype, shift.dtype)
     entries = stiffness.flat().astype(dtype)
     if isinstance(mass, PatternedOperator):
@@ -212,11 +212,11 @@ def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, 
 
 
 def require_symmetric(name: str, values: Any, places: Places, size: int, remedy: str) -> None:
-    """Raise ValueError unless entries, of which those at one place add up, are finite and symmetric up to rounding."""
+    """Raise ValueError unless a matrix is finite and symmetric up to rounding. Repeated places add up."""
     data, (rows, cols) = np.asarray(values), places
     wrong = int((~np.isfinite(data)).sum())
     if wrong:
-        raise ValueError(f"{name}: {wrong} of {data.size} entries are NaN or infinite")
+        raise ValueError(f"{name}: {wrong} of {data.size} entries are NaN or infinite; expected finite numbers")
     held = coo_matrix((data, (rows, cols)), shape=(size, size)).tocsr()
     difference = abs(held - held.T).tocoo()
     largest = float(np.max(np.abs(data), initial=0))
