@@ -56,13 +56,12 @@ def eigenpairs(
         mass: ``"consistent"`` or ``"lumped"``; a given pencil already has it.
         multiplet: the treatment of a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns.
             ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8 additional pairs and includes
-            the missing ones, or drops the eigenvalue if 8 are too few. The arrays contain excluded pairs; ``.kept``
-            marks them.
+            the missing ones, or drops the eigenvalue if 8 are too few. Excluded pairs stay in the arrays (see
+            ``.kept``).
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge, also under
             `jit`, by a callback to the host. Otherwise ``.result`` has the code and derivatives are NaN; concrete
             values also cause a warning.
-        progress: a function, such as ``print``, that receives short texts during the computation if values are
-            concrete.
+        progress: a function such as ``print`` that receives short texts during a computation with concrete values.
         interval: (a, b), to compute all eigenpairs with a ≤ λ < b instead of the lowest.
         quadrature: see `assemble`; a given pencil already has it.
 
@@ -121,9 +120,9 @@ def eigsh(
     ``eigsh(K, M, k)`` is ``eigenpairs(sparse_pencil(K, M), k)``. It corresponds to `scipy.sparse.linalg.eigsh` with
     ``which="LM"`` and ``sigma`` below the spectrum, but needs no shift. K may be singular, with any null space, or
     indefinite. Eigenvectors are the *rows* of ``.vectors``. Multiple eigenvalues are found with their full
-    multiplicity. If values are traced and a multiplicity exceeds about forty, pairs may be missing; ``.result`` then
-    reports it. For the largest eigenvalues, negate K; for interior eigenvalues, give the interval. K and M cannot be a
-    ``LinearOperator``, because they are factorised (by nested dissection).
+    multiplicity. If values are traced, an eigenvalue of multiplicity above about forty may lack pairs; then ``.result``
+    is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the interval. K and M
+    cannot be a ``LinearOperator``, because they are factorised (by nested dissection).
 
     First derivatives with respect to the entries of K and M are available in forward and reverse mode. At any
     multiplicity they are exact for signatures and for sums over all equal eigenvalues. The derivative of an eigenvector

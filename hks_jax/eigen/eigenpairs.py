@@ -48,13 +48,11 @@ class Eigenpairs(eqx.Module):
         vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. Under "mirror" and "mean" this holds
             on the doubled domain; so each doubling divides the norm here by √2.
         frame: (k, n_dof) the same values as `vectors`, but another derivative. It excludes the rotations of the
-            eigenfunctions among themselves. These rotations are singular at multiple eigenvalues, and signatures do not
-            need them.
+            eigenfunctions among themselves. They are singular at multiple eigenvalues, and irrelevant to signatures.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the distance of λ from `spectral_origin`, but at least
             by the mean gap of the eigenvalues.
-        converged: (k,) whether the residual is at most the solver's tolerance, or the level of rounding if that is
-            larger.
+        converged: (k,) whether the residual is at most the solver's tolerance, or the level of rounding if larger.
         kept: (k,) whether each pair belongs to the truncated spectrum. This is false only for the last pairs, if a
             multiple eigenvalue that k cuts was dropped or completed; signatures then exclude these pairs.
         part: (k,) under "mirror" and "mean" the index of the pencil's part that each pair belongs to (0 is the Neumann
@@ -169,8 +167,7 @@ class Eigenpairs(eqx.Module):
     def unconfirmed(self) -> Bool[Array, ""]:
         """Whether the solver's certificate ends before the last eigenvalue.
 
-        If a lower bound of the spectrum is known, a missing certificate (NaN) does not count, because some solvers have
-        none.
+        If a lower bound of the spectrum is known, the certificate is optional, because some solvers have none.
         """
         if not self.k:
             return jnp.zeros((), bool)
@@ -182,7 +179,7 @@ class Eigenpairs(eqx.Module):
     def result(self) -> RESULTS:
         """The most serious failure, a traceable code: compare with ``RESULTS.successful``, or call its ``error_if``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
-        code: Any = RESULTS  # mypy takes its members for strings
+        code: Any = RESULTS  # mypy sees its members as strings
         result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
         result = code.where(jnp.all(self.converged), result, code.unconverged)
         return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)

@@ -35,7 +35,7 @@ _JUST_BELOW = 0.625
 _ALIKE = 1e-3
 """The relative width of a bracket below which the eigenvalues in it count as one multiple eigenvalue."""
 _NARROW = 8
-"""The width, in units of the distance below zero, at which a bracket is no longer divided."""
+"""The width of a bracket, in units of the distance below zero of the first count, at which division stops."""
 
 Scalar = Float[Array, ""]
 Number = Int[Array, ""]
@@ -240,8 +240,7 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
     high, number = jnp.where(lower, state.next, state.high), jnp.where(lower, count, state.number)
     first = jnp.where(lower & (count != state.number), state.next, state.first)
     share = jnp.clip(wanted / jnp.maximum(number, 1).astype(dtype), 1 / 16, 1 / 2)
-    # If the bracket has no lower end, search downwards, and if it has no upper end, upwards, in steps that grow by
-    # four.
+    # Without a lower end, search downwards; without an upper end, search upwards. Steps grow by a factor of four.
     reach = size * jnp.asarray(4.0, dtype) ** (state.tries - 1).astype(dtype)
     up = jnp.maximum(low, 0) + reach * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)

@@ -63,8 +63,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         if not is_traced(below) and below > 2 * half:
-            # If the multiplicity of the lowest eigenvalue exceeds k, compute all its pairs, because the count includes
-            # them.
+            # If the lowest eigenvalue has a multiplicity above k, compute all its pairs: the count includes them.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
 

@@ -16,7 +16,7 @@ from hks_jax.linear.products import aligned, matmul
 
 _FAILURE = 1e-6
 _START = 30
-"""A bound of the nonuniformity of the random start of a Lanczos bound: more than the root of the condition of PD."""
+"""The assumed deviation of the start of `lanczos_bound` from a uniform one: above the root of the condition of PD."""
 
 Scalar = Float[Array, ""]
 Columns = Float[Array, "*shape b"]
@@ -132,8 +132,8 @@ def lanczos_bound(
 ) -> Scalar:
     """Return an upper bound of the eigenvalues of PK by Lanczos iteration.
 
-    From a random start, the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ with probability at least 1 −
-    1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is θ/(1 − ε) for the ε at
+    From a random start, the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ with probability at least
+    1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is θ/(1 − ε) for the ε at
     which the probability of failure is 10⁻⁶. The start is normally distributed with respect to D instead of P⁻¹; a
     safety factor accounts for the difference.
     """

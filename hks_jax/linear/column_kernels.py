@@ -219,8 +219,8 @@ def _product(x: Float[Array, "m s"], y: Float[Array, "s s"]) -> Float[Array, "m 
 def _pivoted_cholesky(a: Small, floor: float, rank: int) -> tuple[Small, Small]:
     """Return F with FFᵀ = A, except for pivots raised to ``floor``, and F⁻ᵀ; the first ``rank`` columns of both.
 
-    Let p be the k-th pivot row. Since F[p, j] = 0 for j > k, column p of CFᵀ = I gives the k-th column of C = F⁻ᵀ: F[p,
-    k] C[:, k] = e_p − Σ_{j<k} F[p, j] C[:, j].
+    Let p be the k-th pivot row. Since F[p, j] = 0 for j > k, column p of CFᵀ = I gives the k-th column of C = F⁻ᵀ:
+    F[p, k] C[:, k] = e_p − Σ_{j<k} F[p, j] C[:, j].
     """
     index = jax.lax.broadcasted_iota(jnp.int32, (a.shape[0],), 0)
 

@@ -121,9 +121,8 @@ def conjugate_gradients(
         else:
             before = direct(before)
             state, regular = advance(before)
-            # The preconditioned residual gives the error before this step. Assume that the step reduces the error by
-            # the same factor as the previous one; this saves one application of the preconditioner, the dearest
-            # operation.
+            # The preconditioned residual gives the error before this step. Assuming that the step reduces it by the
+            # same factor as the previous step saves one (expensive) application of the preconditioner.
             reduction = xp.where(before.fresh, 1, xp.sqrt(xp.minimum(xp.abs(before.change), 1)))
             error = relative(before.energy, before.first) * reduction
         errors = xp.where(before.going, xp.where(regular, error, xp.inf), before.errors)

@@ -84,8 +84,8 @@ def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Mat
 #
 # Ω is antisymmetric. In the derivative of VₑVₑᵀ, the projector on an eigenspace, the entries of Ω within the eigenspace
 # cancel, so that the rule may set them to zero. The derivative of tr f(A) = Σ f(λᵢ) does not contain them either.
-# Second derivatives contain the derivative of 1/gap, which is NaN at equal eigenvalues, because a sum such as Σᵢ f'(λᵢ)
-# Gᵢᵢ depends on the omitted entries.
+# Second derivatives contain the derivative of 1/gap, which is NaN at equal eigenvalues, because a sum such as
+# Σᵢ f'(λᵢ) Gᵢᵢ depends on the omitted entries.
 @differentiable_eigh.defjvp
 def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
     values, vectors = differentiable_eigh(tolerance, primals[0])
@@ -128,8 +128,8 @@ def standard_form(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
     return lapack.triangular_solve(factor, half.T), factor
 
 
-# Let L̇ = LP with P lower triangular. Then Ḃ = L̇Lᵀ + LL̇ᵀ gives P + Pᵀ = L⁻¹ḂL⁻ᵀ. For C = L⁻¹AL⁻ᵀ it follows that Ċ =
-# L⁻¹ȦL⁻ᵀ − PC − CPᵀ.
+# Let L̇ = LP with P lower triangular. Then Ḃ = L̇Lᵀ + LL̇ᵀ gives P + Pᵀ = L⁻¹ḂL⁻ᵀ. For C = L⁻¹AL⁻ᵀ it follows that
+# Ċ = L⁻¹ȦL⁻ᵀ − PC − CPᵀ.
 @standard_form.defjvp
 def _standard_form_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[tuple, tuple]:
     reduced, factor = standard_form(*primals)

@@ -40,7 +40,8 @@ class Dissection(NamedTuple):
 def dissect(pattern: Pattern) -> Dissection:
     """Return the elimination tree of a matrix with this pattern.
 
-    Raises: ValueError: the factors have 2³¹ or more entries.
+    Raises:
+        ValueError: the factors have 2³¹ or more entries.
     """
     return _dissect(pattern, accelerators.at_hand())
 
@@ -56,8 +57,7 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     above = np.flatnonzero(order_of_ends > 0)
     boundaries = _boundaries(level, front, depth, rows[above], cols[above])
     ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
-    # The width is at least 1, and only padding if no front is coupled; but it is 0 on the first level, which has no
-    # parent.
+    # The width is at least 1 (only padding if no front is coupled), except on the first level, which has no parent.
     width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
     # For each boundary node of a level: its front, and its place among the own and boundary nodes of the parent.
     placed = [(keys // n, slot[keys % n]) for keys in boundaries]

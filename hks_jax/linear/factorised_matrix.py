@@ -54,7 +54,7 @@ class FactorisedMatrix(eqx.Module):
         factor: LDLᵀ. Derivatives treat it as a constant.
         sound: whether a test with random right-hand sides shows that the factorisation is accurate enough. Then its
             inertia is that of A, and iterative refinement converges. Otherwise results are NaN.
-        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. It bounds the error of
+        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. It estimates the error of
             log|det A| and the relative error of A⁻¹. It is infinite if pivots were replaced; then log|det A| and A⁻¹
             are NaN. Solutions are refined, and more accurate.
     """
@@ -141,7 +141,8 @@ def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Arra
 def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMatrix:
     """Factorise a symmetric matrix A. Only one of each pair of entries equal by symmetry is read.
 
-    Raises: ValueError: A is concrete, and not finite or singular. The message begins with the given name.
+    Raises:
+        ValueError: A is concrete, and not finite or singular. The message begins with the given name.
     """
     ones = jnp.ones(matrix.size, matrix.dtype)
     pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))

@@ -40,8 +40,7 @@ def _matrix_by_matrix(function: Callable[P, T]) -> Callable[P, T]:
 def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Return the eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors in columns.
 
-    Only the lower triangle is read. No function of this file is differentiable; `hks_jax.linear.dense_eigh` has the
-    rule.
+    Only the lower triangle is read. No function of this file is differentiable; see `hks_jax.linear.dense_eigh`.
     """
     vectors, values = jax.lax.linalg.eigh(a, symmetrize_input=False)
     return values, vectors

@@ -23,8 +23,8 @@ Function = Callable[[Any, Any, Array], Array]
 def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:
     """Compute f(A) = V f(Λ) Vᵀ of a dense symmetric matrix A = VΛVᵀ, differentiably.
 
-    With B, the result is V f(Λ) Vᵀ = f(B⁻¹A) B⁻¹, where AV = BVΛ and VᵀBV = I. For example, f(λ) = 1 gives B⁻¹, f(λ) =
-    1/λ gives A⁻¹, and f(λ) = e^(−tλ) gives the heat kernel.
+    With B, the result is V f(Λ) Vᵀ = f(B⁻¹A) B⁻¹, where AV = BVΛ and VᵀBV = I. For example, f(λ) = 1 gives B⁻¹,
+    f(λ) = 1/λ gives A⁻¹, and f(λ) = e^(−tλ) gives the heat kernel.
 
     First and second derivatives exist with respect to A, B and the arrays in the closure of f, forward and reverse in
     any order. They are exact at equal eigenvalues, and accurate at nearly equal ones, because no division by a small

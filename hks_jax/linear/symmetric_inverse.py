@@ -31,7 +31,7 @@ def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inver
 
     Pivots smaller than ``least`` are replaced by ±``least``. Without ``least``, the inverse of a singular matrix is not
     finite. On CPUs, LAPACK computes Cholesky factors of large batches, which are usually definite, and eigenvalues of
-    others. Accelerators use elimination, because it has far fewer sequential operations.
+    others. Accelerators use elimination, because eigenvalues and Cholesky factors are slow there.
     """
     none = jnp.zeros(len(matrices), matrices.dtype) if least is None else least
     if not accelerators.at_hand():  # avoids tracing unused branches
@@ -134,8 +134,8 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
 
 # Sweeping a block P of A replaces P by −P⁻¹, and the rest by the Schur complement of P. After sweeping all blocks, A
 # has become −A⁻¹. By Sylvester's law of inertia, as many pivots as eigenvalues of A are negative. Let U be the rows of
-# P with P replaced by −I, and let A₀ be A with zeros in the rows and columns of P. Then the swept matrix is A₀ −
-# UᵀP⁻¹U, which takes two products and one pass over A.
+# P with P replaced by −I, and let A₀ be A with zeros in the rows and columns of P. Then the swept matrix is
+# A₀ − UᵀP⁻¹U, which takes two products and one pass over A.
 def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]) -> Matrices:
     """Sweep the block that begins at row ``at``, given its inverse."""
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)

@@ -176,7 +176,7 @@ def test_a_cut_multiplet_is_reported():
     field = flat((12, 12), (1.0, 1.0))  # λ₁ = λ₂ by symmetry
     with pytest.warns(hj.AccuracyWarning, match="is arbitrary. Take a larger k$"):
         hj.eigenpairs(two_squares(), 1)
-    with pytest.warns(hj.AccuracyWarning, match="k = 2 cuts a multiple eigenvalue: its last 1 pair.*Take k = 1 or"):
+    with pytest.warns(hj.AccuracyWarning, match="k = 2 cuts a multiple eigenvalue: the last 1 pair.*Take k = 1 or"):
         pairs = hj.eigenpairs(field, 2)
     assert pairs.cut_multiplet == 1
     assert hj.eigenpairs(field, 3).cut_multiplet == 0

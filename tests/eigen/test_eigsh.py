@@ -217,7 +217,7 @@ def test_what_is_refused():
 
 
 def test_a_cut_multiple_eigenvalue_is_told():
-    with pytest.warns(hj.AccuracyWarning, match=r"k = 3 cuts a multiple eigenvalue: its last 2"):
+    with pytest.warns(hj.AccuracyWarning, match=r"k = 3 cuts a multiple eigenvalue: the last 2"):
         hj.eigsh(lattice(12), k=3)
 
 

@@ -51,8 +51,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
         block: the number of vectors filtered together. The workspace is proportional to it.
-        spare: the number of additional vectors as a fraction of k. With more vectors, fewer but dearer rounds are
-            needed.
+        spare: the number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds.
         max_rounds: the maximal number of rounds on the finest grid.
         single_precision: whether filters run in float32.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores

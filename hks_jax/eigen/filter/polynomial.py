@@ -27,8 +27,7 @@ class Band(NamedTuple):
     def degree_for(self, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:
         """Return the degree at which the polynomial equals ``gain`` at a value below the band: gain = cosh(degree · a).
 
-        The degree is at most `MOST_DEGREE`. If a wide band needs a higher degree, pairs do not converge, and
-        `Eigenpairs` reports it.
+        The degree is at most `MOST_DEGREE`. If a wide band needs a higher degree, pairs do not converge.
         """
         below = jnp.maximum(self.low - value, 0)
         degree = jnp.arccosh(jnp.asarray(gain, value.dtype)) / jnp.arccosh(1 + 2 * below / (self.high - self.low))
@@ -50,8 +49,8 @@ class Band(NamedTuple):
 # If the mesh is coarse in one direction only, β also depends on the direction of a mode, and βμ and μ may order the
 # modes near the edge of the band differently. If the mesh is too coarse for the wanted modes, other modes with β ≈ 3⁻ᵈ
 # and much larger μ have smaller values βμ. Then W = Σⱼ (I − D⁻¹M)ʲ D⁻¹, with n more terms of the Neumann series,
-# replaces D⁻¹. The value βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large. The scale ζ/λ becomes 1 − (n +
-# 1)(1 − β)ⁿ⁺¹, because dψ/dμ = 1 − (n + 2)(1 − β)ⁿ⁺¹.
+# replaces D⁻¹. Then βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large. Since
+# dψ/dμ = 1 − (n + 2)(1 − β)ⁿ⁺¹, the scale ζ/λ becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
 #
 # W may replace D⁻¹ everywhere. Since q < 0 on both sides of ζ, −q(D⁻¹K)D⁻¹ is also a symmetric positive definite
 # preconditioner for K − λM.

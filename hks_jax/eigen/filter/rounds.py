@@ -29,9 +29,8 @@ _LEAST_DEGREE = 4
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
-"""Limits for the lumped mass: the spread of the relative shift of nearly equal eigenvalues, and the least value,
-relative to the last wanted eigenvalue, of modes above twice that. If it fails them, the filter uses a better
-inverse."""
+"""The limits beyond which the lumped mass gets further terms: the spread of the relative shifts of similar eigenvalues,
+and the least ψ, relative to the last wanted eigenvalue, of modes above twice that eigenvalue."""
 _MOST_TERMS = 15
 """The maximal number of further terms of the Neumann series of the inverse mass."""
 

@@ -38,7 +38,7 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
 
     The number of known vectors and the size are multiples of ``block``, the number of rows written at once. On
     accelerators, the basis is a single array, because skipping empty pieces would take longer than computing with them.
-    Its vectors are columns there, like those of blocks, so that no kernel transposes.
+    Its vectors are columns there, like those of blocks, so that no kernel has to transpose them.
     """
     if accelerators.at_hand():
         return jnp.pad(known.T, ((0, 0), (0, size - len(known))))

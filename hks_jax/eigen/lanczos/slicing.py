@@ -67,8 +67,7 @@ def _consider(
     # If as many are missing at a nearer shift, they are equal eigenvalues. Then search there, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
-    # If a multiplicity exceeds the wanted number, a part suffices, and the certificate is at a shift below the
-    # multiplet.
+    # If a multiplicity exceeds the wanted number, a part suffices; the certificate is then below the multiplet.
     cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
@@ -182,8 +181,7 @@ def _window(
     low = jnp.fmax(jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf), bottom)
     high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
-    # The last slice has fewer eigenvalues to find, but some beyond the last wanted one, because the certificate needs a
-    # gap.
+    # The last slice is smaller, but contains some unwanted eigenvalues, because the certificate needs a gap.
     size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2 + 2 * plan.block, plan.slice_size)
     return vectors, (low, high), jnp.minimum(steps_for(plan, size), plan.steps)
 
