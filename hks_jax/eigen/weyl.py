@@ -59,7 +59,7 @@ def weyl_count(
     if volume is None:
         raise ValueError("problem: got one without dimension or volume; give them to `sparse_pencil` for Weyl's law")
     if any(part.metric is not None and part.null_space is None for part in pencil.parts):
-        raise ValueError("problem: got a potential, which Weyl's law does not include; use `count_eigenvalues`")
+        raise ValueError("problem: got one with a potential, which Weyl's law omits; use `count_eigenvalues`")
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():

@@ -407,5 +407,5 @@ def test_counts_take_matrices_and_the_checks_of_eigenpairs():
     assert int(hj.count_eigenvalues((K, M), 2.2)) == 3
     assert int(hj.count_eigenvalues(K, 1.5)) == 1
     indefinite = sp.csr_matrix(np.diag([1.0, 1, 1, 1]) + 2 * np.eye(4, k=1) + 2 * np.eye(4, k=-1))
-    with pytest.raises(ValueError, match=r"M: it has \d negative"):
+    with pytest.raises(ValueError, match=r"M: got a matrix with \d negative"):
         hj.count_eigenvalues((K, indefinite), 1.0)
