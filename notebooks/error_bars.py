@@ -47,15 +47,15 @@ plane, again = scan(folder, rng), scan(folder, rng)
 print(*plane.notes, sep="\n")
 
 # %% [markdown]
-# `noise="residuals"` asks for the covariance of the tensors, from what the fit leaves in each voxel. It should be half
-# that of the difference of two scans:
+# `noise="residuals"` asks for the noise of the tensors, from what the fit leaves of each image. In each voxel its
+# covariance should be half that of the difference of two scans:
 
 # %%
 grid = plane.grid("largest")
 inside = grid.inside
-noise = hj.TensorNoise(plane.covariance, grid)
+noise = plane.noise(grid)
 two = hj.TensorNoise.from_scans(plane.tensors, again.tensors, grid)
-stated, seen = (np.median(np.trace(each.covariance[inside], axis1=-2, axis2=-1)) for each in (noise, two))
+stated, seen = (np.median(np.trace(each.covariance[inside], axis1=-2, axis2=-1)) for each in (plane, two))
 print(f"variance of a tensor: by residuals {stated:.3g}, by two scans {seen:.3g}; shared over {two.correlation:.2g} mm")
 assert 0.75 < stated / seen < 1.33
 
@@ -82,13 +82,14 @@ print(bars.summary())
 print("signal to noise:", np.round(bars.signal_to_noise, 1), " claimed:", bars.trusted)
 
 # %% [markdown]
-# The second scan tells whether they are right: the two maps differ by √2 deviations.
+# The second scan tells whether they are right: the two maps differ by √2 deviations. At large t a map has few
+# independent places, so that one difference tells the ratio to a factor of two or three.
 
 # %%
 difference = np.asarray(signature(again.tensors) - bars.value)
 ratio = np.nanvar(difference, axis=(1, 2)) / (2 * np.nanmean(bars.deviation**2, axis=(1, 2)))
 print("variance of the difference over the predicted one:", np.round(ratio, 2))
-assert np.all((ratio > 0.5) & (ratio < 2))
+assert np.all((ratio > 1 / 3) & (ratio < 3))
 
 # %% [markdown]
 # What noise alone could have made of flat space fades: below two deviations from 1.

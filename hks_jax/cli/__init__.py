@@ -8,7 +8,7 @@ examples:
   hks-jax hks --help
 """
 
-# The command line, `hks-jax`: errors become one line on stderr and an exit code.
+# This is the command line `hks-jax`. It reports an error as one line on stderr and as an exit code.
 
 import _thread
 import argparse
@@ -30,19 +30,19 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
 
 COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
-"""Each module has a docstring, which is its help, its `OPTIONS`, and `run`, which returns the text to print."""
+"""The modules of the commands. The docstring is the help text, `OPTIONS` lists options, and `run` runs the command."""
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
-# What users can put right: wrong values, missing files, missing extras. All else is a failure of the computation.
+# Errors that users can correct: wrong values, missing files, missing extras. Other errors mean a failed computation.
 INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
+    """An argument parser that reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the error, and leave with the exit code for bad input."""
+        """Print the error and end with the exit code for bad input."""
         self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
@@ -59,11 +59,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code.
+    """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
-    0: done; 1: the computation failed; 2: bad input; 130: interrupted. Output files appear whole
-    and, but for `paper`, `batch`, the checkpoint of `fit` and the pairs that `hks` keeps, all at the end: unless it is
-    0, there are none.
+    Output files are written atomically and together at the end, so there are none unless the exit code is 0. Exceptions
+    are `paper`, `batch`, the checkpoint of `fit` and the eigenpairs that `hks` saves.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
     if not argv:
@@ -73,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         args, unknown = parser.parse_known_args(argv)
         if unknown:
             Parser(prog=args.prog).error(f"unrecognized arguments: {' '.join(unknown)}")
-    except SystemExit as stop:  # argparse has printed its message
+    except SystemExit as stop:  # argparse has printed the message
         return int(stop.code or 0)
     progress = Progress(args.quiet)
     try:
@@ -99,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run_and_exit() -> NoReturn:
     """Run the command line as a program.
 
-    An interrupt leaves JAX's threads computing, and Python would crash while it takes them down: it leaves at once.
+    JAX's threads continue after an interrupt, and Python would crash while stopping them, so the process ends at once.
     """
     sys.unraisablehook = _interrupt_again
     code = main()
@@ -111,8 +110,8 @@ def run_and_exit() -> NoReturn:
 
 
 def _interrupt_again(unraisable: Any) -> None:
-    # Python discards exceptions in finalisers and in callbacks of the garbage collector (JAX has one). An interrupt
-    # there comes again a moment later, when the callback is over.
+    # Python discards exceptions in finalisers and in callbacks of the garbage collector, such as JAX's. The timer
+    # therefore repeats an interrupt that occurs there, after the end of the callback.
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
         threading.Timer(0.05, _thread.interrupt_main).start()
     else:

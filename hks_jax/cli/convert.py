@@ -1,8 +1,8 @@
 """Write the tensors of a file in another format.
 
-Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT in the format of its suffix:
-{written}. Components are turned to the axes that the format has them in, which OUT says itself:
-it needs neither --order nor --frame. Numbers are converted only from the unit that --unit says, to mm2/s.
+Read tensors from FILE, or fit them to diffusion-weighted images, and write them to OUT. The suffix of OUT determines
+the format: {written}. OUT declares the order and the frame of its components, so reading it
+needs neither --order nor --frame. With --unit, numbers are converted from that unit to mm2/s.
 
 examples:
   hks-jax convert dti.nrrd tensor.nii.gz
@@ -23,7 +23,7 @@ from hks_jax.io.formats import WRITTEN
 
 OPTIONS = f"""
 @file {READING}
-output OUT  the file to write; an existing one is replaced
+output OUT  the file to write; an existing file is replaced
 """
 
 
@@ -32,13 +32,13 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if not args.output.name.lower().endswith(WRITTEN):
         raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(WRITTEN)}")
     if args.output.is_dir():
-        raise IsADirectoryError(f"OUT: {args.output} is a folder; expected a file")
+        raise IsADirectoryError(f"OUT: got the folder {args.output}; expected a file")
     if args.output.exists() and args.output.samefile(args.file):
-        raise ValueError(f"OUT: {args.output} is FILE itself; choose another name")
+        raise ValueError(f"OUT: got {args.output}, the same file as FILE. Choose another name")
     volume = read(args, progress)
     invalid = int(find_invalid(volume).sum())
     if invalid:
-        progress.warn(f"{invalid} tensors are not positive definite and are written as they are; see --repair")
+        progress.warn(f"{invalid} tensors are not positive definite and are written unchanged; see --repair")
     with progress.stage("writing", str(args.output)):
         save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
     return Done([args.output], {**describe_input(volume, volume.mask), "not_positive_definite": invalid})

@@ -1,9 +1,10 @@
 """Compute the Gaussian curvature of a 2D field.
 
-Compute the Gaussian curvature of a two-dimensional field of diffusion tensors, or of a slice. FILE is read as by
+Compute the Gaussian curvature of a two-dimensional field of diffusion tensors, or of a slice. FILE is read as in
 'hks-jax hks'.
 
-Writes to the folder OUT: curvature.npz, curvature.nii.gz (or .nrrd, .vti, as FILE is), curvature.png and report.json.
+The command writes curvature.npz, curvature.png, report.json and an image in the format of FILE (curvature.nii.gz, .nrrd
+or .vti) to the folder OUT.
 
 examples:
   hks-jax curvature tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
@@ -26,12 +27,12 @@ from hks_jax.io.formats import WRITTEN
 
 OPTIONS = f"""
 @file @metric {READING} @domain @dtype @output
---periodic x|y|xy  periodic axes: behind the last node comes the first again (default none)
+--periodic x|y|xy  periodic axes, along which the first node follows the last (default none)
 @view
 """
 
 COLOURED = 0.98
-"""The part of the values that the colours span: differences of noisy tensors have a few wild ones."""
+"""The quantile of absolute values at the ends of the colour scale; differences of noisy tensors have outliers."""
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -42,8 +43,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
     if volume.dimension != 2:
         raise ValueError(
-            f"--slice: the tensors are on a volume of shape {volume.shape}, and Gaussian curvature belongs to two "
-            "dimensions; choose a slice, such as --slice z=14"
+            f"--slice: got tensors on a volume of shape {volume.shape}; expected two dimensions for the Gaussian "
+            "curvature. Choose a slice, such as --slice z=14"
         )
     field = field_of(volume, volume.grid(args.components), settings)
     inside = field.grid.inside
@@ -51,9 +52,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         curvature = np.asarray(gaussian_curvature(field, ["x" in periodic, "y" in periodic]))
     known = np.isfinite(curvature)
     if not known.any():
-        raise ValueError("tensors: no grid line inside the mask has the 8 nodes that the differences need")
+        raise ValueError("tensors: no grid line has 8 nodes inside the mask, which finite differences need")
     if lacking := int((inside & ~known).sum()):
-        progress.note(f"{lacking} nodes are too near the mask's rim for the differences: NaN there")
+        progress.note(f"the curvature is NaN at {lacking} nodes too near the mask's boundary for finite differences")
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]
     values = curvature[known].astype(np.float64)
     report = {

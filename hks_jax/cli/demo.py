@@ -1,8 +1,8 @@
 """Compute and draw the signature of a brain slice.
 
-Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The brain comes with the PyPI wheel
-mdt==1.2.7 (install it with --no-deps), the fit needs "hks-jax[dti]"; without them, or with --phantom, an analytic
-phantom takes the brain's place.
+Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The PyPI wheel mdt==1.2.7 contains
+the brain (install it with --no-deps), and the fit needs "hks-jax[dti]". Without them, or with --phantom, the command
+uses an analytic phantom instead.
 
 examples:
   hks-jax demo
@@ -26,18 +26,18 @@ from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fi
 
 OPTIONS = """
 -o,--output OUT = demo  folder for the results
---phantom  use the phantom in any case
+--phantom  use the phantom even if the brain is installed
 @view
 """
 
 B_MAX = 1000.0
-"""s/mm²; a single tensor describes the signal well up to there."""
+"""The largest b-value, in s/mm², up to which a single tensor describes the signal well."""
 RIM = 2
-"""Voxels taken off the mask: at the rim, tissue mixes with what surrounds it and fits fail."""
+"""The number of voxels eroded from the mask, because boundary voxels contain several tissues and have bad fits."""
 SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
-"""How far the heat has spread, √(Dt), at the times drawn: in voxels, from their resolution to the brain's size."""
+"""The diffusion lengths √(Dt) at the drawn times, in voxels, from one voxel to the size of the brain."""
 N_PAIRS = 600
-"""Of the two problems whose mean it is: enough for the first of these times."""
+"""The number of eigenpairs, for both boundary problems together, that the first time needs."""
 PHANTOM_SHAPE = (72, 80)
 
 
@@ -63,8 +63,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     spread = (rf"($\sqrt{{Dt}}$ ≈ {length:.2g} mm)" for length in lengths)
     titles = [f"$t$ = {number_text(t)} s  {text}" for t, text in zip(times, spread, strict=True)]
     title = (
-        rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹: 1 is flat, above is "
-        "positive curvature, that of the rim included"
+        rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat, "
+        "larger values mean positive curvature, including that of the boundary"
     )
     first = "mean diffusivity, mm²/s", mean
     drawing = partial(signature_panels, result, titles=titles, first=first, title=title, view=args.view)
@@ -76,8 +76,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 def _installed_brain(progress: Progress) -> ExampleBrain | None:
     brain = find_example_brain()
     if brain is None:
-        progress.note("no example brain: the wheel mdt==1.2.7 is not installed; using the phantom")
+        progress.note("the example brain (wheel mdt==1.2.7) is not installed; using the phantom")
     elif importlib.util.find_spec("dipy") is None:
-        progress.note('no tensor fit: DIPY is not installed (pip install "hks-jax[dti]"); using the phantom')
+        progress.note('DIPY, which fits tensors, is not installed (pip install "hks-jax[dti]"); using the phantom')
         brain = None
     return brain

@@ -1,9 +1,9 @@
 """Write a page to explore a signature in a browser.
 
-Write a page to explore the signature that 'hks-jax hks' has left in the folder OUT: one HTML file that any browser
-opens, without a network. It has sliders for t and the slice, maps of the tensors beside the signature, the curves of
-the points that you choose and their distance to all others, and the mean curves of regions, to be saved as CSV.
-Surfaces are turned by hand.
+Write a page to explore the signature that 'hks-jax hks' has written to the folder OUT. The page is one HTML file that
+any browser opens without a network. It has sliders for t and the slice, maps of the signature and of the tensors,
+curves over t at chosen points, the distance of a chosen point's curve to all others, and mean curves of regions. Curves
+can be saved as CSV, and surfaces can be rotated.
 
 examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse --times auto:24
@@ -30,10 +30,10 @@ from hks_jax.io.volume import TensorVolume
 OPTIONS = """
 result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 -o,--output PAGE  the page (default: explore.html in OUT)
---labels FILE  regions: whole numbers on the same voxels or at the vertices, 0 for none (NIfTI, .npy)
+--labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, .npy)
 @names
 --title TEXT  the page's title (default: the name of the tensors' file)
---unit TEXT  the unit of t (default: s for D⁻¹ of tensors fitted here, else none)
+--unit TEXT  the unit of t (default: s for the metric D⁻¹ of tensors from --bval and --bvec, otherwise none)
 """
 
 
@@ -46,12 +46,12 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if page.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"--output: got {page}; expected a name that ends in .html")
     if args.labels is None:
-        refuse(args, ("names",), "it names labels; pass --labels too")
+        refuse(args, ("names",), "this option names the labels, which are missing; pass --labels too")
     with progress.stage("reading", str(source)):
         result = Result.read(source, "hks", over_times=True)
         place, affine, world = result.place, None, None
         if isinstance(place, TetMesh):
-            raise ValueError(f"{source}: is on tetrahedra; expected a grid or a surface. ParaView shows the .vtu there")
+            raise ValueError(f"{source}: got a result on tetrahedra; expected a grid or a surface. Use ParaView")
         if isinstance(place, TensorVolume) and place.affine is not None:
             affine, axes = place.affine, [a for a in range(4) if place.dimension == 3 or a != place.thin_axis]
             world = affine[:3, axes]
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def _spread(result: Result) -> np.ndarray | None:
-    """Return √(Dt), where t is the time of a diffusion: with the median of the mean diffusivity inside."""
+    """Return the lengths √(Dt) for the metric D⁻¹, where D is the median mean diffusivity inside; otherwise None."""
     tensors = result.arrays.get("input_tensors")
     if tensors is None or result.settings.get("metric") != "inverse":
         return None

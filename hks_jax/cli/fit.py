@@ -1,10 +1,10 @@
 """Find the metric that has a given signature.
 
-Find the metric that has a given heat kernel signature. TARGET is an npz as 'hks-jax hks' writes it without
-normalisation: 'hks' (n_times, *shape), 'times', 'spacing', 'origin' and, optional, 'mask', 'affine'.
+Find the metric that has a given heat kernel signature. TARGET is an npz that 'hks-jax hks' wrote without
+normalisation. It contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and optionally 'mask' and 'affine'.
 
-Writes to the folder OUT: tensors.npz (the metric), fit.npz (its signature, and the loss at each step), fit.png (in two
-dimensions) and report.json. Ctrl-C ends the fit, and writes the best metric so far.
+The command writes to the folder OUT: tensors.npz (the metric), fit.npz (its signature, and the loss at each step),
+fit.png (in two dimensions) and report.json. Ctrl-C ends the fit and writes the best metric found until then.
 
 example:
   hks-jax fit out/hks.npz -o fitted --parametrisation conformal --noise 0.01 --h1 1e-4 --checkpoint fit.part.npz
@@ -31,47 +31,47 @@ from hks_jax.io.result import Result, plain, recorded_boundary
 from hks_jax.io.volume import digest
 
 OPTIONS = f"""
-target TARGET  the signature: .npz
+target TARGET  the signature, an .npz file
 @output
---init FILE  tensors to start from: {FORMATS} (default: identity)
+--init FILE  the initial tensors: {FORMATS} (default: identity)
 --metric tensor|inverse|adjugate
-    the metric of the tensors D of --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹; must be chosen but
-    for NumPy's files, which hold the metric itself unless you choose
---order ORDER  order of the components of --init, where the file does not declare it
+    the metric of the tensors D in --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹. This option is
+    required except for NumPy's files, whose tensors are the metric by default
+--order ORDER  order of the components in --init, if the file does not declare it
 @interpolation
 --parametrisation log-euclidean|cholesky|conformal|eigenvalues|rotation = log-euclidean
-    what varies: the whole tensor as log-euclidean (default) or cholesky; or of --init a conformal factor, the
-    eigenvalues, or the rotation
+    the unknowns of the fit: the whole tensor, as log-euclidean (default) or cholesky; or only a conformal factor, the
+    eigenvalues, or the rotation of the tensors in --init
 --boundary CONDITION
-    the target's, written as for 'hks-jax hks' (default what TARGET says of itself, else neumann)
--k K  number of eigenpairs (default: all but 1e-6 of the heat trace at the smallest time)
---noise SIGMA  standard deviation of the logarithm of the target (0.01 for 1 %): stop where the misfit reaches it
+    the boundary condition of the target, as for 'hks-jax hks' (default: the condition in TARGET, otherwise neumann)
+-k K  number of eigenpairs (default: enough for all but 1e-6 of the heat trace at the smallest time)
+--noise SIGMA  standard deviation of the logarithm of the target (0.01 for 1 %); the fit stops at this misfit
 --smoothness LENGTH
-    length, in units of the spacing, below which steps are smooth (default a tenth of the domain, and 0 for conformal
-    without --noise)
---h1 WEIGHT  penalise slopes: ½ WEIGHT · mean |∇p|² of the parameters p
---tv WEIGHT  penalise total variation, which keeps edges sharp
---max-steps N = 50  steps per stage
---continuation N = 1  stages, large times first
---starts N = 1  starts, from random changes of --init
---seed N = 0  of the starts after the first
---optimiser gauss-newton|lbfgs|bfgs = gauss-newton  how the misfit is reduced
---checkpoint FILE  written after each step; if it is there, go on from it
+    smoothing length of the steps, in coordinate units (default a tenth of the domain, or 0 for conformal without
+    --noise)
+--h1 WEIGHT  penalise slopes by ½ WEIGHT · mean |∇p|² of the parameters p
+--tv WEIGHT  penalise the total variation, which keeps edges sharp
+--max-steps N = 50  largest number of steps per stage
+--continuation N = 1  number of stages, which add times from large to small
+--starts N = 1  number of starts; all but the first begin at random perturbations of --init
+--seed N = 0  seed of the random perturbations
+--optimiser gauss-newton|lbfgs|bfgs = gauss-newton  optimisation method
+--checkpoint FILE  file that is written after each step; if the file exists, the fit continues from it
 @dtype @view
 """
 
 
 _OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
-"""Options that `Search` takes as they are."""
+"""Options that are arguments of `Search` with the same name."""
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.init is None:
-        refuse(args, ("metric", "order"), "is about the tensors of --init; give both or none")
+        refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
     elif args.metric is None and image_suffix(args.init):
         raise ValueError(
-            "--metric: choose inverse, tensor or adjugate; --init has diffusion tensors, which are no metric"
+            "--metric: --init has diffusion tensors, so a metric must be chosen: inverse, tensor or adjugate"
         )
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation
@@ -80,13 +80,13 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     use_dtype(args.dtype)
     with progress.stage("reading", str(args.target)):
         target = Result.read(args.target, "hks", over_times=True)
-        # The mask is the domain of a signature that was computed: its pieces were wanted.
+        # The mask is the domain of the computed signature, so all of its components belong to the domain.
         grid = target.grid
         init = _initial(args, grid, progress)
         if args.boundary is None:
             recorded = recorded_boundary(target.settings)
             args.boundary = recorded or "neumann"
-            origin = "the target's" if recorded else "the target says none"
+            origin = "recorded in the target" if recorded else "the default, because the target records none"
             progress.note(f"boundary {json.dumps(args.boundary)} ({origin})")
     for message in unreached_sides(grid.inside, args.boundary):
         progress.warn(message)
@@ -106,9 +106,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             checkpoint=args.checkpoint,
         )
     if not math.isfinite(fit.loss):
-        raise ComputationError(f"no fit: {RESULTS['not finite']}. Check --init and -k")
+        raise ComputationError(f"the fit failed: {RESULTS['not finite']}. Check --init and -k")
     if not fit.converged:
-        progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; the best metric so far is written")
+        progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; writing the best metric found")
     names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", "noise", "boundary", *_OF_SEARCH)
     report = {
         "target": {
@@ -129,7 +129,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> TensorField:
-    """Return the field to start from, on the target's grid."""
     if args.init is None:
         unit = np.eye(grid.dimension, dtype=args.dtype)
         return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
@@ -137,16 +136,16 @@ def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> Tensor
     if volume.shape != grid.shape:
         remedy = "Give one tensor for each node of the target"
         if volume.dimension > grid.dimension:
-            remedy = f"Cut the slice out first: hks-jax convert {args.init} slice.npz --slice z=14, --init slice.npz"
+            remedy = f"Write the slice by 'hks-jax convert {args.init} slice.npz --slice z=14', and pass that file"
         raise ValueError(
             f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. {remedy}"
         )
     if not np.allclose(volume.spacing, grid.spacing, rtol=1e-4):
-        progress.warn(f"--init: its spacing {volume.spacing} is not the target's, {grid.spacing}, which is used")
+        progress.warn(f"--init: got the spacing {volume.spacing}; using the spacing of the target, {grid.spacing}")
     if lacking := int((grid.inside & ~volume.inside).sum()):
         raise ValueError(
             f"--init: got a mask without {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
-            "all of them. Cut the target's mask to it"
+            "all nodes. Restrict the target to the mask of --init"
         )
     metric: Any = args.metric or "tensor"
     tensors = volume.tensors.astype(args.dtype)
@@ -154,7 +153,6 @@ def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> Tensor
 
 
 def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str, Any], progress: Progress) -> Done:
-    """Write tensors.npz, fit.npz, fit.png (in 2D) and report.json."""
     from hks_jax.plot import fit_panels, save_figure
     from hks_jax.plot.signature import placed
 

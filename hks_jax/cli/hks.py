@@ -1,14 +1,15 @@
 """Compute the signature of a tensor field in a file.
 
-Compute the heat kernel signature of a field of diffusion tensors. FILE holds one of
+Compute the heat kernel signature of a field of diffusion tensors. FILE contains one of
 
-  tensors                    of a volume, which is computed whole unless --slice cuts it; pass --metric
-  diffusion-weighted images  with --bval and --bvec: tensors are fitted to them
-  a mesh                     of triangles or tetrahedra, with the metric of space, or with that of the tensors at its
-                             vertices that --array names, or of the volume --tensors in which it lies
-  eigenpairs                 which --save-pairs has kept: for other times, or another normalisation or method
+  tensors                    of a volume; --metric is required, and --slice restricts the computation to a slice
+  diffusion-weighted images  with --bval and --bvec, to which tensors are fitted
+  a mesh                     of triangles or tetrahedra, with the metric of space, or of tensors at its vertices
+                             (--array), or of tensors in a volume (--tensors)
+  eigenpairs                 written by --save-pairs, for other times, or another normalisation or method
 
-The folder OUT gets hks.npz, an image or a mesh in FILE's format (times along the fourth axis), hks.png and report.json.
+The command writes to the folder OUT: hks.npz, an image or a mesh in FILE's format, hks.png and report.json. Times are
+along the fourth axis of the image.
 
 examples:
   hks-jax hks tensor.nii.gz -o out --metric inverse
@@ -27,13 +28,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from hks_jax import SurfaceMesh, TetMesh, assemble
+from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
-from hks_jax.cli.noise import require_spectral, signature_of
+from hks_jax.cli.noise import Noisy, noise_of_volume, require_spectral, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
@@ -48,31 +49,31 @@ from hks_jax.optional import optional
 
 OPTIONS = f"""
 @file @metric {READING} @output {SOLVING}
---through I,J,K  the voxel that the slices in the picture of a volume run through (default: one in the middle)
+--through I,J,K  voxel through which the slices in the picture of a volume pass (default: a voxel in the middle)
 @clean
 --tensors FILE
-    of a mesh that lies in a volume, such as a cortex: the tensors, sampled at its vertices in the coordinates of the
-    scanner (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation); options on voxels and numbers
-    are about this file
+    tensors of a volume that contains the mesh, such as a cortical surface. The tensors are interpolated at the vertices
+    in scanner coordinates (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation). The options on
+    voxels and numbers refer to this file
 --inside FILE
-    of a mesh: the vertices of the domain, such as a cortex without its medial wall: FreeSurfer's .label, or zeros and
-    ones in .npy, or .npz with 'mask'
+    vertices of a mesh that form the domain, such as a cortical surface without its medial wall, as FreeSurfer's .label,
+    or as zeros and ones in .npy or in the array 'mask' of an .npz
 @signature @noise @view
---save-pairs  keep the eigenpairs, in OUT as pairs.npz: 'hks-jax hks OUT/pairs.npz --times …' solves nothing again
+--save-pairs  write the eigenpairs to OUT/pairs.npz; 'hks-jax hks OUT/pairs.npz --times …' reuses them
 """
 
 _OF_TENSORS = ("metric", "order", "interpolation")
 """Options that are about the tensors at a mesh's vertices."""
-_NO_NOISE = "it is for tensors on a grid; leave it out for meshes and for eigenpairs"
+_NO_NOISE = "it is of tensors, which eigenpairs and meshes with the metric of space do not have; leave it out"
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if is_mesh(args.file):
         return _on_mesh(args, Settings.of(args, metric=args.metric), progress)
-    refuse(args, ("clean",), "it is for meshes; leave it out for tensors on a grid, and see --repair")
-    refuse(args, ("inside",), "it is for meshes; leave it out for tensors on a grid, and see --mask")
-    refuse(args, ("tensors",), "it is for a mesh that lies in a volume; leave it out for the volume itself")
+    refuse(args, ("clean",), "this option is for meshes; for tensors on a grid, see --repair")
+    refuse(args, ("inside",), "this option is for meshes; for tensors on a grid, see --mask")
+    refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
     return _on_grid(args, Settings.of(args), progress)
 
 
@@ -94,7 +95,7 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
         _check_voxel(args.through, volume)
     if not saved:
         solved = compute_pairs(volume, settings, progress)
-    if args.save_pairs:  # at once: later steps may fail, or be interrupted
+    if args.save_pairs:  # at once, because later steps may fail
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
@@ -105,79 +106,108 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 
 def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
-    """Raise ValueError, before the long computation, for a voxel through which no slices can be drawn."""
+    """Raise ValueError, before the long computation, if no slices can be drawn through a voxel."""
     text = ",".join(map(str, voxel))
     if volume.dimension != 3:
-        raise ValueError(f"--through: got {text}; only the picture of a volume has slices, not that of one slice")
+        raise ValueError(f"--through: got {text} for a slice; expected a volume. Leave this option out")
     if not all(i < n for i, n in zip(voxel, volume.shape, strict=True)):
-        raise ValueError(f"--through: got {text}; expected a voxel of the volume, whose shape is {volume.shape}")
+        raise ValueError(f"--through: got {text}; expected a voxel of the volume with shape {volume.shape}")
     if not volume.inside[voxel]:
         middle = ",".join(map(str, np.argwhere(volume.inside)[volume.inside.sum() // 2]))
-        raise ValueError(f"--through: voxel {text} is outside the mask; {middle}, for one, is inside")
+        raise ValueError(f"--through: got {text}, which is outside the mask; expected a voxel inside, such as {middle}")
 
 
 def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
     _check_mesh_options(args)
     with progress.stage("reading", str(args.file)):
-        mesh = _read_domain(args, progress)
+        mesh, noisy = _read_domain(args, progress)
     boundary = settings.boundary or "neumann"
     settings = replace(settings, boundary=boundary)
     with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
         pencil = assemble(mesh, boundary)
     pairs = solve(pencil, settings, progress)
     described = {"source": str(args.file), **describe_mesh(args.file, mesh)}
-    result = result_of(mesh, described, pairs, settings, progress)
+    of_pairs = partial(result_of, mesh, described, pairs)
+    if noisy is None:
+        result = of_pairs(settings, progress)
+    else:
+        result = with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
     image = args.file.suffix.lower()
-    if image not in WRITTEN or (image == ".ply" and isinstance(mesh, TetMesh)):  # no room for values at the vertices
+    if image not in WRITTEN or (image == ".ply" and isinstance(mesh, TetMesh)):  # formats without values at vertices
         image = ".vtu"
     return write_outputs(args.output, result, progress, partial(_draw_mesh, result), image)
 
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that are for grids alone, and for tensors whose metric is open."""
-    refuse(args, ("noise",), _NO_NOISE)
     if args.tensors and args.array:
-        raise ValueError("--tensors, --array: got both; tensors come from a volume, or from the mesh's own vertices")
+        raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
-    if not args.tensors:  # they are about the volume in which the mesh lies
+    if not args.tensors:  # with --tensors, these options refer to the volume
         of_grids += [o.name for o in options_in(READING) if o.name not in (*_OF_TENSORS, "array")]
-    refuse(args, of_grids, "it is for tensors on a grid; leave it out for a mesh")
+    refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
     if args.boundary not in (None, *MESH_BOUNDARIES):
-        raise ValueError(f"--boundary: got {args.boundary!r}; a mesh takes one of {', '.join(MESH_BOUNDARIES)}")
+        raise ValueError(f"--boundary: got {args.boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
     if not (args.array or args.tensors):
         why = "a mesh has the metric of space unless --array names tensors at its vertices, or --tensors a volume"
         refuse(args, _OF_TENSORS, f"{why} of them; pass both, or neither")
+        refuse(args, ("noise",), _NO_NOISE)
     elif args.metric is None:
-        raise ValueError("--metric: choose the metric of the tensors at the vertices: inverse, tensor or adjugate")
+        raise ValueError("--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate")
 
 
-def _read_domain(args: argparse.Namespace, progress: Progress) -> SurfaceMesh | TetMesh:
-    """Read the mesh in the precision asked for, with the metric of the tensors at its vertices if asked to."""
+def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
+    """Read the mesh in the precision asked for, with the metric of the tensors at its vertices if asked to.
+
+    And where error bars are asked for, the tensors and their noise: those of the volume, if they come from one.
+    """
     use_dtype(args.dtype)
     mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))
     vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
     inside = None if args.inside is None else _inside(args.inside, len(vertices))
+    settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
+
+    def domain(tensors: Any) -> SurfaceMesh | TetMesh:
+        return kind.from_tensors(vertices, cells, tensors, args.metric, **settings)
+
     if args.tensors:
         volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
         require_valid(volume, "--repair")
         at = np.arange(len(vertices)) if inside is None else np.flatnonzero(inside)
-        tensors = np.zeros((len(vertices), 3, 3), args.dtype)
-        tensors[at] = sample_tensors(volume, np.asarray(mesh.vertices)[at])
-    elif args.array:
-        arrays = read_mesh_arrays(args.file, clean=args.clean)
-        if args.array not in arrays:
-            there = ", ".join(arrays) or "none"
-            raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {there}")
-        values = arrays[args.array].reshape(len(vertices), -1)
-        if values.shape[1] != (9 if args.order is None else 6):
-            n = values.shape[1]
-            raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
-        tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
-    else:
-        return kind(vertices, cells, mask=inside)
-    settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
-    return kind.from_tensors(vertices, cells, tensors, args.metric, **settings)
+
+        def sampled(values: Any) -> SurfaceMesh | TetMesh:
+            tensors = np.zeros((len(vertices), 3, 3), args.dtype)
+            tensors[at] = sample_tensors(replace(volume, tensors=np.asarray(values)), np.asarray(mesh.vertices)[at])
+            return domain(tensors)
+
+        if args.noise is None:
+            return sampled(volume.tensors), None
+        noise = noise_of_volume(args, volume, volume.grid("all"), progress)
+        return sampled(volume.tensors), Noisy(volume.tensors, noise, sampled, traceable=False)
+    if not args.array:
+        return kind(vertices, cells, mask=inside), None
+    arrays = read_mesh_arrays(args.file, clean=args.clean)
+    if args.array not in arrays:
+        there = ", ".join(arrays) or "none"
+        raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {there}")
+    values = arrays[args.array].reshape(len(vertices), -1)
+    if values.shape[1] != (9 if args.order is None else 6):
+        n = values.shape[1]
+        raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
+    tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
+    return domain(tensors), None if args.noise is None else Noisy(tensors, _relative(args.noise, tensors), domain)
+
+
+def _relative(noise: str, tensors: Float[np.ndarray, "V 3 3"]) -> TensorNoise:
+    try:
+        level = float(noise)
+    except ValueError:
+        raise ValueError(
+            f"--noise: got {noise!r}; for tensors at the vertices of a mesh state a number, relative to the mean "
+            "diffusivity"
+        ) from None
+    return TensorNoise.relative(tensors, level)
 
 
 def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
@@ -185,12 +215,12 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
         return read_mask(path)
     numbers = optional("nibabel.freesurfer").read_label(path)
     if numbers.size == 0 or numbers.max() >= n_vertices:
-        raise ValueError(f"--inside: {path} names {numbers.size} vertices, and the mesh has {n_vertices}")
+        raise ValueError(f"--inside: got {numbers.size} vertices in {path}; expected indices 0 … {n_vertices - 1}")
     return np.isin(np.arange(n_vertices), numbers)
 
 
 def _draw_mesh(result: Result, path: Path) -> None:
-    """Draw the signature on the surface, or on the solid's boundary, once for each time with its own colours."""
+    """Draw the signature on the surface, or on the boundary of a solid, with a separate colour scale for each time."""
     from hks_jax.plot import new_figure, number_text, save_figure, surface
 
     mesh, n = result.place, len(result.times)

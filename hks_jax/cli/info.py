@@ -1,9 +1,9 @@
-"""Say what is in a file, and which k and t would suit it.
+"""Describe the content of a file, with suitable k and t.
 
-Say what is in a file of tensors: shape, order of components and how it was determined, frame, units, mask and its
-pieces, eigenvalues, tensors that are not positive definite, and the k and t that would suit; and ask where frame or
-unit seem wrong. Of a mesh of triangles or tetrahedra ({meshes}, or a surface of
-FreeSurfer's): size, boundary, pieces, and the same.
+Describe a file of tensors: the shape, the order of the components and its source, the frame, the units, the mask and
+its connected components, the eigenvalues, the number of tensors that are not positive definite, and suitable k and t.
+The command also asks questions if the frame or a unit looks wrong. For a mesh of triangles or tetrahedra
+({meshes}, or a FreeSurfer surface), it gives the size, the boundary, the connected components, and suitable k and t.
 
 examples:
   hks-jax info tensor.nii.gz --mask mask.nii.gz
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
 
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
-    """Return the facts about a volume, in plain numbers; without a boundary, for the one that suits it."""
+    """Return facts about a volume for JSON; if `boundary` is None, for its default boundary condition."""
     inside, bad = volume.inside, find_invalid(volume)
     boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad
@@ -79,7 +79,7 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         ends = {"least": values.min(), "median": np.median(values), "largest": values.max()}
         description["eigenvalues"] = {name: float(value) for name, value in ends.items()}
         description["median_mean_diffusivity"] = float(np.median(values.mean(axis=-1)))
-    # Of a few valid ones among indefinite tensors nothing can be told that suits.
+    # If many tensors are invalid, suitable k and t cannot be computed.
     if count and good.any() and bad.sum() <= MANY * inside.sum():
         metrics = {"inverse": np.linalg.inv(tensors), "tensor": tensors}
         description["suits"] = {name: suitable(g, volume.spacing, inside, boundary) for name, g in metrics.items()}
@@ -87,7 +87,7 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
 
 
 def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
-    """Return the facts about a mesh in space."""
+    """Return facts about a mesh in space for JSON."""
     vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
     measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
     sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
@@ -107,7 +107,6 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
 
 
 def _lines(description: dict[str, Any]) -> list[str]:
-    """Return the description as lines of text."""
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     words = next((words for words in WORDS.values() if words.simplices in description), None)
     if words is not None:
@@ -120,28 +119,28 @@ def _lines(description: dict[str, Any]) -> list[str]:
         ]
     else:
         bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
-        length = f" {description['length_unit']}" if description["length_unit"] else ", in no declared unit"
-        placed = "without an affine" if description["affine"] is None else "placed by an affine"
+        length = f" {description['length_unit']}" if description["length_unit"] else ", without a declared unit"
+        placed = "without an affine" if description["affine"] is None else "with an affine"
         lines += [
             f"tensors         {by_axis(description['shape'])}, {description['dtype']}, {placed}",
             f"spacing         {by_axis(description['spacing'])}{length}",
             f"order, frame    {description['order']}, {description['frame']} axes",
             *(f"                {as_options(note)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",
-            f"components      {description['components']}{f' ({sizes} nodes)' if sizes else ': nothing to compute on'}",
-            f"boundary        {description['boundary']} unless chosen"
-            f"{', whose two problems share the k pairs' * (description['boundary'] == 'mean')}",
+            f"components      {description['components']}{f' ({sizes} nodes)' if sizes else ': the domain is empty'}",
+            f"boundary        {description['boundary']} by default"
+            f"{', with k eigenpairs for two problems together' * (description['boundary'] == 'mean')}",
         ]
         if description["without_element"]:
             lines.append(
-                f"                {description['without_element']} voxels inside belong to no element, a cube of "
-                "neighbours (in a slice a square) that are all inside, and are left out"
+                f"                {description['without_element']} voxels inside are left out, because they belong to "
+                "no element; an element is a cube (in a slice a square) of voxels inside"
             )
         lines.append(f"invalid         {bad} tensors are not positive definite")
         if "question" in description:
             lines.append(f"                {as_options(description['question'])}")
         elif bad > MANY * description["inside"]:
-            lines.append("                so many are no noise: of tensors indefinite by nature see --positive")
+            lines.append("                noise does not explain this number; for indefinite tensors, see --positive")
         elif bad:
             lines[-1] += ": see --repair"
         if description["not_symmetric"]:
@@ -157,17 +156,17 @@ def _lines(description: dict[str, Any]) -> list[str]:
     lines += [f"question        {question}" for question in description.get("questions", ())]
     for name, s in description.get("suits", {}).items():
         worth = s["k_for_least_time"] <= s["unknowns"] / 4
-        takes = f"k ≈ {s['k_for_least_time']}" if worth else "more pairs than are worth computing: see --method auto"
+        takes = f"k ≈ {s['k_for_least_time']}" if worth else "too many eigenpairs; see --method auto"
         of = time if name == "inverse" else ""
         lines.append(
-            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} by the spacing (to 1 %; takes {takes}); "
-            f"t ≥ {s['least_time_of_k']:.3g}{of} by k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the size"
+            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} for an error of 1 % from the spacing (needs {takes}); "
+            f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} from the size"
         )
     return lines
 
 
 def _units(description: dict[str, Any]) -> tuple[str, str]:
-    """Return how the units of diffusivities and of times in the metric D⁻¹ are written, empty where they are open."""
+    """Return the units of diffusivities and of times in the metric D⁻¹ as texts, empty if they are unknown."""
     if description.get("unit"):
         return f" {description['unit']}", " s" if description["length_unit"] == "mm" else ""
     if description.get("length_unit") != "mm":

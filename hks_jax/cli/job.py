@@ -1,4 +1,4 @@
-"""The main job: from a tensor volume or a mesh to its heat kernel signature, and the facts that reports have."""
+"""Compute the heat kernel signature of a tensor volume or a mesh, and the facts for the report."""
 
 import argparse
 from dataclasses import asdict, dataclass, fields, replace
@@ -24,14 +24,14 @@ from hks_jax.signatures.suitable import SHOWN, default_k
 
 
 class ComputationError(RuntimeError):
-    """The computation did not give what was asked for."""
+    """The error for a computation that failed."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to compute: the options of the same names.
+    """The settings of a computation, with the names of the options.
 
-    Only meshes may have no metric. Without a boundary a volume has its `default_boundary`, and a mesh the natural one.
+    The metric is None only for meshes. The boundary None means `default_boundary` for a volume, natural for a mesh.
     """
 
     metric: MetricChoice | None
@@ -47,14 +47,14 @@ class Settings:
 
     @classmethod
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
-        """Return the arguments' settings, or the defaults, with those that are given in their place."""
+        """Return the settings in `args`, or the defaults, where `given` replaces some."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
         given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
 
 class Solved(NamedTuple):
-    """The eigenpairs of a volume or slice, its metric, and the settings with their boundary."""
+    """The eigenpairs of a volume or slice, its metric, and the settings, whose boundary is not None."""
 
     volume: TensorVolume
     field: hj.TensorField
@@ -63,17 +63,17 @@ class Solved(NamedTuple):
 
     @property
     def domain(self) -> TensorVolume:
-        """The volume, whose mask is the domain."""
+        """The volume, with the domain as its mask."""
         return self.volume.with_mask(self.field.grid.mask)
 
     @property
     def described(self) -> dict[str, Any]:
-        """A report's entries about the tensors."""
+        """The entries of a report about the tensors."""
         return describe_input(self.volume, self.field.grid.mask)
 
 
 def use_dtype(dtype: str) -> None:
-    """Let JAX compute in float64 if asked to: the application's choice, made before any array is."""
+    """Enable float64 in JAX if `dtype` is ``"float64"``; applications do so before they create arrays."""
     if dtype == "float64":
         jax.config.update("jax_enable_x64", True)
 
@@ -85,7 +85,7 @@ def result_of(
     settings: Settings,
     progress: Progress,
 ) -> Result:
-    """Compute the signature on a volume, whose mask is the domain, or on a mesh; `described` goes into the report."""
+    """Compute the signature on a mesh, or on a volume whose mask is the domain; the report includes `described`."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
         values, origin = _signature(pairs, times, settings)
@@ -94,12 +94,12 @@ def result_of(
 
 
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n of `default_times`, up to where all but the constant has decayed to `SHOWN`."""
+    """Return n default times, at the last of which the non-constant modes have decayed to the factor `SHOWN`."""
     return tuple(np.asarray(hj.default_times(pairs, n, SHOWN), np.float64).tolist())
 
 
 def field_of(volume: TensorVolume, grid: hj.Grid, settings: Settings) -> hj.TensorField:
-    """Return the metric of a volume or slice on its grid, in the precision asked for."""
+    """Return the metric of a volume or slice on its grid, in the chosen precision."""
     use_dtype(settings.dtype)
     metric, lies, tensors = settings.metric, settings.interpolation, volume.tensors.astype(settings.dtype)
     assert metric is not None
@@ -121,7 +121,7 @@ def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) 
 
 
 def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Progress) -> hj.Eigenpairs:
-    """Compute eigenpairs; raise ComputationError unless all of them converged."""
+    """Compute eigenpairs; raise ComputationError unless all converge."""
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
@@ -135,7 +135,7 @@ def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Pro
 
 
 def _signature(pairs: hj.Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the signature and, where a method was chosen, the report's entry about the choice."""
+    """Return the signature and, for the method ``"auto"``, the entry of the report about the methods used."""
     if settings.method != "auto":
         return np.asarray(hj.hks(pairs, times, settings.normalisation, settings.method)), {}
     result = hj.hks_auto(pairs, times, settings.normalisation)
@@ -166,7 +166,7 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
 
 
 def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, Any]:
-    """Return a report's entries about the tensors; the mask is the domain."""
+    """Return the entries of a report about the tensors, where `mask` is the domain."""
     about = {name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit")}
     return {
         "source": volume.source,
@@ -182,7 +182,7 @@ def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, A
 
 
 def describe_pairs(pairs: hj.Eigenpairs) -> dict[str, Any]:
-    """Return a report's entries about eigenpairs."""
+    """Return the entries of a report about eigenpairs."""
     values = np.asarray(pairs.eigenvalues)
     return {
         "k": pairs.k,

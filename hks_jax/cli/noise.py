@@ -1,17 +1,19 @@
-"""Error bars on the command line: the source of the noise, and the part of the signature above it."""
+"""Error bars on the command line, from a chosen source of noise, and the signal-to-noise ratio of signatures."""
 
 import argparse
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.cli.job import Solved, automatic_times, result_of
+from hks_jax.cli.job import Settings, Solved, automatic_times, result_of
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.cli.values import Times
@@ -19,25 +21,34 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 
 _CANDIDATES = 4
-"""How many times as many times are looked at as automatic ones are asked for."""
+"""The number of candidates per automatic time."""
 _SIGNAL = 1.0
-"""The signal to noise from which on automatic times begin."""
+"""The signal-to-noise ratio at which automatic times begin."""
 _RIM = 0.1
-"""The share of a signature that the boundary may decide (`boundary_influence`) at nodes of the interior."""
+"""The influence of the boundary on the signature (`boundary_influence`) below which a node is in the interior."""
 _LEAST = 0.1
-"""The share of the nodes that an interior has at least: fewer do not tell how a map varies."""
+"""The least share of nodes in the interior; fewer nodes do not represent the variation of a map."""
 _CLEAR = 2.0
-"""The signal to noise that the report names the first time of."""
+"""The signal-to-noise ratio for which the report contains the first time above it."""
+
+
+class Noisy(NamedTuple):
+    """Tensors, their noise, and the domain that tensors make, with JAX or not."""
+
+    tensors: np.ndarray
+    noise: hj.TensorNoise
+    domain: Callable[[Any], Any]
+    traceable: bool = True
 
 
 def require_spectral(args: argparse.Namespace) -> None:
-    """Raise ValueError where error bars are asked for of a method that has none."""
+    """Raise ValueError if error bars are requested for a method other than ``"spectral"``."""
     if args.noise is not None and args.method != "spectral":
-        raise ValueError(f"--noise: with --method {args.method} there are no error bars; leave one of them out")
+        raise ValueError(f"--noise: got --method {args.method}; expected spectral. Leave one of the options out")
 
 
 def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
-    """Return the arguments that read the second scan that ``--noise`` names; None where it names a number or a word."""
+    """Return the arguments for reading a second scan if ``--noise`` names a file, or else None."""
     if args.noise in (None, "residuals", "roughness"):
         return None
     try:
@@ -49,11 +60,30 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
 
 def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -> Result:
     """Compute the signature of a volume or slice whose eigenpairs are known, with error bars if asked to."""
+    volume, field, pairs, settings = solved
+    of_pairs = partial(result_of, solved.domain, solved.described, pairs)
     if getattr(args, "noise", None) is None:
-        return result_of(solved.domain, solved.described, solved.pairs, solved.settings, progress)
-    bars, maps, interior, times = _error_bars(args, solved, progress)
-    settings = replace(solved.settings, times=Times(times, solved.settings.times.automatic))
-    result = result_of(solved.domain, solved.described, solved.pairs, settings, progress)
+        return of_pairs(settings, progress)
+
+    def metric(D: Any) -> Any:
+        assert settings.metric is not None
+        return hj.TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
+
+    noisy = Noisy(volume.tensors, noise_of_volume(args, volume, field.grid, progress), metric)
+    return with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
+
+
+def with_error_bars(
+    args: argparse.Namespace,
+    of_pairs: Callable[[Settings, Progress], Result],
+    noisy: Noisy,
+    pairs: hj.Eigenpairs,
+    settings: Settings,
+    progress: Progress,
+) -> Result:
+    """Compute a signature and its error bars; `of_pairs` computes the former alone."""
+    bars, maps, interior, times = _error_bars(args, noisy, pairs, settings, progress)
+    result = of_pairs(replace(settings, times=Times(times, settings.times.automatic)), progress)
     ratio = np.asarray(bars.signal_to_noise_at(interior))
     nodes = np.isfinite(np.asarray(bars.value[0])).sum()
     clear = np.flatnonzero(ratio > _CLEAR)
@@ -72,12 +102,14 @@ def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -
     return replace(result, arrays=arrays, report={**result.report, "noise": report})
 
 
-def _noise(args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progress: Progress) -> hj.TensorNoise:
-    """Return the noise that the arguments name."""
+def noise_of_volume(
+    args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progress: Progress
+) -> hj.TensorNoise:
+    """Return the noise of a volume's tensors that the arguments name."""
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: residuals are those of a fit to diffusion-weighted images (--bval, --bvec)")
-        return hj.TensorNoise(volume.covariance, grid)
+        return volume.noise(grid)
     if args.noise == "roughness":
         return hj.TensorNoise.from_roughness(volume.tensors, grid)
     if (second := second_scan(args)) is not None:
@@ -86,31 +118,31 @@ def _noise(args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progre
 
 
 def _error_bars(
-    args: argparse.Namespace, solved: Solved, progress: Progress
+    args: argparse.Namespace, noisy: Noisy, pairs: hj.Eigenpairs, settings: Settings, progress: Progress
 ) -> tuple[hj.Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
-    """Return error bars, the noise (n_draws, n_times, *shape) of which they are made, the interior, and the times.
+    """Return error bars, the sampled noise (n_draws, n_times, *shape), the interior (n_times, *shape), and the times.
 
-    The interior (n_times, *shape) is where the boundary decides little, under ``"mean"``, and empty at times that leave
-    few such nodes; else it is all of the domain. Automatic times begin where there is signal.
+    For the boundary ``"mean"``, the interior contains the nodes with little influence of the boundary, and is empty at
+    times with few such nodes. For other boundaries, it is the whole domain. Automatic times begin at the first with a
+    sufficient signal-to-noise ratio.
     """
-    volume, field, pairs, settings = solved
-    noise, wanted = _noise(args, volume, field.grid, progress), settings.times.automatic
+    wanted = settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
     maps: list[np.ndarray] = []
 
     def signature(D: Any) -> Any:
-        assert settings.metric is not None
         assert settings.boundary is not None
-        metric = hj.TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
-        return hj.hks(hj.eigenpairs(metric, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
+        domain = noisy.domain(D)
+        return hj.hks(hj.eigenpairs(domain, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
 
     def keep(one: Any) -> None:
         maps.append(np.asarray(one, np.float32))
 
     with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", hj.AccuracyWarning)  # of times that are not chosen, too
-        tensors, more = volume.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
-        bars = hj.uncertainty(signature, tensors, noise, method="resample", progress=progress.update, **more)
+        tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
+        more |= {"compiled": noisy.traceable, "progress": progress.update}
+        bars = hj.uncertainty(signature, tensors, noisy.noise, method="resample", **more)
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:
             nodes = interior[0].sum()
@@ -119,7 +151,7 @@ def _error_bars(
     chosen = np.arange(len(times))
     if not settings.times.explicit:
         ratio = np.asarray(bars.signal_to_noise_at(interior))
-        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # where all is near the rim
+        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # empty interior
         clear = np.flatnonzero(ratio >= _SIGNAL)
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
         chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)

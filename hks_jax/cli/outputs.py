@@ -1,4 +1,4 @@
-"""The files of a job, which appear all or not at all, and the printed summary."""
+"""Write the files of a command, all or none, and print its summary."""
 
 import argparse
 import importlib.metadata
@@ -14,19 +14,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hks_jax.atomic import atomic_folder
 from hks_jax.cli.progress import Progress
 from hks_jax.io.result import Result, plain, signature_file
 from hks_jax.io.tables import write_json
+from hks_jax.storage import atomic_folder
 
 REPORT = "report.json"
 PAIRS = "pairs.npz"
-"""The file of eigenpairs that were kept."""
+"""The name of the file of saved eigenpairs."""
 _OPTIONAL = ("nibabel", "dipy", "pynrrd", "vtk", "meshio")
 
 
 class Done(NamedTuple):
-    """What a command prints: the names of its files, or a text in their place; as JSON a summary and the names."""
+    """The output of a command: the names of its files, or a text in place of the names, and a summary for JSON."""
 
     files: list[Path]
     summary: dict[str, Any]
@@ -34,7 +34,7 @@ class Done(NamedTuple):
 
 
 def show(args: argparse.Namespace, done: Done) -> None:
-    """Print the result of a command, as the arguments ask."""
+    """Print the output of a command in the form that the arguments choose."""
     names = list(map(str, done.files))
     if args.json:
         print(json.dumps(plain({**done.summary, "files": names}), ensure_ascii=False))
@@ -46,9 +46,9 @@ def show(args: argparse.Namespace, done: Done) -> None:
 def writing(
     folder: Path, report: Mapping[str, Any], progress: Progress, stale: Callable[[], Iterable[Path]] = tuple
 ) -> Iterator[tuple[Path, Done]]:
-    """Yield a temporary folder, and a `Done` that has the report and the paths of the results at the end.
+    """Yield a temporary folder, and a `Done` to which the report and the paths of the results are added at the end.
 
-    Then report.json is written, too, and all files move to `folder`, or none; files that `stale` returns are gone.
+    Then the function also writes report.json, moves all files to `folder` atomically, and deletes the `stale` files.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
@@ -61,7 +61,7 @@ def writing(
 
 
 def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], image: str) -> Done:
-    """Write hks.npz, hks.png (by `draw`), report.json and, unless its suffix is empty, an image."""
+    """Write hks.npz, hks.png (by `draw`), report.json and, unless the suffix `image` is empty, an image."""
     stale = partial(of_earlier, folder, result.eigenvalues, progress)
     with writing(folder, result.report, progress, stale) as (temporary, done):
         result.save(temporary / "hks", image, {"command": sys.argv})
@@ -70,23 +70,23 @@ def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callab
 
 
 def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> list[Path]:
-    """Return an earlier signature's files in a folder, and all made of it but eigenpairs with these eigenvalues."""
+    """Return the files of an earlier signature in a folder, without a file of eigenpairs with these eigenvalues."""
     found, own, pairs = [], [], folder / PAIRS
-    if signature_file(folder).is_file():  # else files of these names are not ours
+    if signature_file(folder).is_file():  # otherwise, another program wrote the files
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
         own = [*folder.glob("hks.*"), folder / REPORT]
         found = [*own, *(folder / name for name in ("explore.html", *regions) if (folder / name).is_file())]
     if zipfile.is_zipfile(pairs):
-        with np.load(pairs) as arrays:  # reads this one array only
+        with np.load(pairs) as arrays:  # reads only the array that is used
             if "eigenvalues" in arrays and not np.array_equal(arrays["eigenvalues"], eigenvalues):
                 found.append(pairs)
     if derived := [file.name for file in found if file not in own]:
-        progress.note(f"removed {', '.join(derived)} of an earlier signature in {folder}")
+        progress.note(f"removed files of an earlier signature in {folder}: {', '.join(derived)}")
     return found
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the libraries that took part, and the device."""
+    """Return the versions of Python, the system and the libraries, and the device."""
     import jax
 
     python, system, device = platform.python_version(), platform.platform(), jax.devices()[0].device_kind

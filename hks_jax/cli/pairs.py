@@ -1,4 +1,4 @@
-"""``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``: eigenpairs kept with the field that they are of."""
+"""Write and read eigenpairs together with their field, for ``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``."""
 
 import argparse
 import json
@@ -17,17 +17,17 @@ from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.io.result import plain, recorded_boundary
-from hks_jax.npz import load_npz
+from hks_jax.storage import load_npz
 
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
-"""Settings that belong to the pairs."""
+"""Settings that the saved eigenpairs determine."""
 _ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "unit", "notes", "repair")
-"""The entries of a volume that are kept as text beside its arrays."""
+"""The attributes of a volume that are saved as text."""
 
 
 def is_saved_pairs(path: Path) -> bool:
-    """Tell whether a file holds eigenpairs with their field."""
+    """Return whether a file contains eigenpairs with their field."""
     if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:
@@ -35,18 +35,18 @@ def is_saved_pairs(path: Path) -> bool:
 
 
 def check_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that come too late."""
+    """Raise ValueError for options that the saved eigenpairs determine."""
     if args.others:
-        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one of eigenpairs")
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one file of eigenpairs")
     settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
-    why = f"{args.file} holds eigenpairs: all but the signature is settled; leave it out"
+    why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
     refuse(args, (*settled, "save_pairs"), why)
 
 
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with the settings of their computation.
 
-    The suffix of images and the warnings are read back, too. The fingerprint is that of a study's subject.
+    The file also contains the suffix of images, the warnings, and the fingerprint of a study's subject.
     """
     volume, settings = solved.domain, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}
@@ -56,15 +56,15 @@ def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str],
 
 
 def are_of(path: Path, fingerprint: str) -> bool:
-    """Tell whether a file holds the eigenpairs of a study's subject, computed from the same files and settings."""
+    """Return whether a file contains eigenpairs with the same fingerprint, that is of the same files and settings."""
     if not is_saved_pairs(path):
         return False
-    with np.load(path) as arrays:  # reads this one array only
+    with np.load(path) as arrays:  # reads only the array that is used
         return bool(json.loads(str(arrays[_RECORD]))["fingerprint"] == fingerprint)
 
 
 def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solved, str]:
-    """Return the eigenpairs, where the settings that are settled are theirs, and the suffix of images."""
+    """Return the eigenpairs with `settings` (and with the settings that the file determines), and the image suffix."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}

@@ -1,7 +1,7 @@
 """Reproduce the paper's table and figures.
 
-Reproduce Table 1 and Figures 1 to 6 of Zobel, Reininghaus and Hotz, and count the triangles of a remark: tables and PNG
-pictures.
+Reproduce Table 1 and Figures 1 to 6 of Zobel, Reininghaus and Hotz as tables and PNG pictures, and count the triangles
+that a remark in the paper mentions.
 
 examples:
   hks-jax paper
@@ -16,8 +16,8 @@ from hks_jax.cli.progress import Progress
 
 OPTIONS = """
 -o,--output OUT = paper  folder for the results
---full  the paper's own sizes: minutes instead of seconds
---only NAME...  only these, such as: table1 figure3
+--full  use the sizes of the paper, which takes minutes instead of seconds
+--only NAME...  reproduce only these, such as: table1 figure3
 """
 
 

@@ -1,7 +1,7 @@
-"""Draw a result that is in a file.
+"""Draw a result in a file.
 
-Draw a result that 'hks-jax hks', 'fit' or 'curvature' has written as npz: an image for each time, or with --points a
-curve over the times for each point.
+Draw a result that 'hks-jax hks', 'fit' or 'curvature' has written as npz. The picture has an image for each time, or
+with --points a curve over the times for each point.
 
 examples:
   hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9 --unit s
@@ -23,26 +23,26 @@ from hks_jax.io.result import Result
 from hks_jax.signatures.suitable import RESOLVED
 
 OPTIONS = """
-result RESULT  the result: .npz, or the folder of a signature
+result RESULT  the result, as an .npz or the folder of a signature
 -o,--output PICTURE!  the picture: .png, .pdf, .svg, …
---array NAME  which array of the file (default: hks or curvature)
---times T...  some of the saved times, or auto:N for N of them, evenly spaced (default: all, or 12 of more)
---slice AXIS=N  of a volume, such as z=14 (default: the middle along z)
---points X,Y...  curves at these coordinates, as the images show them, not images
+--array NAME  name of the array in the file (default: hks or curvature)
+--times T...  some of the saved times, or auto:N for N evenly spaced ones (default: all times, at most 12)
+--slice AXIS=N  slice of a volume, such as z=14 (default: the middle along z)
+--points X,Y...  draw curves at these coordinates, as the images show them, instead of images
 --range R = own
-    of the colours: own for each image (default) or shared by all, 1 % of the values at least; or two numbers LOW,HIGH
-    (write --range=LOW,HIGH where LOW is negative)
---quantiles Q,Q = 0,1  that own and shared ranges span
---cmap NAME = viridis  a colour map of matplotlib
---scaled  curves of (4πt)^(d/2)·HKS, which is 1 for flat space
---unit TEXT  the unit of t
---title TEXT  a title for the whole picture
+    range of the colours: own for each image (default) or shared by all images, at least 1 % of the values; or two
+    numbers LOW,HIGH (write --range=LOW,HIGH if LOW is negative)
+--quantiles Q,Q = 0,1  quantiles of the values at the ends of own and shared ranges
+--cmap NAME = viridis  colour map of matplotlib
+--scaled  draw curves of (4πt)^(d/2)·HKS, which is 1 for flat space
+--unit TEXT  unit of t
+--title TEXT  title of the picture
 --dpi DPI = 150  pixels per inch
 @view
 """
 
 MANY = 12
-"""Images at most, unless times are chosen."""
+"""The largest number of images, unless times are chosen."""
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot import new_figure, save_figure
 
     if args.cmap not in colormaps:
-        raise ValueError(f"--cmap: got {args.cmap!r}; expected a name that matplotlib knows, such as viridis")
+        raise ValueError(f"--cmap: got {args.cmap!r}; expected a colour map of matplotlib, such as viridis")
     formats = sorted(new_figure(1, 1).canvas.get_supported_filetypes())
     if args.output.suffix.lstrip(".").lower() not in formats:
         raise ValueError(f"--output: got {args.output}; expected a name that ends in one of {', '.join(formats)}")
@@ -70,7 +70,7 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
     """Return the indices of the times to draw."""
     times = result.times
     if not times.size:
-        refuse(args, ("times", "points"), f"{args.result} has no times; leave this out")
+        refuse(args, ("times", "points"), f"{args.result} has no times; leave this option out")
         return np.arange(1)
     if args.times is None:
         count = times.size if args.points is not None else MANY
@@ -99,10 +99,10 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         values = values.take(index, 1 + "xyz".index(axis))
         title = f"{title}, slice {axis} = {index}".lstrip(", ")
     else:
-        refuse(args, ("slice",), f"{args.result} is a slice already (two axes); leave this out")
+        refuse(args, ("slice",), f"{args.result} is a slice, with two axes; leave this option out")
     drawn = volume.inside & np.isfinite(values).all(axis=0)
     if not drawn.any():
-        raise ValueError(f"--slice: no value of {args.result} is finite there; choose another")
+        raise ValueError(f"--slice: no value of {args.result} in this slice is finite; choose another slice")
     plane, box = cropped(volume, drawn)
     vmin, vmax = (None, None) if isinstance(args.range, str) else args.range
     return hks_panels(
@@ -129,10 +129,10 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     values, volume = result.values, result.volume
     grid, d = result.grid, volume.dimension
     orientation = placed(volume, None, "neurological")
-    if orientation is not None:  # points have the coordinates that the images show
+    if orientation is not None:  # points are in the coordinates of the images' axes
         values, grid = orientation.array(values), orientation.grid(grid)
     if any(len(point) != d for point in args.points):
-        raise ValueError(f"--points: got {args.points}; expected {d} coordinates each")
+        raise ValueError(f"--points: got {args.points}; expected {d} coordinates per point")
     style = {"scaled": args.scaled, "cmap": args.cmap, "unit": args.unit or ""}
     if result.eigenvalues.size:
         style["limit"] = RESOLVED[d] / float(result.eigenvalues[-1])

@@ -1,4 +1,4 @@
-"""Progress on stderr: the stage, its time so far and the time left, and the library's warnings."""
+"""Report progress on stderr: the stage, the elapsed and the remaining time, and warnings of the library."""
 
 import io
 import shutil
@@ -14,19 +14,19 @@ from hks_jax.cli.options import as_options
 
 WIDTH = 20
 INTERVAL = 5.0
-"""Seconds between updates within a stage where stderr is no terminal."""
+"""The seconds between updates within a stage if stderr is not a terminal."""
 TICK = 0.5
-"""Seconds after which a terminal's line is drawn again, with the time that has passed."""
+"""The seconds after which the line on a terminal is redrawn with the elapsed time."""
 
 
 def bar(done: float) -> str:
-    """Return a bar that is filled up to the part `done`, 0 … 1."""
+    """Return a progress bar for the completed fraction `done`, 0 … 1."""
     filled = round(WIDTH * min(max(done, 0.0), 1.0))
     return "[" + "#" * filled + "." * (WIDTH - filled) + "]"
 
 
 def duration(seconds: float) -> str:
-    """Return about how long, no finer than an estimate is: ``40 s``, ``3 min``, ``1 h 20 min``."""
+    """Return a duration as text, rounded as befits an estimate: ``40 s``, ``3 min``, ``1 h 20 min``."""
     if seconds < 95:
         return f"{max(5 * round(seconds / 5), 5)} s"
     minutes = round(seconds / 60)
@@ -34,11 +34,11 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Prints stages and warnings as they come, and remembers them for the report.
+    """Print stages and warnings at once, and store them for the report.
 
     Attributes:
-        timings: seconds by stage.
-        warnings: messages, each once.
+        timings: the seconds of each stage.
+        warnings: the messages of warnings, without duplicates.
     """
 
     _LINE_END = "\n"
@@ -56,7 +56,7 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str, detail: str = "") -> Iterator[None]:
-        """Announce a stage and time it."""
+        """Announce a stage and measure its time."""
         begin = self._begin = self._last = time.perf_counter()
         self._stage, self._text, self._end = f"{name}: {detail}" if detail else name, "", None
         over = threading.Event()
@@ -73,10 +73,10 @@ class Progress:
             self._close_line()
 
     def update(self, text: str) -> None:
-        """Show how far the present stage is: in place on a terminal, else every few seconds.
+        """Show the progress of the current stage, in place on a terminal or otherwise every few seconds.
 
-        A text that comes with an estimate of the time left (`hks_jax.eigen.solver.Status`) is shown with it, and with a
-        bar of the time that has passed in all.
+        If the text has an estimate of the remaining time (`hks_jax.eigen.solver.Status`), it is shown with the estimate
+        and with a bar of the elapsed fraction.
         """
         now, left = time.perf_counter(), getattr(text, "seconds_left", None)
         with self._lock:
@@ -88,13 +88,13 @@ class Progress:
             self.note(f"{self._stage}, {self._text}{'' if left is None else f', about {duration(left)} left'}")
 
     def note(self, text: str) -> None:
-        """Say something that is no warning."""
+        """Print a text that is not a warning."""
         if not self.quiet:
             self._close_line()
             print(f"[{time.perf_counter() - self._start:7.1f} s] {text}", file=self.stream, flush=True)
 
     def warn(self, message: str) -> None:
-        """Show a warning, once; also where progress is not shown."""
+        """Print a warning, unless it was printed before; `quiet` does not suppress it."""
         if message not in self.warnings:
             self.warnings.append(message)
             self._close_line()
@@ -102,7 +102,7 @@ class Progress:
 
     @contextmanager
     def catching_warnings(self) -> Iterator[None]:
-        """Show the library's warnings as one line each."""
+        """Print each warning of the library in one line."""
 
         def show(message: Warning | str, category: type[Warning], *_position: Any, **more: Any) -> None:
             if issubclass(category, UserWarning):
@@ -124,14 +124,13 @@ class Progress:
                     self._draw()
 
     def _draw(self) -> None:
-        """Draw the terminal's last line again."""
         with self._lock:
             self.stream.write(f"\r{self._line()[: shutil.get_terminal_size().columns - 1]}\x1b[K")
             self.stream.flush()
             self._open_line = True
 
     def _line(self) -> str:
-        """Return the time, the stage, a bar, the time left, and the text."""
+        """Return the line on the terminal: elapsed time, stage, bar, remaining time and text."""
         now, shown = time.perf_counter(), ", ".join(filter(None, (self._stage, self._text)))
         if self._end is not None:
             left = max(self._end - now, 0.0)
@@ -148,10 +147,10 @@ class Progress:
 
 
 class StudyProgress(Progress):
-    """Progress over many subjects: how many are done, and how long the others will take.
+    """Progress over many subjects: the number of finished subjects, and the estimated time for the others.
 
-    On a terminal it is one line with a bar, in which the stages of a subject are shown too; elsewhere a line for each
-    subject that begins and ends. Warnings are shown with the subject's name and kept for its sidecar.
+    On a terminal, one line shows a bar and the stages of the current subject. Otherwise, a line is printed at the
+    beginning and at the end of each subject. Warnings include the name of the subject, and its sidecar contains them.
     """
 
     _LINE_END = "\r\x1b[K"
@@ -162,7 +161,7 @@ class StudyProgress(Progress):
 
     @contextmanager
     def subject(self, name: str) -> Iterator[None]:
-        """Work on a subject: its warnings are those of the body, and its seconds tell how long the others take."""
+        """Attribute warnings in the body to a subject, and use its time to estimate the time of other subjects."""
         begun = self._begun = time.perf_counter()
         self._subject, self._stage, self._text, self.warnings = name, "", "", []
         if self._on_terminal:
@@ -177,7 +176,7 @@ class StudyProgress(Progress):
             self._subject = ""
 
     def line(self) -> str:
-        """Return the bar, how many of how many are done, and the time left where one was computed already."""
+        """Return the bar, the numbers of finished and all subjects, and after the first one the remaining time."""
         text = f"{bar(self.ended / max(1, self.total))} {self.ended} of {self.total}"
         if not self.ended or self.ended == self.total:
             return text
@@ -186,10 +185,10 @@ class StudyProgress(Progress):
         return f"{text}, about {duration(max(left, 0.0))} left"
 
     def note(self, text: str) -> None:
-        """Say nothing: the decisions of reading a subject's files are in its sidecar."""
+        """Print nothing, because the sidecar of a subject contains the notes of the reader."""
 
     def end(self, text: str) -> None:
-        """Say how a subject, or the study, ended."""
+        """Print the result of a subject or of the study."""
         super().note(text)
 
     def _line(self) -> str:

@@ -1,4 +1,4 @@
-"""The volume of tensors that the options of reading describe."""
+"""Read the volume of tensors that the options for reading describe."""
 
 import argparse
 from collections.abc import Callable
@@ -18,44 +18,44 @@ from hks_jax.io.units import unit_question
 
 
 def image_suffix(path: Path) -> str:
-    """Return the suffix of images in the format of a file; of NumPy's files none."""
+    """Return the suffix of images in the format of a file; it is empty for NumPy's files."""
     return format_of(path).image
 
 
 def require_metric(args: argparse.Namespace) -> None:
-    """Raise ValueError where diffusion tensors are not yet a metric."""
+    """Raise ValueError if the file has diffusion tensors and no metric is chosen."""
     if args.metric is None and image_suffix(args.file):
         raise ValueError(
-            "--metric: choose one; diffusion tensors D become a metric as inverse (D⁻¹, Brownian motion with "
+            "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, for Brownian motion with "
             "diffusivity D), tensor (D itself) or adjugate (|D|D⁻¹)"
         )
 
 
 def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
-    """Read the tensors as `read` does, and refuse those that make no metric."""
+    """Read the tensors by `read`, and raise ValueError if they do not define a metric."""
     require_metric(args)
     volume = read(args, progress)
     if 1 in volume.shape:
-        raise ValueError(f"--slice: the volume is one voxel thick; pass --slice {'xyz'[volume.shape.index(1)]}=0")
+        raise ValueError(f"--slice: got a volume one voxel thick. Pass --slice {'xyz'[volume.shape.index(1)]}=0")
     require_valid(volume.with_mask(volume.grid(args.components).mask), "--repair")
     return volume
 
 
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
-    """Read or fit the tensors, cut the slice, settle the mask, and repair if asked to.
+    """Read or fit the tensors, and apply the options for the slice, the mask and the repair.
 
-    Questions are warnings, unless `ask` takes them. With ``args.strict_unit``, an implausible unit needs ``--unit``.
+    Questions go to `ask` or become warnings. With ``args.strict_unit``, an implausible unit without ``--unit`` fails.
     """
     with progress.stage("reading", str(args.file)):
         volume, mask = _load(args)
         if mask is not None and mask.shape == volume.shape:
             volume, mask = volume.with_mask(mask), None
-        if mask is None:  # background says nothing of units and axes
+        if mask is None:  # the background would distort the checks of units and axes
             volume = _without_filling(without_background(volume), args.background, progress)
         volume = _reviewed(volume, args, progress.warn if ask is None else ask)
         if args.slice is not None:
             volume = sliced(volume, *args.slice)
-        if mask is not None:  # it may be one of the slice alone
+        if mask is not None:  # the mask may have the shape of the slice
             if mask.shape != volume.shape:
                 raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
             volume = without_background(volume.with_mask(mask))
@@ -68,15 +68,15 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
         values = np.linalg.eigvalsh(volume.tensors[volume.inside])
         if clipped := int((values[:, 0] < 0.01 * np.median(values.mean(axis=-1))).sum()):
             progress.warn(
-                f"{clipped} tensors inside have an eigenvalue near zero: DIPY clips fits that are not positive "
-                "definite. Distances in D⁻¹ are enormous there; --erode 1 takes the rim off, --repair nearest:1e-4 "
-                "replaces them"
+                f"{clipped} tensors inside have an eigenvalue near zero, because DIPY clips fits that are not positive "
+                "definite. Distances in D⁻¹ are very large there. --erode 1 removes boundary voxels, and --repair "
+                "nearest:1e-4 replaces these tensors"
             )
     return volume
 
 
 def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
-    """Return the slice that ``--slice`` names."""
+    """Return a slice; an error names the option ``--slice``."""
     try:
         return volume.slice(axis, index)
     except ValueError as error:
@@ -84,20 +84,20 @@ def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
 
 
 def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
-    """Return the volume, and the mask where that is still to be laid over it."""
+    """Return the volume, and the mask of ``--mask`` if the volume does not have it yet."""
     if args.bval is None and args.bvec is None:
-        refuse(args, ("b_max",), "it is for diffusion-weighted images; pass --bval and --bvec too")
-        refuse(args, ("bvec_frame",), "it is for diffusion-weighted images; of tensors pass --frame")
+        refuse(args, ("b_max",), "this option is for diffusion-weighted images; pass --bval and --bvec too")
+        refuse(args, ("bvec_frame",), "this option is for diffusion-weighted images; for tensors pass --frame")
         spacing = args.spacing[0] if args.spacing is not None and len(args.spacing) == 1 else args.spacing
         files, names = [args.file, *args.others] if args.others else args.file, ("frame", "array", "confidence", "unit")
         volume = read_tensors(files, args.order, spacing=spacing, **{name: getattr(args, name) for name in names})
         return volume, None if args.mask is None else read_mask(args.mask, volume.affine)
     if args.others:
-        raise ValueError(f"FILE: got {1 + len(args.others)} files; --bval and --bvec belong to one file of all images")
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one file of all images for --bval, --bvec")
     if args.bval is None or args.bvec is None:
-        raise ValueError("--bval, --bvec: got one of them; diffusion-weighted images need both")
-    refuse(args, ("frame",), "it is for files of tensors; pass --bvec-frame")
-    refuse(args, ("order", "array", "spacing"), "it is for files of tensors; leave it out with --bval and --bvec")
+        raise ValueError("--bval, --bvec: got one option; expected both for diffusion-weighted images")
+    refuse(args, ("frame",), "this option is for files of tensors; pass --bvec-frame")
+    refuse(args, ("order", "array", "spacing"), "this option is for files of tensors; leave it out with --bval")
     noise: Literal["residuals"] | None = "residuals" if getattr(args, "noise", None) == "residuals" else None
     axes: dict[str, Any] = {"bvec_frame": args.bvec_frame or "fsl"}
     files = (args.file, args.bval, args.bvec, args.mask)
@@ -105,27 +105,27 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
 
 
 def _without_filling(volume: TensorVolume, background: str | None, progress: Progress) -> TensorVolume:
-    """Return the volume without background, if ``--background`` puts it outside; warn if nothing is said of it."""
+    """Exclude the background if ``--background outside`` is given; warn about it if the option is not given."""
     found = None if background == "inside" else find_background(volume)
     if found is None:
         return volume
     if background is None:
-        progress.warn(f"{found[1]}. Pass --mask, or --background outside, or inside if they are of the domain")
+        progress.warn(f"{found[1]}. Pass --mask or --background outside, or inside if the domain contains these voxels")
         return volume
-    note = found[1].replace("count as inside", "are left out as asked")
+    note = found[1].replace("count as inside", "are left out, as asked")
     return replace(volume.with_mask(~found[0]), notes=(*volume.notes, note))
 
 
 def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str], None]) -> TensorVolume:
-    """Ask the questions that the tensors raise; return them with notes on their fibres."""
-    if args.positive is not None:  # of no diffusion
+    """Ask questions about a wrong frame or unit; return the volume with a note about its fibres."""
+    if args.positive is not None:  # these are not diffusion tensors
         return volume
     volume, asked = reviewed(volume)
     for question in asked:
         if getattr(args, "strict_unit", False) and not volume.unit and question == unit_question(volume):
             raise ValueError(
-                f"{args.file}: {as_options(question)}. If the numbers are right pass --unit mm2/s: the subjects of a "
-                "study must have the same unit, in the table by a column unit"
+                f"{args.file}: {as_options(question)}. The subjects of a study must have the same unit. If the numbers "
+                "are right, pass --unit mm2/s, or add a column unit to the table"
             )
         ask(as_options(question))
     return volume
@@ -134,7 +134,7 @@ def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str
 def _repaired(volume: TensorVolume, args: argparse.Namespace) -> TensorVolume:
     if args.positive is not None:
         if args.repair is not None:
-            raise ValueError("--positive, --repair: got both; --positive leaves nothing to repair")
+            raise ValueError("--positive, --repair: got both, but --positive leaves nothing to repair. Leave one out")
         try:
             return positive_tensors(volume, *args.positive)
         except ValueError as error:
@@ -142,4 +142,4 @@ def _repaired(volume: TensorVolume, args: argparse.Namespace) -> TensorVolume:
     if args.repair is None:
         return volume
     volume = repair_tensors(volume, *args.repair)
-    return volume if volume.repair["voxels"] else replace(volume, notes=(*volume.notes, "repair: not needed"))
+    return volume if volume.repair["voxels"] else replace(volume, notes=(*volume.notes, "repair: no tensor needs it"))

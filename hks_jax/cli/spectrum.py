@@ -1,11 +1,11 @@
 """Compare eigenvalues with Weyl's law.
 
-Compute the lowest eigenvalues of the Laplace-Beltrami operator of a field of diffusion tensors. FILE is read as by
+Compute the lowest eigenvalues of the Laplace-Beltrami operator of a field of diffusion tensors. FILE is read as in
 'hks-jax hks'.
 
-Writes to the folder OUT: spectrum.csv and spectrum.npz (eigenvalues, their residuals, and how many there are up to each
-by Weyl's law), spectrum.png and report.json. The boundary is neumann, also of a mask: mean would join the eigenvalues
-of two problems.
+The command writes to the folder OUT: spectrum.csv and spectrum.npz (eigenvalues, residuals, and the counts of
+eigenvalues by Weyl's law), spectrum.png and report.json. The default boundary condition is neumann even for a mask,
+because mean would join the eigenvalues of two problems.
 
 examples:
   hks-jax spectrum tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 300

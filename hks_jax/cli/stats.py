@@ -1,15 +1,15 @@
-"""Write a table of regions' means over the labels of an atlas.
+"""Write a table of means over the regions of an atlas.
 
-Write a table of regions: for each label of an image, and each t of the signature that 'hks-jax hks' has left in the
-folder OUT, the mean, the standard deviation and the median over the region's voxels; with the region's volume, and the
-share of it that is in the domain. The labels are in the image's own space: where their affine places them on other
-voxels they are refused.
+Write a table of the mean, the standard deviation and the median of the signature over each labelled region, at each t.
+The signature is the one that 'hks-jax hks' has written to the folder OUT. The table also has the volume of each region
+in the domain, and the share of its voxels in the domain. The labels must be on the voxels of the image; labels with
+another affine raise an error.
 
 examples:
   hks-jax stats out --atlas sub-01_dseg.nii.gz
   hks-jax stats out --atlas aparc+aseg.nii.gz --names FreeSurferColorLUT.txt -o regions.tsv
 
-Of many subjects, 'hks-jax batch --atlas' writes all tables and joins them.
+For many subjects, 'hks-jax batch --atlas' writes all tables and joins them.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from hks_jax.signatures.regions import region_statistics
 OPTIONS = """
 result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 -o,--output TABLE  the table (default: regions.tsv in OUT)
---atlas FILE!  labels on the voxels of the image, whole numbers, 0 for none: NIfTI, or .npy of the image's shape
+--atlas FILE!  integer labels on the image's voxels, with 0 for unlabelled: NIfTI, or .npy of the image's shape
 @names
 """
 
@@ -41,7 +41,7 @@ _SCALES = {
     "raw": "the heat kernel signature, per (metric length)^d",
     "heat-trace": "the heat kernel signature divided by the heat trace",
     "volume": "the heat kernel signature times the domain's volume in the metric",
-    "flat": "(4πt)^(d/2) times the heat kernel signature: 1 where space is flat",
+    "flat": "(4πt)^(d/2) times the heat kernel signature, which is 1 for flat space",
 }
 
 
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def names_of(labels: Path, names: Path | None) -> tuple[Path | None, dict[int, str]]:
-    """Return the file of the names of labels, which may be beside them, and the names."""
+    """Return the names of labels and their file, which is `names` or the table beside the labels."""
     beside = names or names_beside(labels)
     return (None, {}) if beside is None else (Path(beside), read_names(beside))
 
@@ -66,22 +66,22 @@ def names_of(labels: Path, names: Path | None) -> tuple[Path | None, dict[int, s
 def region_table(
     source: Path, atlas: Path, names: Path | None, progress: Progress
 ) -> tuple[tuple[str, ...], list[tuple[Any, ...]], dict[str, Any]]:
-    """Return the columns and rows of a result's table, a row for each region and time, and what its sidecar says."""
+    """Return the columns, the rows (one for each region and time) and the sidecar of a result's table."""
     result = Result.read(source, "hks")
     volume, values = result.volume, result.values
     if not result.times.size:
-        raise ValueError(f"{source}: has no times; expected a signature over t, as 'hks-jax hks' writes it")
+        raise ValueError(f"{source}: got a result without times; expected a signature that 'hks-jax hks' wrote")
     if volume.affine is None:
-        progress.warn(f"{source.name} has no place in space: the labels are taken voxel by voxel, and not checked")
+        progress.warn(f"{source.name} has no affine, so the positions of the labels are not checked")
     labels = read_labels(atlas, volume)
     names, called = names_of(atlas, names)
-    # A slice of a volume is one voxel thick.
+    # A slice with an affine counts as one voxel thick.
     of_one = math.prod(volume.spacing) if volume.affine is None else abs(np.linalg.det(volume.affine[:3, :3]))
     regions = region_statistics(values, labels, float(of_one))
     if not regions.nodes.any():
-        raise ValueError(f"{atlas}: none of its {regions.labels.size} regions has a voxel in the domain of {source}")
+        raise ValueError(f"{atlas}: none of the {regions.labels.size} regions has a voxel in the domain of {source}")
     n_times, n_regions = regions.mean.shape
-    by_time = {"t": result.times, "lambda1_t": result.arrays.get("scaled_times")}  # of a study whose times are λ₁t
+    by_time = {"t": result.times, "lambda1_t": result.arrays.get("scaled_times")}  # for --time-unit lambda1
     by_region = {
         "index": regions.labels,
         "voxels": regions.nodes,
@@ -92,7 +92,7 @@ def region_table(
     cells = {name: np.tile(of, n_regions) for name, of in by_time.items() if of is not None}
     cells |= {name: np.repeat(of, n_times) for name, of in by_region.items()}
     cells |= {"mean": regions.mean.T.ravel(), "std": regions.deviation.T.ravel(), "median": regions.median.T.ravel()}
-    if "noise_maps" in result.arrays:  # the means of draws of noise have the variance of the mean's
+    if "noise_maps" in result.arrays:  # the variance of the mean is that of means of noise
         draws = [region_statistics(one, labels).mean for one in result.arrays["noise_maps"]]
         cells["error"] = np.sqrt(np.mean(np.square(draws), axis=0)).T.ravel()
     described = _about(result, atlas, names)
@@ -102,7 +102,7 @@ def region_table(
 
 
 def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
-    """Return the sidecar: a description of each column, in their order, and where they came from."""
+    """Return the sidecar, with descriptions of the columns in order, and their origin."""
     settings = result.settings
     flat = result.volume.dimension == 2 and result.volume.affine is None
     values = _SCALES.get(settings.get("normalisation", "raw"), "the heat kernel signature")
@@ -111,17 +111,17 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
         "index": {"Description": "number of the region in the label map"},
         "region": {"Description": "name of the region"},
         "voxels": {"Description": "voxels of the region that are in the domain of the signature"},
-        "coverage": {"Description": "their share of all of the region's voxels"},
+        "coverage": {"Description": "share of the region's voxels that are in the domain of the signature"},
         "volume": {
-            "Description": f"{'area' if flat else 'volume'} of the voxels counted, in the lengths of the image "
-            "(NIfTI: mm); a slice is one voxel thick"
+            "Description": f"{'area' if flat else 'volume'} of the region's voxels in the domain, in the unit of the "
+            "image (NIfTI: mm); a slice is one voxel thick"
         },
-        "lambda1_t": {"Description": "t times the first positive eigenvalue: the same numbers for all subjects"},
-        "t": {"Description": "time of diffusion, (metric length)²: s for the metric D⁻¹ of mm²/s on mm", **unit},
-        "mean": {"Description": f"mean over these voxels of {values}"},
+        "lambda1_t": {"Description": "t times the first positive eigenvalue, equal for all subjects"},
+        "t": {"Description": "time in (metric length)²; in s for the metric D⁻¹ with D in mm²/s", **unit},
+        "mean": {"Description": f"mean of {values} over the region's voxels in the domain"},
         "std": {"Description": "standard deviation over these voxels (the root of the mean square deviation)"},
         "median": {"Description": "median over these voxels"},
-        "error": {"Description": "standard deviation of the mean that the noise of the tensors gives it"},
+        "error": {"Description": "standard deviation of the mean due to the noise of the tensors"},
         "GeneratedBy": {"Name": "hks-jax", "Version": __version__},
         "LabelMap": {"File": atlas.name, "SHA256": digest(atlas)},
         "Names": None if names is None else {"File": names.name, "SHA256": digest(names)},

@@ -1,4 +1,4 @@
-"""How the command line writes slices, voxels, repairs, boundaries, times and folders."""
+"""Parse the values of options: slices, voxels, repairs, boundary conditions, times and folders."""
 
 import math
 import os
@@ -16,7 +16,7 @@ from hks_jax.io.repair import REPAIRS
 
 
 def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return a reader of texts that raises an error, naming the expected form, where `read` returns None."""
+    """Return a parser of texts that raises an error with the expected form if `read` returns None."""
 
     def parse(text: str) -> Any:
         if (value := read(text)) is None:
@@ -27,7 +27,7 @@ def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    """Read finite numbers between commas; none where there is anything else."""
+    """Return finite numbers separated by commas, or an empty tuple for any other text."""
     try:
         numbers = tuple(map(float, text.split(",")))
     except ValueError:
@@ -48,7 +48,7 @@ def _positive(text: str) -> tuple[str, float] | None:
 
 
 def parse_boundary(text: str) -> BoundarySpec:
-    """Read ``neumann``; ``neumann,periodic`` (one per axis); ``neumann:dirichlet,periodic`` (low side, high side)."""
+    """Parse ``neumann``, ``neumann,periodic`` (one per axis) or ``neumann:dirichlet,periodic`` (low:high sides)."""
     entries: list[Any] = [tuple(one.split(":", 1)) if ":" in one else one for one in text.split(",")]
     return text if entries == [text] else tuple(entries)
 
@@ -61,7 +61,7 @@ class Times(NamedTuple):
 
 
 def parse_times(words: list[str] | None) -> Times:
-    """Read numbers, separated by spaces or commas, or ``auto``, ``auto:8``."""
+    """Parse numbers separated by spaces or commas, or ``auto``, or ``auto:8``."""
     text = ",".join(piece for word in words or ["auto"] for piece in word.split(",") if piece)
     if auto := re.fullmatch(r"auto(?::0*([1-9]\d*))?", text):
         return Times((), int(auto[1] or 6))
@@ -72,17 +72,17 @@ def parse_times(words: list[str] | None) -> Times:
 
 
 def parse_folder(text: str) -> Path:
-    """Return a path, if it is a folder that may be written, or could become one."""
+    """Return a path if it is a writable folder, or if such a folder can be created."""
     nearest = next(folder for folder in (Path(text), *Path(text).absolute().parents) if folder.exists())
     if not nearest.is_dir():
-        raise ArgumentTypeError(f"{nearest} is a file; expected a folder, or a name that is free")
+        raise ArgumentTypeError(f"got the file {nearest}; expected a folder, or a path that does not exist")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ArgumentTypeError(f"{nearest} may not be written; choose another folder")
+        raise ArgumentTypeError(f"the folder {nearest} is not writable. Choose another folder")
     return Path(text)
 
 
 def parse_target(text: str) -> Path:
-    """Return the path of a file, if its folder may be written."""
+    """Return the path of a file if its folder is writable or can be created."""
     return parse_folder(os.path.dirname(text) or ".") / os.path.basename(text)
 
 
@@ -117,4 +117,4 @@ KINDS: dict[str, Callable[[str], Any] | Iterable[str]] = {
     "CONDITION": parse_boundary,
     **{"ORDER": ORDERS, "UNIT": UNITS, "SOLVER": ("auto", *SOLVERS)},
 }
-"""By the words of the table of options: what reads a text, or the texts that are allowed. Other words are any text."""
+"""For each word in the table of options, the parser of its values or the allowed values; other words allow any text."""

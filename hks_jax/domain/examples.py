@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import require_count
-from hks_jax.domain.geodesic import geodesic_ball, geodesic_sphere
+from hks_jax.domain.geodesic import geodesic
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -68,7 +68,7 @@ def sphere_mesh(n: int) -> SurfaceMesh:
     The eigenvalues of the sphere are l(l + 1), 2l + 1 times.
     """
     require_count("n", n)
-    return SurfaceMesh(*geodesic_sphere(n))
+    return SurfaceMesh(*geodesic(n, 2))
 
 
 def ball_mesh(n: int) -> TetMesh:
@@ -81,7 +81,7 @@ def ball_mesh(n: int) -> TetMesh:
     Dirichlet conditions those of the zeros of jₗ, the spherical Bessel functions; each 2l + 1 times.
     """
     require_count("n", n)
-    return TetMesh(*geodesic_ball(n))
+    return TetMesh(*geodesic(n, 3))
 
 
 def _periodic_grid(shape: Sequence[int]) -> Grid:

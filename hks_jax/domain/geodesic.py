@@ -51,27 +51,17 @@ def _glued(
     return points, number.reshape(len(simplices), -1)[:, cells].reshape(-1, cells.shape[1])
 
 
-def geodesic_sphere(n: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Return 10n² + 2 points of the unit sphere and 20n² triangles between them, oriented outward."""
-    corners, faces = _icosahedron()
-    shares, cells = _glued(faces, n)
-    vertices = shares[:, :_CENTRE] @ corners
-    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    return vertices, _swapped(cells, vertices[cells])
+def geodesic(n: int, dimension: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "cells corners"]]:
+    """Return the points and the cells of the unit sphere (2) or ball (3), triangles oriented outward or tetrahedra.
 
-
-def geodesic_ball(n: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "C 4"]]:
-    """Return points of the unit ball, in n concentric layers about its centre, and 20n³ tetrahedra between them."""
+    The sphere has 10n² + 2 points and 20n² triangles; the ball n concentric layers about its centre, 20n³ tetrahedra.
+    """
     corners, faces = _icosahedron()
-    shares, cells = _glued(np.insert(faces, 0, _CENTRE, axis=1), n)
+    shares, cells = _glued(faces if dimension == 2 else np.insert(faces, 0, _CENTRE, axis=1), n)
     vertices = shares[:, :_CENTRE] @ corners
-    length = np.linalg.norm(vertices, axis=1)
-    radius = 1 - shares[:, _CENTRE] / n
+    length, radius = np.linalg.norm(vertices, axis=1), 1 - shares[:, _CENTRE] / n
     vertices *= (radius / np.where(length > 0, length, 1))[:, None]
-    return vertices, _swapped(cells, vertices[cells[:, 1:]] - vertices[cells[:, :1]])
-
-
-def _swapped(cells: Int[np.ndarray, "n corners"], frames: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, "n corners"]:
-    """Swap two vertices of the cells whose frame is left-handed."""
+    frames = vertices[cells] if dimension == 2 else vertices[cells[:, 1:]] - vertices[cells[:, :1]]
+    # Of the cells whose frame is left-handed, two vertices are swapped.
     left = np.linalg.det(frames) < 0
-    return np.where(left[:, None], cells[:, [1, 0, *range(2, cells.shape[1])]], cells)
+    return vertices, np.where(left[:, None], cells[:, [1, 0, *range(2, dimension + 1)]], cells)

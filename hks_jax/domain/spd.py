@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.linear.dense_eigh import differentiable_eigh
+from hks_jax.linear.products import matmul
 
 
 @jax.jit
@@ -127,7 +128,7 @@ def _exp_in_2d(deviator: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Arr
 
 def _exp_in_3d(deviator: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]:
     """Return [S, S²] and the coefficients of I, S and S² in exp S − I; tr S = 0."""
-    square = _matmul(deviator, deviator)
+    square = matmul(deviator, deviator)
     p, r = 0.5 * jnp.trace(square, axis1=-2, axis2=-1), determinant(deviator)
     small_p, small_r = p / 4**_SQUARINGS, r / 8**_SQUARINGS
     a = b = c = jnp.zeros_like(p)
@@ -182,7 +183,7 @@ def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tu
     values, vectors = eigh(primals[0])
     a, b = values[..., :, None], values[..., None, :]
     differences = 2 / (a + b) * _atanhc((a - b) / (a + b))
-    inner = _matmul(_matmul(jnp.swapaxes(vectors, -1, -2), tangents[0]), vectors)
+    inner = matmul(jnp.swapaxes(vectors, -1, -2), tangents[0], vectors)
     return _log_of_pairs(values, vectors), _compose(vectors, differences * inner)
 
 
@@ -196,11 +197,7 @@ def _log_of_pairs(values: Float[Array, "... d"], vectors: Float[Array, "... d d"
 
 
 def _compose(vectors: Float[Array, "... d d"], inner: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    return symmetrise(_matmul(_matmul(vectors, inner), jnp.swapaxes(vectors, -1, -2)))
-
-
-def _matmul(a: Float[Array, "... d d"], b: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    return jnp.matmul(a, b, precision="highest")
+    return symmetrise(matmul(vectors, inner, jnp.swapaxes(vectors, -1, -2)))
 
 
 def _atanhc(x: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -79,7 +79,7 @@ class NodalPencil(eqx.Module):
     def mass_solve(
         self, low: Float[Array, ""] | float, degree: int
     ) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return r ↦ Pr, P ≈ M⁻¹ so many steps of Chebyshev iteration; exact where the mass is lumped."""
+        """Return r ↦ Pr, P ≈ M⁻¹ by a number of steps of Chebyshev iteration; exact where the mass is lumped."""
         inverse, mass = 1 / self.lumped[..., None], self.mass.of_columns()
         if self.mass.is_diagonal:
             return lambda r: inverse * r
@@ -126,8 +126,8 @@ def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
     """Return a pencil on all nodes of a grid, whose lowest eigenpairs are those of the pencil given, if that pays.
 
     Each node that is not free is an equation of its own, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
-    the spectrum; eigenvectors of others vanish there. The pencil is returned as it is where more than that quarter is
-    wanted, k pairs, and where values are traced, as the computation is compiled for its mask in any case.
+    the spectrum; eigenvectors of others vanish there. The pencil is returned as it is where k, the number of pairs that
+    are wanted, exceeds that quarter, and where values are traced: they are compiled for their mask in any case.
     """
     parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
     return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from hks_jax.inverse.metric_fit import Step
-from hks_jax.npz import load_npz, write_npz
+from hks_jax.storage import load_npz, write_npz
 
 
 @dataclasses.dataclass
@@ -26,7 +26,7 @@ class Checkpoint:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and settings; functions count by their names, which are those of the next session too."""
+    """Return a hash of arrays and settings. A function counts by its name, which another process gives it too."""
     digest = hashlib.blake2b(digest_size=16)
     for leaf in jax.tree.leaves(parts):
         text = getattr(leaf, "__qualname__", repr(leaf)).encode()

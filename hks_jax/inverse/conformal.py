@@ -20,7 +20,7 @@ from hks_jax.linear.multifrontal import Factorisation, factorise
 
 
 class Preconditioner(eqx.Module):
-    """What resembles JᵀJ + μB, up to a factor: symmetric, positive definite, and with an inverse."""
+    """An approximation of JᵀJ + μB up to a factor: symmetric, positive definite, and easily inverted."""
 
     @abstractmethod
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
@@ -80,7 +80,7 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
 
 
 _TOP = 0.03
-"""About what the eigenvalues of JᵀJ are where a(λt)² is largest, for weights that add up to one."""
+"""The size of the eigenvalues of JᵀJ where a(λt)² is largest, for weights that add up to one."""
 _POWER, _REACH = 3, 9.0
 """In fits on 32² and 64² nodes from t = 0.0045 on, (1 + λt/9)³ takes the fewest steps among such powers, or nearly."""
 
@@ -92,7 +92,7 @@ _POWER, _REACH = 3, 9.0
 #
 # x/6 for small x, which is the curvature's share tK/3, and of the order of 1/x for large. So JᵀJ is about Σₜ wₜ a(tL)²,
 # L the Laplacian, and its eigenvalues fall off with those of L, beyond the first few. On a grid they do so faster: the
-# factor is interpolated between nodes, which takes away what oscillates from node to node.
+# factor is interpolated between nodes, which damps oscillations from node to node.
 class ConformalInformation(Preconditioner):
     """B½ (1 + L/λ₁)⁻³ B½, B the lumped mass and L the Laplacian of the initial metric by differences along edges.
 

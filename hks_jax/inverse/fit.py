@@ -42,11 +42,11 @@ def fit_metric(
 
     Minimises half the weighted mean square of the differences between predicted and given signature, plus the penalties
     of the regularisers. The signature does not tell isometric metrics apart, and sees high frequencies faintly: damped
-    steps, smooth ones by default, take what the data determine first.
+    steps, smooth ones by default, change first the directions that the data determine.
 
     Args:
-        init: where to start: a grid, for the flat metric, or a field, which keeps what the parametrisation does not
-            reach.
+        init: where to start: a grid, for the flat metric, or a field. Properties of the field that the parametrisation
+            does not change stay.
         target: (n_times, *grid.shape), positive at observed nodes: ``hks(pairs, times)`` of the metric sought. A wave
             kernel signature is (n_energies, *grid.shape), a heat trace (n_times,); eigenvalues are (m,), ascending,
             with those that are zero.
@@ -69,8 +69,8 @@ def fit_metric(
         The fit. ``fit.result`` says how it ended; nothing is raised when it stalls or is interrupted.
 
     Warns:
-        AccuracyWarning: the misfit is near to what k pairs leave out: the fit matches its own truncation; or it stays
-            above what the noise explains: no metric that the parametrisation has explains the target.
+        AccuracyWarning: the misfit is near the truncation error of k pairs: the fit matches its own truncation. Or it
+            stays above the noise: no metric of this parametrisation explains the target.
 
     Raises:
         TypeError: `init` is neither a grid nor a field.
@@ -111,8 +111,8 @@ def fit_metric(
     misfit, left = float(outcome.misfit), float(outcome.truncation)
     if truncation_shows(misfit, left):
         warn_of_accuracy(
-            f"k: {problem.k} eigenpairs leave out what amounts to a misfit of about {left:.1e}, and the fit's is "
-            f"{misfit:.1e}: it has fitted its own truncation. Use k=None, or k={more_pairs(problem, values)} or "
+            f"k: {problem.k} eigenpairs leave out a misfit of about {left:.1e}, and the fit's is {misfit:.1e}: "
+            f"it has fitted its own truncation. Use k=None, or k={more_pairs(problem, values)} or "
             f"more; only if the target was itself computed with {problem.k} pairs is nothing wrong"
         )
     elif noise is not None and result in ("converged", "stalled") and misfit > noise**2:

@@ -1,5 +1,6 @@
 """Gauss–Newton with Levenberg–Marquardt damping, matrix-free: products with J and Jᵀ, and conjugate gradients."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -19,11 +20,11 @@ _Options = dict[str, Any]
 _Tags = frozenset[object]
 
 _TIGHTER, _LONGER = 30, 3
-"""By what the linear systems are solved more exactly in steps that may be the last."""
+"""The factors of exactness and of the number of products in linear systems of steps that may be the last."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
-"""What part of the promised reduction a step must keep to be taken, and to let damping fall; what a worse one costs."""
+"""The shares of the promised reduction for which a step is taken, and damping falls; the factor after a worse step."""
 _FREE = 0.01
-"""What part of a step's curvature may be damping if the step is to tell how far the solution is."""
+"""The largest share of damping in a step's curvature for which the step measures the distance to the solution."""
 
 
 def remaining_change(last: Array, before: Array) -> Array:
@@ -33,7 +34,7 @@ def remaining_change(last: Array, before: Array) -> Array:
 
 
 class _State(eqx.Module):
-    """What is known at the last accepted unknowns."""
+    """The descent's knowledge at the last accepted unknowns."""
 
     values: Values  # the unknowns
     gradient: Values  # the gradient
@@ -57,13 +58,13 @@ class _Progress(eqx.Module):
     trial: Values  # the unknowns to be looked at next
     step_size: Float[Array, ""]  # 1/μ, relative to the first
     linearised: Any  # residuals and Jacobian at the last accepted unknowns
-    aux: Any  # what the residuals tell beside, there
-    descent: _State  # what the descent knows, there
+    aux: Any  # the residuals' further output, there
+    descent: _State  # the descent's knowledge, there
     finite: Bool[Array, ""]  # whether the last step is
 
 
 def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:
-    """Return residuals with the products with their Jacobian, and what they tell beside."""
+    """Return residuals with the products with their Jacobian, and their further output."""
     residual, product, aux = jax.linearize(lambda v: fn(v, args), values, has_aux=True)
     jacobian = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: values))
     return optx.FunctionInfo.ResidualJac(residual, jacobian), aux
@@ -83,10 +84,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     Its settings are arrays: steps compiled for some serve all others.
 
     Args:
-        tolerance: what the unknowns still change, relative and absolute (root mean square), when it stops: see
+        tolerance: of the change of the unknowns, relative and absolute (root mean square), at which it stops; see
             `Search`.
         damping: μ of the first step, relative to the scale of the data.
-        growth: by what μ is divided after a step that kept what the linearisation promised.
+        growth: the divisor of μ after a step that reduces the misfit as far as its linearisation promised.
         inner_product: B, in which steps are small.
         inner_tolerance: reduction of the linear residual in each step; steps that may be the last go 30 times further.
         inner_steps: the most products with JᵀJ in each step; in steps that may be the last three times as many.
@@ -125,7 +126,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         self.preconditioner = preconditioner or self.inner_product
 
     def accepted(self, y: Values, state: _State) -> _State:
-        """Return what the step that led to the new unknowns tells; their own gradient comes with the next step."""
+        """Return the state at new unknowns, from the step that led there; the next step computes their gradient."""
         step = y - state.values
         change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(y))))
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
@@ -148,11 +149,11 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     def _next(
         self, step_size: Array, linearised: Any, state: _State, needed: bool | Bool[Array, ""]
     ) -> tuple[Values, _State]:
-        """Return the step δ, zero if none is needed, and the state with the gradient and what the step promises."""
+        """Return the step δ, zero if none is needed, and the state with the gradient and the promised reduction."""
         jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape
         adjoint, damping = jacobian.transpose(), self.damping / step_size
 
-        # J and Jᵀ stand in the program once: they are most of what there is to compile.
+        # J and Jᵀ stand in the program once: they take most of the compilation.
         def normal(x: Array, first: Bool[Array, ""]) -> tuple[Array, float]:
             x = x.reshape(shape)
             image = adjoint.mv(jax.lax.cond(first, lambda: residual, lambda: jacobian.mv(x)))
@@ -168,7 +169,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         solution = conjugate_gradients(normal, precondition, column, tolerance[None], most=most, orthogonal=True)
         x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
         promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
-        return -x, eqx.tree_at(lambda s: (s.gradient, s.promised), state, (gradient, promised))
+        # A stationary point needs no step; a step of size zero would show no convergence.
+        stationary = jnp.all(gradient == 0)
+        done, damped = state.done | stationary, jnp.where(stationary, 0, state.damped)
+        return -x, dataclasses.replace(state, gradient=gradient, promised=promised, done=done, damped=damped)
 
     def init(
         self, fn: Callable, y: Values, args: Any, options: _Options, f_struct: Any, aux_struct: Any, tags: _Tags
@@ -181,10 +185,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     def step(
         self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Values, _Progress, Any]:
-        """Look at the trial, take it or not, and choose the next; return the unknowns and what is told of them.
+        """Take the trial or not, and choose the next; return the unknowns and the residuals' further output.
 
-        The next is not computed, which is most of the work, where the option ``"enough"``, a function of what the
-        residuals tell beside, says that what was taken will do.
+        Computing the next is most of the work. It is left out where the option ``"enough"``, a function of that output,
+        says that the unknowns will do.
         """
         linearised, aux = _linearise(fn, state.trial, args)
         # Traces are compared by identity: the one of the state stands for all.
@@ -224,5 +228,5 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         tags: _Tags,
         result: Any,
     ) -> tuple[Values, Any, dict[str, Any]]:
-        """Return the unknowns and what is told of them as they are."""
+        """Return the unknowns and the further output as they are."""
         return y, aux, {}

@@ -1,4 +1,4 @@
-"""What data tell about the unknowns of a fit: the spectrum of JᵀJ, resolution, and uncertainty."""
+"""The information of data about the unknowns of a fit: the spectrum of JᵀJ, resolution, and uncertainty."""
 
 from typing import Any
 
@@ -16,11 +16,11 @@ from hks_jax.linear import lapack
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 
 _ROUNDS = 4
-"""Rounds of Chebyshev filtering for the weakest directions, each with what the last one found."""
+"""Rounds of Chebyshev filtering for the weakest directions; each begins with the result of the last."""
 
 
 class Identifiability(eqx.Module):
-    """What noisy data determine near a solution, to first order.
+    """The directions that noisy data determine near a solution, to first order.
 
     With independent residuals of standard deviation σ the information about the unknowns is JᵀJ/σ². Against a prior of
     standard deviation τ, a direction v of JᵀJ with eigenvalue s² is determined by s²/(s² + σ²/τ²): near one by the
@@ -31,8 +31,8 @@ class Identifiability(eqx.Module):
         directions: (n, *values) their eigenvectors, of length one.
         weak_strengths: (n_weak,) estimates from above of the smallest eigenvalues, ascending.
         weak_directions: (n_weak, *values) directions that the data hardly see.
-        resolution: (nodes,) for each node of the domain, what part of its unknowns the data determine: 0 … 1. A lower
-            bound, by the n directions alone.
+        resolution: (nodes,) the share of each node's unknowns that the data determine: 0 … 1. A lower bound, by the n
+            directions alone.
         deviation: (nodes,) the standard deviation of a node's unknowns (root mean square) that is left, by the n
             directions alone: an upper bound of that of the exact posterior, to first order, under a white prior
             (unknowns independent of each other, of standard deviation τ each). Under a prior that expects
@@ -70,11 +70,11 @@ def identifiability(
     iterations: int = 4,
     seed: int = 0,
 ) -> Identifiability:
-    """Find what the data of a fit determine, by products with J and Jᵀ alone.
+    """Find the directions that the data of a fit determine, by products with J and Jᵀ alone.
 
     The strongest directions come from randomised subspace iteration on JᵀJ (Halko, Martinsson and Tropp 2011), the
     weakest from the same on the complement, by Chebyshev polynomials that damp all that is strong. Isometries that the
-    observation cannot tell are among the weak ones, and so are checkerboards and what is far from every observed node.
+    observation cannot tell are among the weak ones, and so are checkerboards and changes far from observed nodes.
 
     Args:
         fit: from `fit_metric`, or its problem.
@@ -152,7 +152,7 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
 
     def improve(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
         values, block = state
-        # A Chebyshev polynomial that is small between what is weak as far as is known and the top, and grows below.
+        # A Chebyshev polynomial: small between the weak eigenvalues found so far and the top, growing below.
         cut = jnp.mean(values)
         centre, half = (1.1 * top + cut) / 2, (1.1 * top - cut) / 2
 

@@ -21,7 +21,7 @@ _TOLERANCE, _STEPS = 1e-6, 1000
 
 RESULTS = {
     "converged": "the unknowns no longer change by more than the tolerance",
-    "noise level reached": "the misfit is what the stated noise explains",
+    "noise level reached": "the misfit is as small as the stated noise",
     "steps exhausted": "max_steps was reached; allow more",
     "stalled": "no step improves the loss any more; damping, regularisers or k may need a change",
     "not finite": "the signature or its derivative is NaN or infinite; see the warnings",
@@ -34,7 +34,7 @@ class Step:
     """One step of a fit.
 
     Attributes:
-        step: its number, from 0: what was known before any change. Of solvers of optimistix only steps that were taken
+        step: its number, from 0 for the unknowns before any change. Of solvers of optimistix only steps that were taken
             are told, not those that were tried.
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the part of the data.
@@ -63,11 +63,11 @@ class Step:
 
 
 class Posterior(eqx.Module):
-    """What noise and prior leave open of a fitted metric, to first order.
+    """The uncertainty of a fitted metric that noise and prior leave, to first order.
 
     Attributes:
         values: (*values) the standard deviations of the unknowns, in the parametrisation's units.
-        tensors: (*shape, d, d) those of the tensors' components.
+        tensors: (*shape, d, d) the standard deviations of the tensors' components.
         unsolved: the largest relative residual of the linear systems of the draws.
         sampling_error: the relative standard deviation of all of these deviations.
     """
@@ -80,7 +80,7 @@ class Posterior(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class MetricFit:
-    """What `fit_metric` returns.
+    """The result of `fit_metric`.
 
     Attributes:
         field: the fitted metric.
@@ -89,7 +89,7 @@ class MetricFit:
         truncation_misfit: an estimate of the misfit that the metric itself would have to a target of all eigenpairs, as
             k are computed; 0 for signatures that k pairs define.
         history: one entry for each step.
-        result: one of the keys of `RESULTS`, which say what they mean.
+        result: one of the keys of `RESULTS`, whose values explain them.
         values: the unknowns, as the parametrisation has them.
         problem: the least squares problem, for `identifiability` and for a fit of your own.
         losses: the loss of each start.
@@ -127,7 +127,7 @@ class MetricFit:
         """Compute the error bars of the fitted metric, to first order about it: Laplace's approximation.
 
         The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹: J is the Jacobian of the data, Σ their noise,
-        weighed as in the fit, and R what the penalties and a white prior know. Draws from it come of one linear
+        weighed as in the fit, and R the Hessian of the penalties and of a white prior. Draws from it come of one linear
         system each, by conjugate gradients.
 
         Args:

@@ -1,4 +1,4 @@
-"""What is observed: a target signature, where and when, and how a prediction is compared with it."""
+"""Observations: a target signature, its nodes and times, and the comparison of a prediction with it."""
 
 import dataclasses
 import math
@@ -31,14 +31,14 @@ LOSSES: dict[str, Loss] = {
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """What the target of `hks_jax.fit_metric` is, and how exactly it is known.
+    """The kind of the target of `hks_jax.fit_metric`, and its weights and noise.
 
     Attributes:
         signature: ``"hks"``; ``"heat-trace"``; ``"eigenvalues"``, the lowest; `wave_kernel` (σ); or a function of
             `Eigenpairs` to an array of the target's shape.
         loss: ``"log"`` (differences of logarithms), ``"relative"``, ``"absolute"``, or a function of predicted and
             target values, flat, to residuals.
-        weights: ≥ 0, broadcast to the target's shape; 0 for what is not observed (it may be NaN there).
+        weights: ≥ 0, broadcast to the target's shape; 0 where nothing is observed (the target may be NaN there).
         noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``): the fit stops where the misfit
             reaches it (discrepancy principle), which regularises it.
         deviation: the standard deviation of the target's noise, in its unit, broadcast to its shape, as
@@ -57,7 +57,7 @@ class Data:
     deviation: Any = None
 
     def __post_init__(self) -> None:
-        """Check what can be checked without the target."""
+        """Check the settings, as far as that needs no target."""
         if not callable(self.signature) and not isinstance(self.signature, Signature):
             named("signature", self.signature, SIGNATURES, "wave_kernel(sigma), or a function of eigenpairs")
         if not callable(self.loss):
@@ -87,7 +87,7 @@ class Observation(eqx.Module):
         return values[: self.shape[0]] if self.signature.lowest else values  # there may be spare pairs
 
     def pairs_needed(self, k: int | None, pencil: AnyPencil, field: TensorField) -> int:
-        """Return how many eigenpairs to compute: k, or enough for what is observed."""
+        """Return the number of eigenpairs to compute: k, or enough for the observed times."""
         if self.signature.lowest:
             return self.shape[0]
         times = None if self.times is None else self.observed_times
@@ -120,7 +120,7 @@ class Observation(eqx.Module):
         return np.asarray(self.times)[self.entries.value // math.prod(self.shape[1:])]
 
     def stages(self, count: int) -> list["Observation"]:
-        """Return what several stages observe: the largest times first, all of them in the last."""
+        """Return the observation of each of several stages: the largest times first, all of them in the last."""
         if self.signature.left_out is None:
             return [self]
         times, stages = self.observed_times, []
@@ -134,7 +134,7 @@ class Observation(eqx.Module):
 
 
 def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: Any) -> tuple[Observation, float | None]:
-    """Check the target; return what is observed, and the standard deviation of the residuals where it is known."""
+    """Check the target; return the observation, and the standard deviation of the residuals where it is known."""
     signature: Any = data.signature
     if not isinstance(signature, Signature):
         signature = SIGNATURES[signature] if isinstance(signature, str) else Signature(signature)

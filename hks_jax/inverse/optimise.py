@@ -1,4 +1,4 @@
-"""The loop: steps of an optimistix solver, each compiled, with what lies between them in Python."""
+"""The loop of a fit: compiled steps of an optimistix solver, and decisions between them in Python."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,15 +21,15 @@ _REJECTIONS = 12
 
 
 class _Told(eqx.Module):
-    """What residuals and objective tell a solver beside their value, with the unknowns to which it belongs."""
+    """The further output of residuals and objective, with the unknowns to which it belongs."""
 
     values: Values  # the unknowns
-    outcome: Outcome  # what a fit has come to with them
+    outcome: Outcome  # loss and misfit there
     gradient: Float[Array, ""]  # the norm of the objective's gradient; NaN where it was not computed
 
 
 def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
-    """Return residuals, and what is told beside.
+    """Return residuals and their further output.
 
     They are scaled by the number of nodes, so that a step's curvature is of order one whatever the grid.
     """
@@ -90,10 +90,10 @@ def _strongly_typed(state: Any) -> Any:
 
 
 class Reached(NamedTuple):
-    """Where a search has come to."""
+    """The end of a search."""
 
     values: Values  # the unknowns
-    outcome: Outcome | None  # what a fit has come to with them; None where it is not known
+    outcome: Outcome | None  # loss and misfit there; None where they are not known
     result: str  # one of the keys of `metric_fit.RESULTS`
 
     @property

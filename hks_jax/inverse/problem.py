@@ -29,7 +29,7 @@ and 1e-5 to 3e-5 in Jᵀ; solves to this tolerance cost 5e-6 and 5e-5, where not
 
 
 class Outcome(NamedTuple):
-    """What a fit has come to."""
+    """Loss, misfit and eigenpairs at some unknowns."""
 
     loss: Float[Array, ""]  # half the weighted mean square of the residuals, plus the penalties
     misfit: Float[Array, ""]  # the part of the data
@@ -40,8 +40,8 @@ class Outcome(NamedTuple):
 class Problem(eqx.Module):
     """Residuals as a function of the unknowns."""
 
-    unknowns: Unknowns  # what varies
-    observation: Observation  # what is to be matched
+    unknowns: Unknowns  # the parameters that vary
+    observation: Observation  # the data
     regularisers: tuple[Regulariser, ...]  # penalties
     k: int = eqx.field(static=True)  # eigenpairs
     boundary: Any = eqx.field(static=True)  # boundary conditions
@@ -56,7 +56,7 @@ class Problem(eqx.Module):
         return eigenpairs(field, self.k, self.boundary, self.solver, multiplet="complete")
 
     def evaluate(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
-        """Return the residuals of the data and of the penalties, half of whose squares add up to the loss; and that."""
+        """Return the residuals of the data, those of the penalties, and the outcome."""
         field = self.unknowns.field(values)
         pairs = self._pairs_of(field)
         data = _residuals_of(self.observation, pairs, self.solver)
@@ -100,7 +100,7 @@ def _in_single(tree: Any) -> Any:
 
 @jit_quickly(eqx.filter_jit)
 def outcome_of(problem: Problem, values: Values) -> Outcome:
-    """Return what a fit has come to with these unknowns."""
+    """Return loss, misfit and eigenpairs at these unknowns."""
     return problem.evaluate(values)[2]
 
 
@@ -110,7 +110,7 @@ def truncation_shows(misfit: float, left: float) -> bool:
 
 
 def more_pairs(problem: Problem, values: Values) -> int:
-    """Return how many pairs to go on with where those of a problem are too few for the field that it has come to."""
+    """Return a larger number of pairs, for a field that the pairs of a problem are too few for."""
     field = problem.unknowns.field(values)
     pencil = assemble(field, problem.boundary)
     smallest = float(np.min(problem.observation.observed_times))

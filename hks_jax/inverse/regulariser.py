@@ -1,4 +1,4 @@
-"""Regularisers: what a fit prefers where the data leave a choice.
+"""Regularisers: the preferences of a fit where the data leave a choice.
 
 Each is half a weighted mean of squares over the domain, given by its residuals: least squares solvers need these.
 """
@@ -19,7 +19,7 @@ class Regulariser(eqx.Module):
     """A penalty on the unknowns or on the field: half the weighted sum of the squares of `deviations` over the nodes.
 
     Attributes:
-        weight: what the penalty is multiplied by.
+        weight: the factor of the penalty.
     """
 
     weight: eqx.AbstractVar[float]
@@ -35,7 +35,7 @@ class Regulariser(eqx.Module):
 
     @abstractmethod
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
-        """Return what the penalty keeps small."""
+        """Return the numbers that the penalty keeps small."""
 
 
 class H1(Regulariser):
@@ -52,7 +52,7 @@ class TotalVariation(Regulariser):
     """weight · mean (√(|∇p|² + ε²) − ε): edges in the parameters p stay sharp.
 
     Attributes:
-        weight: what the penalty is multiplied by.
+        weight: the factor of the penalty.
         epsilon: slopes below it, per coordinate unit, count as smooth.
     """
 

@@ -35,8 +35,8 @@ class Search:
         tolerance: a fit has converged when the unknowns u change by less than it, relative to 1 + |u| (root mean square
             over all of them). Both the last step and the sum of the steps to come, if the last two begin a geometric
             series, must be below it. The linear systems of steps that may be the last are solved 30 times more exactly,
-            with three times as many products. Directions that so many products do not find are not in it:
-            `identifiability` tells of them. (Solvers of optimistix: the last step alone.)
+            with three times as many products. Directions that the products do not find are left out:
+            `identifiability` shows them. (Solvers of optimistix: the last step alone.)
         max_steps: steps per stage.
         continuation: stages: the first fits the largest times alone, the last all of them.
         starts: how often to start, the first time from the initial field, then from random smooth changes of it; the
@@ -71,7 +71,7 @@ class Search:
 
 
 def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: float | None) -> InnerProduct:
-    """Return that in which steps are small, of a given smoothness; see `Search` for its default."""
+    """Return the inner product in which steps are small, for a smoothness; see `Search` for its default."""
     if not isinstance(unknowns, Nodal):
         return InnerProduct()
     grid = unknowns.init.grid
@@ -96,7 +96,7 @@ class Run:
     now: Checkpoint  # where the fit stands
     progress: Callable[[Step], None] | None  # called with each step
     path: str | os.PathLike[str] | None  # of the checkpoint
-    mark: str  # of what fit it is
+    mark: str  # a hash of data and settings
     clock: float  # when the fit began, by `time.perf_counter`
 
     def told(
@@ -114,7 +114,7 @@ class Run:
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
         """Solve one problem from given unknowns; the tolerances are multiplied by a factor."""
         method = self._optimiser(problem, tolerances * self.search.tolerance, step_size)
-        with jax.debug_nans(False):  # what nobody computed is told as NaN
+        with jax.debug_nans(False):  # numbers that were not computed are NaN
             return optimise(problem, values, method, self.noise, self.search.max_steps, self.told)
 
     def _optimiser(self, problem: Problem, tolerance: float, step_size: float) -> Optimiser:
@@ -123,7 +123,7 @@ class Run:
         if not isinstance(given, str):
             return given
         if given == "gauss-newton":
-            # Against noise small steps: the misfit must not fall far below what the noise explains.
+            # Small steps against noise: the misfit must not fall far below it.
             damping, growth = (1e-4, 10.0) if self.noise is None else (1e-2, 3.0)
             preconditioner = self._preconditioner(problem)
             return GaussNewton(
@@ -133,7 +133,7 @@ class Run:
         return OPTIMISERS[given](traced, traced, optx.rms_norm)
 
     def _preconditioner(self, problem: Problem) -> Preconditioner:
-        """Return what resembles JᵀJ where that is known, else the inner product."""
+        """Return an approximation of JᵀJ where one is known, else the inner product."""
         unknowns, observation = problem.unknowns, problem.observation
         if isinstance(unknowns, Nodal) and unknowns.parametrisation == PARAMETRISATIONS["conformal"]:
             rough = getattr(self.inner_product, "factor", None) is None
@@ -186,7 +186,7 @@ class Run:
     def with_enough_pairs(
         self, reached: Reached, problem: Problem, renewed: Callable[[int], Problem] | None
     ) -> tuple[Reached, Problem]:
-        """Go on with more eigenpairs while what they leave out shows: they were chosen for the volume of the start.
+        """Go on with more eigenpairs while their truncation shows: they were chosen for the volume of the start.
 
         `renewed` makes the problem of their number; None leaves it as it is.
         """

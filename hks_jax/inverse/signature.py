@@ -20,9 +20,9 @@ from hks_jax.signatures.kernels import heat_trace, wks
 from hks_jax.signatures.truncation import resolving, truncation, truncation_map
 
 TAIL = 1e-6
-"""What part of the heat trace at the smallest time may lie beyond the pairs that are computed."""
+"""The share of the heat trace at the smallest time that may lie beyond the computed pairs."""
 _LOST = 0.05
-"""What part makes a time unresolvable."""
+"""The share beyond all useful pairs that makes a time unresolvable."""
 
 
 class Signature(eqx.Module):
@@ -30,10 +30,10 @@ class Signature(eqx.Module):
 
     Attributes:
         function: of the eigenpairs, then of the times or energies and of sigma where there are any.
-        symbol: what it depends on besides the eigenpairs: ``"t"``, times; ``"e"``, energies; empty, nothing.
+        symbol: the symbol of a further argument: ``"t"`` for times, ``"e"`` for energies, empty for none.
         at_nodes: whether it has a value for each node.
-        left_out: estimates what part of it lies beyond the eigenpairs, from these and the times; None: it is defined by
-            the pairs that are computed.
+        left_out: estimates the share of it that lies beyond the eigenpairs, from these and the times; None: the pairs
+            that are computed define it.
         lowest: whether it is the lowest eigenvalues, as many as the target has.
         sigma: the width of wave kernels.
     """

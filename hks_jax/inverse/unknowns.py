@@ -25,7 +25,7 @@ Parameters = Float[Array, "n c"]
 
 
 def named(argument: str, given: Any, table: Mapping[str, Any], others: str) -> Any:
-    """Return what a name stands for; raise ValueError, with the names and what else may be given, if it is none."""
+    """Return a table's entry by its name; raise ValueError, with the names and the alternatives, for another."""
     if isinstance(given, str) and given in table:
         return table[given]
     raise ValueError(f"{argument}: got {given!r}; expected {', '.join(map(repr, table))}, {others}")
@@ -115,7 +115,7 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
 
 
 def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
-    """Return a function to parameters that are zero for the initial tensors, so many for d dimensions."""
+    """Return a function from initial tensors to zeros, whose number depends on the dimension."""
     return lambda base: jnp.zeros((len(base), count(base.shape[-1])), base.dtype)
 
 
@@ -130,7 +130,7 @@ PARAMETRISATIONS = {
 
 
 class Unknowns(eqx.Module):
-    """What a fit varies."""
+    """The parameters that a fit varies."""
 
     @abstractmethod
     def start(self) -> Values:
@@ -148,7 +148,7 @@ class Unknowns(eqx.Module):
 class Nodal(Unknowns):
     """A few numbers at each node of the domain."""
 
-    parametrisation: Parametrisation  # what they mean
+    parametrisation: Parametrisation  # from them to tensors
     init: TensorField  # the initial field, which stays as it is outside the domain
     # The flat indices of the domain's nodes, made of the domain (*shape).
     nodes: Any = eqx.field(static=True, converter=lambda domain: StaticArray(np.flatnonzero(domain)))
@@ -215,7 +215,7 @@ class Free(Unknowns):
 
 
 def unknowns_for(parametrisation: str | Parametrisation | Free, init: TensorField, domain: np.ndarray) -> Unknowns:
-    """Return what varies, for a field that a fit starts from."""
+    """Return the unknowns of a fit that starts from a field."""
     if isinstance(parametrisation, Free):
         return Free(parametrisation.function, parametrisation.parameters, init)
     if isinstance(parametrisation, Parametrisation):

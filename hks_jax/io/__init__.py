@@ -1,7 +1,5 @@
-"""Files: tensors, masks, meshes and results in many formats; tensors fitted to diffusion-weighted images."""
+"""Read and write files of tensors, masks, meshes and results; fit tensors to diffusion-weighted images."""
 
-from hks_jax.atomic import atomic_folder as atomic_folder
-from hks_jax.atomic import atomic_path as atomic_path
 from hks_jax.io.dwi import ExampleBrain as ExampleBrain
 from hks_jax.io.dwi import find_example_brain as find_example_brain
 from hks_jax.io.dwi import fit_dwi as fit_dwi
@@ -25,3 +23,5 @@ from hks_jax.io.sampling import sample_tensors as sample_tensors
 from hks_jax.io.tensor_order import ORDERS as ORDERS
 from hks_jax.io.units import UNITS as UNITS
 from hks_jax.io.volume import TensorVolume as TensorVolume
+from hks_jax.storage import atomic_folder as atomic_folder
+from hks_jax.storage import atomic_path as atomic_path

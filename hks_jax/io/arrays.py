@@ -1,4 +1,4 @@
-"""Tensors in NumPy's own files, .npz and .npy."""
+"""Read and write tensors in NumPy's file formats, .npz and .npy."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,16 +9,16 @@ from jaxtyping import Float
 
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
 from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
-from hks_jax.npz import load_npy, load_npz, write_npz
+from hks_jax.storage import load_npy, load_npz, write_npz
 
 
 def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
-    """Return the array of an npy, or ``mask`` of an npz; neither says where it lies."""
+    """Return the array of an npy, or the array ``mask`` of an npz, and None in place of an affine."""
     if name.lower().endswith(".npy"):
         return load_npy(name), None
     arrays = load_npz(name)
     if "mask" not in arrays:
-        raise ValueError(f"{name}: has no array 'mask' (it has {', '.join(sorted(arrays)) or 'none'})")
+        raise ValueError(f"{name}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected an array 'mask'")
     return arrays["mask"], None
 
 
@@ -33,13 +33,13 @@ def read_tensors(
         arrays = load_npz(name)
     if wanted not in arrays:
         raise ValueError(
-            f"{name}: has no array {wanted!r} (it has {', '.join(sorted(arrays)) or 'none'}); expected {wanted!r} of "
-            "shape (*shape, d, d) and, optional, 'spacing', 'origin', 'mask', 'affine', 'order', 'frame'"
+            f"{name}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {wanted!r} of shape "
+            "(*shape, d, d). The file may also have 'spacing', 'origin', 'mask', 'affine', 'order' and 'frame'"
         )
     values = arrays[wanted]
     if values.dtype not in (np.float32, np.float64):
         if values.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: {wanted!r} has dtype {values.dtype}; expected real numbers")
+            raise ValueError(f"{name}: got {wanted!r} of dtype {values.dtype}; expected real numbers")
         values = values.astype(np.float64)
     order = order or _text(arrays, "order") or None
     if (values.ndim, values.shape[-1:]) in ((4, (6,)), (3, (3,))):
@@ -47,14 +47,14 @@ def read_tensors(
     elif order in (None, "matrix"):
         found = Matrices(values, "matrix", None)
     else:
-        raise ValueError(f"order: {name} holds whole matrices along the grid's axes; leave this out")
+        raise ValueError(f"order: got {order!r}, but {name} holds whole matrices. Leave this argument out")
     frame = frame or _text(arrays, "frame") or "voxel"
     if frame != "voxel":
         if "affine" not in arrays or found.tensors.shape[-1] != 3:
-            raise ValueError(f'frame: {name} has no 3×3 tensors with an affine; expected "voxel", the grid\'s own axes')
+            raise ValueError(f'frame: got {frame!r}, but {name} has no 3×3 tensors with an affine; expected "voxel"')
         found = found._replace(tensors=to_voxel_axes(found.tensors, frame, _real(f"{name}: affine", arrays["affine"])))
     if spacing is not None and "spacing" in arrays:
-        raise ValueError(f"spacing: {name} has its own, {np.asarray(arrays['spacing']).tolist()}; leave this out")
+        raise ValueError(f"spacing: {name} declares {np.asarray(arrays['spacing']).tolist()}. Leave this argument out")
     given = arrays if spacing is None else {**arrays, "spacing": spacing}
     about = {"order": found.order, "frame": frame, "source": name, "invalid_by_order": found.invalid}
     units = {key: _text(arrays, key) for key in ("length_unit", "unit")}
@@ -62,7 +62,7 @@ def read_tensors(
 
 
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
-    """Return tensors with the place that `place_of` has written, or a spacing of 1 and the origin 0."""
+    """Return a volume at the position that `place_of` wrote, by default with a spacing of 1 and the origin 0."""
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,
@@ -75,7 +75,7 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
 
 
 def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars and the place that they have; see `hks_jax.io.save`."""
+    """Write scalars and the position of their grid; see `hks_jax.io.save`."""
     slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
     write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})
 
@@ -89,7 +89,7 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
 
 
 def place_of(volume: TensorVolume) -> dict[str, Any]:
-    """Return the arrays that say where the voxels are, and which of them are inside."""
+    """Return the arrays that define the position of the voxels, and the mask."""
     optional = {"mask": volume.mask, "affine": volume.affine}
     given = {key: value for key, value in optional.items() if value is not None}
     return {"spacing": volume.spacing, "origin": volume.origin, **given}

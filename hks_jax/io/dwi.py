@@ -1,4 +1,4 @@
-"""Diffusion tensors from diffusion-weighted images, by DIPY, and where a brain to try them on may be installed."""
+"""Fit diffusion tensors to diffusion-weighted images by DIPY, and find an installed example brain."""
 
 import importlib.metadata
 import os
@@ -18,14 +18,16 @@ from hks_jax.io.tensor_order import Matrices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
 from hks_jax.io.volume import TensorVolume, as_mask, digest, placed
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 _LENGTH = 0.05
 """By how much the length of a direction may differ from 1: it is rounding then."""
+_SEEN = 0.01
+"""The share of an image's noise that its residual has at least, to tell it."""
 
 
 class ExampleBrain(NamedTuple):
-    """The files of a diffusion-weighted brain."""
+    """Paths to the files of a diffusion-weighted scan of a brain."""
 
     images: Path
     bval: Path
@@ -34,10 +36,10 @@ class ExampleBrain(NamedTuple):
 
 
 def find_example_brain() -> ExampleBrain | None:
-    """Locate the brain that the PyPI wheel ``mdt`` carries (104 × 104 × 2 voxels of 2 mm), or return None.
+    """Return the files of the brain in the PyPI wheel ``mdt`` (104 × 104 × 2 voxels of 2 mm), or None.
 
-    The wheel (1.2.7, LGPL-3.0-or-later; install it with ``--no-deps``) is looked up by its metadata and not imported.
-    Its images have 13 directions at b = 0, 30 at b = 1000 and 60 at b = 2000 s/mm².
+    The function reads the wheel's metadata and does not import it. The wheel's version is 1.2.7, its licence
+    LGPL-3.0-or-later; install it with ``--no-deps``. It has 13 images at b = 0, 30 at 1000 and 60 at 2000 s/mm².
     """
     stem = "b1k_b2k_example_slices_24_38"
     names = (f"{stem}.nii.gz", "b1k_b2k.bval", "b1k_b2k.bvec", f"{stem}_mask.nii.gz")
@@ -60,7 +62,7 @@ def fit_dwi(
     unit: Unit | None = None,
     noise: float | Literal["residuals"] | None = None,
 ) -> TensorVolume:
-    """Fit diffusion tensors to diffusion-weighted images: weighted least squares on log signals (DIPY's TensorModel).
+    """Fit diffusion tensors to diffusion-weighted images by weighted least squares on log signals (DIPY's TensorModel).
 
     Args:
         path: NIfTI (nx, ny, nz, n). Voxels where a signal is NaN or infinite are left out.
@@ -76,19 +78,20 @@ def fit_dwi(
             ms/µm². None: mm²/s.
         noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
             ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
-            for n images. None: no covariance.
+            for n images; these also tell what voxels share of an image's noise (24 bytes for each voxel and image).
+            None: no covariance.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s, and with `noise` their covariance, to first order in it. DIPY replaces
-        eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at the rim:
-        erode the mask).
+        Tensors along the voxel axes, in mm²/s, and with `noise` theirs, to first order (`TensorVolume.noise`). DIPY
+        replaces eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at
+        the rim: erode the mask).
 
     Raises:
         ImportError: DIPY or nibabel is missing.
-        FileNotFoundError: no such file.
-        ValueError: numbers of images, b-values and directions that disagree; b-values in another unit; directions that
-            have no length, or another than 1; a mask of another shape; too few images, also to estimate noise from
-            residuals; residuals that are zero; no signal.
+        FileNotFoundError: a file does not exist.
+        ValueError: the numbers of images, b-values and directions differ; the b-values have another unit; a direction
+            of a weighted image does not have length 1; the mask has another shape; there are too few images for the
+            fit, or for an estimate of the noise; all residuals of a voxel are zero; there is no signal.
     """
     dti, gradients, segmentation = map(optional, ("dipy.reconst.dti", "dipy.core.gradients", "dipy.segment.mask"))
     name = os.fspath(path)
@@ -111,7 +114,7 @@ def fit_dwi(
     if weighted < 6 or weighted == used.sum():
         raise ValueError(
             f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
-            "at least 6 and 1"
+            "at least 6 and 1. Raise the limit"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(name, image)[..., used]
@@ -119,25 +122,25 @@ def fit_dwi(
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
     fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
-    covariance = None
+    covariance = modes = None
     if noise is not None:
-        covariance = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
+        covariance, modes = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
     notes = [
-        f"weighted least squares on {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
+        f"tensors fitted by weighted least squares to {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g})",
         *remarks,
         *found,
         *nifti.placement_notes(image),
     ]
     if bvec_frame != "fsl":
-        notes.append(f"gradient directions along the {bvec_frame} axes, as asked; tensors taken to the voxel axes")
+        notes.append(f"directions read along the {bvec_frame} axes, as asked; tensors transformed to the voxel axes")
     if noise is not None:
-        left = f"the fit's residuals, of {int(used.sum()) - 7} degrees of freedom in each voxel"
-        known = left if noise == "residuals" else f"the images' noise, stated as {noise:g}"
-        notes.append(f"covariances of the tensors from {known}")
+        left = f"the fit's residuals, with {int(used.sum()) - 7} degrees of freedom in each voxel"
+        known = left if noise == "residuals" else f"the stated noise of the images, {noise:g}"
+        notes.append(f"covariances of the tensors computed from {known}")
     if clipped:
         notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
-    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance)
+    volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance, modes=modes)
     return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
@@ -145,6 +148,9 @@ def fit_dwi(
 # design, least squares minimise Σ w²(y − Xβ)². A logarithm has the variance σ²/w² to first order, so that β has the
 # covariance σ²(XᵀW²X)⁻¹, and σ² is the signals' sum of squared residuals over as many as there are more images than
 # unknowns (Koay, Chang, Pierpaoli and Basser 2007).
+# Image n alone changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ, its residual r being that of a signal. A residual has the variance
+# σ²(1 − h), h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so that rₙ/√(1 − h) has that of the noise (MacKinnon and White 1985, HC2). Random
+# signs of whole images keep what voxels share of them.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],
@@ -152,8 +158,11 @@ def _covariance(
     noise: float | Literal["residuals"],
     frame: str,
     affine: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "nx ny nz 6 6"]:
-    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask."""
+) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask.
+
+    And, from residuals, the part of each image in the noise of the tensors.
+    """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
     y = np.log(np.maximum(data, positive.min() if positive.size else 1.0))
@@ -164,17 +173,18 @@ def _covariance(
         freedom = design.shape[0] - design.shape[1]
         if freedom < 1:
             raise ValueError(
-                f'noise: got "residuals" with {design.shape[0]} images, and a tensor and a signal without weighting '
-                f"are {design.shape[1]} unknowns; expected at least {design.shape[1] + 1} images, and 15 for an "
-                "estimate to a quarter. State the noise of the images as a number"
+                f'noise: got "residuals" with {design.shape[0]} images, but a tensor and the unweighted signal are '
+                f"{design.shape[1]} unknowns; expected at least {design.shape[1] + 1} images, and 15 for an estimate "
+                "with an error of 25 %. Give the standard deviation of the noise as a number"
             )
-        # Of the signals, not of their logarithms, which near zero are far off.
+        # The residuals are those of the signals, because logarithms of small signals have large errors.
         fitted = np.exp(np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True))
-        variance = np.sum((data - fitted) ** 2, axis=1) / freedom
+        left = data - fitted
+        variance = np.sum(left**2, axis=1) / freedom
         if (zero := variance <= 1e-20 * weights.mean(axis=1)).any():
             raise ValueError(
                 f'noise: got "residuals", which are zero in {int(zero.sum())} of {len(zero)} voxels; expected images '
-                "with noise. Leave these voxels out of the mask, or state the noise of the images as a number"
+                "with noise. Leave these voxels out of the mask, or give the standard deviation of the noise"
             )
     else:
         require_number("noise", noise)
@@ -182,29 +192,39 @@ def _covariance(
     turned = pack(to_voxel_axes(unpack(np.eye(6), "nifti"), frame, affine), "nifti").T
     covariance = np.zeros((*inside.shape, 6, 6))
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
-    return covariance
+    if noise != "residuals":
+        return covariance, None
+    # An image that its own unknown follows, as the only one without weighting, has no residual: a sign by chance.
+    unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
+    modes = np.zeros((*inside.shape, len(design), 6), np.float32)
+    for i, x in enumerate(design):  # to need no more memory than the result
+        change = inverse @ x * np.sqrt(weights[:, i, None])
+        rest = 1 - np.sqrt(weights[:, i]) * (change @ x)
+        size = np.where(rest > _SEEN, left[:, i] / np.sqrt(np.maximum(rest, _SEEN)), unseen[:, i])
+        modes[inside, i] = size[:, None] * change[:, :6] @ turned.T
+    return covariance, modes
 
 
 def _of_length_one(
     name: str, directions: Float[np.ndarray, "n 3"], weighted: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], list[str]]:
-    """Return the directions of weighted images with length 1, those of others zero; and a note of their lengths."""
+    """Return the directions, normalised for weighted images and zero for the others, and a note if any was scaled."""
     lengths = np.linalg.norm(directions, axis=1)
     bad = weighted & ~(np.abs(lengths - 1) <= _LENGTH)
     if bad.any():
         first = int(np.argmax(bad))
         raise ValueError(
-            f"{name}: {int(bad.sum())} directions of weighted images are not of length 1, the first that of image "
+            f"{name}: got {int(bad.sum())} directions of weighted images without length 1, the first for image "
             f"{first} (from 0), {directions[first].tolist()}, of length {lengths[first]:.4g}; expected length 1. "
-            "Divide each by its length, and if that stands for the strength of the gradient, multiply the b-value by "
-            "its square; leave out images whose direction is not known"
+            "Divide each direction by its length. If the length encodes the gradient's strength, also multiply the "
+            "b-value by its square. Leave out images of unknown direction"
         )
     rounded = weighted & (np.abs(lengths - 1) > 1e-3)
     unit = np.where(weighted[:, None], directions / np.where(weighted, lengths, 1.0)[:, None], 0.0)
     if not rounded.any():
         return unit, []
     low, high = lengths[rounded].min(), lengths[rounded].max()
-    return unit, [f"{int(rounded.sum())} directions divided by their lengths, {low:.4g} to {high:.4g}"]
+    return unit, [f"{int(rounded.sum())} directions were divided by their lengths, {low:.4g} to {high:.4g}"]
 
 
 def _inside(
@@ -215,16 +235,16 @@ def _inside(
     affine: Float[np.ndarray, "4 4"],
     segmentation: ModuleType,
 ) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
-    """Return the mask, given or found, without the voxels whose signal is not finite, and notes of how it came."""
+    """Return the given or found mask, without voxels whose signal is not finite, and notes about it."""
     notes, finite = [], np.isfinite(signal)
     if mask is None:
-        # NaN outside, as resampling leaves it, is no signal.
-        with np.errstate(invalid="ignore"):  # where its median filter leaves nothing, it divides by zero
+        # Resampling may leave NaN outside the brain, which counts as no signal here.
+        with np.errstate(invalid="ignore"):  # median_otsu divides by zero if its median filter returns zeros
             _, brain = segmentation.median_otsu(np.where(finite, signal, 0.0)[..., unweighted].mean(axis=-1))
         if not brain.any():
-            raise ValueError("mask: DIPY's median_otsu finds nothing in the unweighted images; pass a mask")
+            raise ValueError("mask: DIPY's median_otsu finds no brain in the unweighted images. Pass a mask")
         inside = brain.astype(bool)
-        notes.append(f"no mask: DIPY's median_otsu of the unweighted images keeps {int(inside.sum())} voxels")
+        notes.append(f"no mask given: DIPY's median_otsu finds {int(inside.sum())} voxels in the unweighted images")
     else:
         inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
         if inside.shape != signal.shape[:3]:
@@ -232,18 +252,18 @@ def _inside(
     usable = inside & finite.all(axis=-1)
     if inside.any() and not usable.any():
         whole = [str(n) for n in np.flatnonzero(~finite[inside].any(axis=0))]
-        which = f"of the images used {', '.join(whole)} (from 0) have" if whole else "in each voxel one image has"
-        raise ValueError(f"{name}: {which} no finite signal inside; expected numbers. Leave such images out")
+        which = f"the used images {', '.join(whole)} (from 0) have" if whole else "in each voxel, some image has"
+        raise ValueError(f"{name}: {which} no finite signal inside the mask; expected numbers. Leave such images out")
     if lost := int((inside & ~usable).sum()):
-        notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: their signal is NaN or infinite")
+        notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: a signal there is NaN or infinite")
     return usable, notes
 
 
 def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:
     file = existing(path)
     with reading(file, "a table of numbers"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of a table without numbers
+        warnings.simplefilter("ignore", UserWarning)  # NumPy warns if a table is empty
         numbers = np.loadtxt(file, dtype=np.float64)
         if not numbers.size or not (may_be_nan or np.isfinite(numbers).all()):
-            raise ValueError("it has none, or NaN or infinite ones")
+            raise ValueError("got no numbers, or NaN or infinite ones; expected finite numbers")
     return numbers

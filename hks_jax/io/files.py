@@ -1,4 +1,4 @@
-"""Reading tensor volumes, and writing results and tensors, whole or not at all, with where they came from."""
+"""Read tensor volumes; write results and tensors atomically, with a record of their origin."""
 
 import math
 import os
@@ -21,7 +21,7 @@ from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
 from hks_jax.io.volume import TensorVolume, as_mask, describe, digest
 from hks_jax.io.vtk_image import by_time
-from hks_jax.npz import write_npz
+from hks_jax.storage import write_npz
 
 
 def read_tensors(
@@ -38,68 +38,70 @@ def read_tensors(
 ) -> TensorVolume:
     """Read a field of diffusion tensors.
 
-    The file's name tells the format. A file that leaves the order of components or their axes open is refused with the
-    choices named. Lengths are in mm where the file declares their unit; a note says what was converted.
+    The suffix of the file determines the format. If neither the file nor an argument gives the order of the components
+    or their axes, the function raises an error that lists the choices. Lengths are in mm if the file declares their
+    unit, and a note reports any conversion.
 
-    NIfTI: (nx, ny, nz, 1, 6) or (nx, ny, nz, 6), whose order the symmetric-matrix intent (code 1005) declares, or a
-    BIDS sidecar, which may declare the frame, too; or six images of one component each, of which one may be given.
+    NIfTI: an image (nx, ny, nz, 1, 6) or (nx, ny, nz, 6). The symmetric-matrix intent (code 1005) or a BIDS sidecar
+    declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
+    each; give the path of one of them, or all six.
 
-    MRtrix: (nx, ny, nz, 6) as its dwi2tensor writes them.
+    MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
 
-    NRRD: an axis of any of the format's kinds of matrix, 2D or 3D, at any place; or one of six (in the plane three)
-    components whose `order` is given. The measurement frame is heeded. The affine's axes are right, anterior, superior
-    where the file's space is patient-based.
+    NRRD: any axis may hold the components. Its kind is one of the format's 2D or 3D matrices, or the axis has six
+    components (three in the plane) and `order` is given. The measurement frame is applied. If the file's space is
+    patient-based, the affine's axes are right, anterior, superior.
 
-    VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at the points or cells, and an
-    array ``mask``. Tensors without components across an image one voxel thick are 2×2.
+    VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at points or cells, and an optional
+    array ``mask``. An image one voxel thick whose tensors vanish across it gives 2×2 tensors.
 
-    npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), array axis a being coordinate a and tensor index a,
-    or six (in the plane three) components whose order is given; and, optional, ``spacing`` (d,) = 1, ``origin`` (d,)
-    = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``order``, ``frame``. npy: the tensors alone.
+    npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), with array axis a along coordinate a, or with six
+    components (three in the plane) if `order` is given. Optional arrays are ``spacing`` (d,) = 1, ``origin`` (d,) = 0,
+    ``mask`` (*shape,), ``affine`` (4, 4), ``order`` and ``frame``. npy: only the tensors.
 
     Args:
-        path: the file, or six.
+        path: the file, or six files.
         order: ``"nifti"`` (xx xy yy xz yz zz), ``"fsl"`` (xx xy xz yy yz zz), ``"mrtrix"`` (xx yy zz xy xz yz) or
-            ``"vtk"`` (xx yy zz xy yz xz); None: as the file declares. Not for whole matrices.
-        mask: a file (see `read_mask`) or a bool array of the volume's shape; None: the file's own, or no mask.
-        frame: the axes along which the file's components are: ``"voxel"``; ``"fsl"`` (voxel axes, the first reversed
-            where the affine's determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"``
-            (NRRD's measurement frame). None: the declared ones, or those of the order's programs: voxel axes
-            for ``"nifti"``, ``"fsl"``, and ``"world"`` for ``"mrtrix"``, ``"vtk"``; for NumPy's files voxel axes.
-        array: the name of the tensors' array in an npz or VTK file, where there are several.
-        spacing: for NumPy's files without one.
-        confidence: voxels of NRRD's masked kinds are inside where their confidence is larger.
-        repair: what to do with tensors inside the mask that are not positive definite: see `repair_tensors`. None:
-            nothing; a metric made of them is refused.
-        unit: of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``: they are
-            converted to mm²/s. None: the numbers are taken as they are.
+            ``"vtk"`` (xx yy zz xy yz xz). None uses the declared order. Omit it for whole matrices.
+        mask: a file (see `read_mask`) or a bool array of the volume's shape. None uses the file's mask, if any.
+        frame: the axes of the file's components: ``"voxel"``; ``"fsl"`` (voxel axes, the first reversed if the affine's
+            determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"`` (NRRD's measurement
+            frame). None uses the declared axes, or else the convention of the order: voxel axes for ``"nifti"``, FSL's
+            for ``"fsl"``, and ``"world"`` for ``"mrtrix"`` and ``"vtk"``. NumPy's files use voxel axes.
+        array: the name of the tensors' array in an npz or VTK file with several arrays.
+        spacing: the spacing for NumPy's files that do not contain it.
+        confidence: in NRRD's masked kinds, a voxel with a larger confidence than this is inside the mask.
+        repair: the repair of tensors inside the mask that are not positive definite; see `repair_tensors`. If None, the
+            tensors stay unchanged, and making a metric of them raises an error.
+        unit: the unit of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``,
+            from which they are converted to mm²/s. None leaves the numbers unchanged.
 
     Returns:
-        The tensors along the voxel axes; `questions` asks about a frame or a unit that looks wrong.
+        The tensors along the voxel axes; `questions` reports a frame or a unit that looks wrong.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: an unreadable or unknown kind of file; an order or a frame that is not declared; shapes that
-            disagree; tensors that `repair` cannot mend.
-        ImportError: an optional library is missing; says what to install.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file's kind is unknown or its content unreadable; the order or the frame is not declared; shapes
+            disagree; `repair` cannot repair the tensors.
+        ImportError: an optional library is missing; the message gives the command that installs it.
     """
     require_number("confidence", confidence, above=-math.inf)
     if not isinstance(path, str | os.PathLike):
         if array is not None or spacing is not None:
-            raise ValueError("array, spacing: they are for NumPy's and VTK's files; leave them out for six images")
+            raise ValueError("array, spacing: only NumPy's and VTK's files need them. Leave them out for six images")
         volume = components.read_tensors(list(path), order, frame)
     else:
         name, reader = os.fspath(path), format_of(path)
         if array is not None and "array" not in reader.options:
-            raise ValueError(f"array: got {array!r}; only npz and VTK files have arrays by name")
+            raise ValueError(f"array: got {array!r}, but only npz and VTK files have arrays by name. Leave it out")
         if spacing is not None and "spacing" not in reader.options:
-            raise ValueError(f"spacing: {name} has its own; only NumPy's files may need one")
+            raise ValueError(f"spacing: {name} has its own, and only NumPy's files may need one. Leave it out")
         if reader is nifti.FORMAT and components.is_one_of_six(path):
             volume = components.read_tensors(components.siblings(path), order, frame)
         else:
             given = {"array": array, "spacing": spacing, "confidence": confidence}
             volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
-            if not name.lower().endswith(".nhdr"):  # which is a header alone, and says nothing of the data beside it
+            if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
                 volume = replace(volume, digest=digest(name))
     if unit is not None:
         volume = in_mm2_per_s(volume, unit)
@@ -120,46 +122,46 @@ def save(
     extra: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write scalars on the grid of a volume or slice, or at the vertices of a mesh, in the format of the suffix.
+    """Write scalars on the grid of a volume or slice, or at the vertices of a mesh; the suffix determines the format.
 
-    ``.nii``, ``.nii.gz``: an image with the volume's affine, times along its fourth axis. A slice becomes an image one
-    voxel thick at its place in space. NaN outside the mask is kept. Times in `extra` are written beside the image, as
-    BIDS does it, NAME.json with ``Times``.
+    ``.nii``, ``.nii.gz``: an image with the volume's affine and times along the fourth axis. A slice is written as an
+    image one voxel thick at its position in space. NaN outside the mask is kept. Times in `extra` are written to
+    NAME.json beside the image as ``Times``, following BIDS.
 
-    ``.nrrd``: the same, times along the last axis; `extra` as text in the header.
+    ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
 
-    ``.vti``: one array of points per time, which is in its name, ``mask``, and `extra` as field data.
+    ``.vti``: one array of point data per time, named by the time, the array ``mask``, and `extra` as field data.
 
-    ``.npz``: the arrays `name` (the values), ``spacing``, ``origin``, ``mask`` and ``affine`` (where there are any),
-    ``slice_axis`` (for a slice), and those in `extra`; of a mesh `name`, ``vertices``, ``faces`` (of tetrahedra
-    ``cells``), and those in `extra`.
+    ``.npz``: the values as the array `name`, and the arrays in `extra`. A grid adds ``spacing``, ``origin``, and if
+    they exist ``mask``, ``affine`` and ``slice_axis``. A mesh adds ``vertices`` and ``faces`` (triangles) or ``cells``
+    (tetrahedra).
 
-    ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and of triangles ``.ply``: the mesh, and one array per time.
+    ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
 
-    Every file says in JSON where it came from: the version, the tensors' file with its SHA-256, order and frame, what
-    was decided in reading it, and `provenance`; of a mesh, but for npz, a file beside it, the path with ``.json`` after
-    it. Files appear whole or not at all.
+    Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
+    the decisions of the reader, and `provenance`. For a mesh not in npz, the record is in a second file, whose path is
+    `path` with ``.json`` appended. Files are written atomically.
 
     Args:
-        path: the file; missing folders are made.
+        path: the file; missing folders are created.
         values: (*shape,) or (n_times, *shape); for a mesh (V,) or (n_times, V).
-        volume: where the values are.
-        name: what to call the values in the file.
-        extra: more arrays, such as the times; for NIfTI the times alone.
-        provenance: what else the file should say of its origin, such as the settings of the computation.
+        volume: the volume, slice or mesh of the values.
+        name: the name of the values in the file.
+        extra: more arrays, such as the times; NIfTI allows only the times.
+        provenance: more entries of the record, such as the settings of the computation.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: an unknown suffix, or values of another shape.
-        ImportError: an optional library is missing; says what to install.
+        ValueError: the suffix is unknown, or the values have another shape.
+        ImportError: an optional library is missing; the message gives the command that installs it.
     """
     file, array = Path(path), np.asarray(values)
     shape = (len(volume.vertices),) if isinstance(volume, SimplicialMesh) else volume.shape
     n = array.ndim - len(shape)
     if n not in (0, 1) or array.shape[n:] != shape:
-        raise ValueError(f"values: got shape {array.shape}; expected {shape}, or n_times before it")
+        raise ValueError(f"values: got shape {array.shape}; expected {shape}, or (n_times, *shape)")
     extra = dict(extra or {})
     if not isinstance(volume, SimplicialMesh):
         write = format_of(file, WRITTEN).write
@@ -177,23 +179,23 @@ def save(
 def save_tensors(
     path: str | os.PathLike[str], volume: TensorVolume, *, provenance: Mapping[str, Any] | None = None
 ) -> Path:
-    """Write the tensors of a volume so that `read_tensors` reads them back; the format follows the suffix.
+    """Write the tensors of a volume in a format that `read_tensors` reads; the suffix determines the format.
 
-    ``.nii``, ``.nii.gz``: a symmetric-matrix image (nx, ny, nz, 1, 6), xx xy yy xz yz zz along the voxel axes; only for
-    volumes. Outside the mask the tensors are zero.
+    ``.nii``, ``.nii.gz``: a symmetric-matrix image (nx, ny, nz, 1, 6) with xx xy yy xz yz zz along the voxel axes. The
+    tensors are zero outside the mask. Slices cannot be written.
 
-    ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame. A slice loses its place in space.
+    ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame. The position of a slice is not written.
 
-    ``.vti``: nine components at the points, along the axes of space, and the mask. A slice has zeros across it.
+    ``.vti``: nine components at the points, along the axes of space, and the mask. A slice has zeros across its plane.
 
     ``.npz``: the arrays that `read_tensors` documents.
 
-    The file says where the tensors came from, as `save` has it, and their order and frame: reading them back needs
-    neither `order` nor `frame`. Units are kept but in VTK's files, which have none.
+    The file contains the record that `save` describes, and the order and frame of the tensors, so `read_tensors` needs
+    neither `order` nor `frame`. Units are written except to VTK's files.
 
     Raises:
-        ValueError: an unknown suffix; NIfTI for a slice; unsymmetric tensors in NIfTI or NRRD.
-        ImportError: an optional library is missing; says what to install.
+        ValueError: the suffix is unknown; the format is NIfTI for a slice, or NIfTI or NRRD for unsymmetric tensors.
+        ImportError: an optional library is missing; the message gives the command that installs it.
     """
     file = Path(path)
     write = format_of(file, WRITTEN).write_tensors

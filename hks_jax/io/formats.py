@@ -1,4 +1,4 @@
-"""The file formats of images on grids, which a file's name chooses."""
+"""The file formats of images on grids; the suffix of a file determines its format."""
 
 import os
 
@@ -8,25 +8,25 @@ from hks_jax.io.volume import Format
 FORMATS = (nifti.FORMAT, mrtrix.FORMAT, nrrd.FORMAT, vtk_image.FORMAT, arrays.FORMAT)
 
 SUFFIXES: tuple[str, ...] = sum((each.names for each in FORMATS), ())
-"""What tensors are read from."""
+"""The suffixes of files from which tensors are read."""
 WRITTEN: tuple[str, ...] = sum((each.written for each in FORMATS), ())
-"""What tensors and results on a grid are written as."""
+"""The suffixes of files to which tensors and results on a grid are written."""
 IMAGES: tuple[str, ...] = sum((each.names for each in FORMATS if each.read_image), ())
-"""What masks are read from."""
+"""The suffixes of files from which masks are read."""
 
 
 def format_of(path: str | os.PathLike[str], suffixes: tuple[str, ...] = SUFFIXES) -> Format:
-    """Return the format of files of this name."""
+    """Return the format that belongs to the suffix of a path; raise ValueError if none of `suffixes` matches."""
     name = os.fspath(path)
     if not name.lower().endswith(suffixes):
         stem, _, suffix = name.rpartition(".")
         advice = ""
         if suffix.lower() == "mih":
-            advice = f". MRtrix makes one file of it: mrconvert {name} {stem}.mif"
+            advice = f". MRtrix converts it into one file: mrconvert {name} {stem}.mif"
         elif suffix.lower() in ("bdouble", "bfloat"):
             advice = (
-                f". Camino's own files do not say how many voxels there are along which axis: dt2nii -inputfile {name} "
-                "-header IMAGE.nii.gz -outputroot OUT_ makes NIfTI of them, OUT_dt.nii.gz"
+                f". Camino's raw files do not state the image's shape. Convert them to NIfTI (OUT_dt.nii.gz): dt2nii "
+                f"-inputfile {name} -header IMAGE.nii.gz -outputroot OUT_"
             )
-        raise ValueError(f"{name}: unknown kind of file; expected {', '.join(suffixes)}{advice}")
+        raise ValueError(f"{name}: the kind of file is unknown; expected {', '.join(suffixes)}{advice}")
     return next(each for each in FORMATS if name.lower().endswith(each.names))

@@ -1,4 +1,4 @@
-"""Masks and label maps: which voxels belong to the domain, and to which region each of them does."""
+"""Read masks, which mark the voxels of the domain, and label maps, which number the regions."""
 
 import os
 import re
@@ -13,20 +13,20 @@ from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
 from hks_jax.io.volume import TensorVolume, as_mask, corners
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
-    """Read a mask of zeros and ones: NIfTI, MRtrix, NRRD, ``.npy``, or the array ``mask`` of an ``.npz``.
+    """Read a mask of zeros and ones from NIfTI, MRtrix, NRRD, ``.npy``, or the array ``mask`` of an ``.npz``.
 
     Args:
         path: the file.
-        affine: where the image lies that the mask is for; a mask that lies elsewhere is refused.
+        affine: the affine of the image that the mask belongs to. A mask at another position raises an error.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: an unknown kind of file, values other than 0 and 1, or a mask that lies elsewhere.
-        ImportError: NIfTI without nibabel, NRRD without pynrrd.
+        FileNotFoundError: the file does not exist.
+        ValueError: the kind of file is unknown, a value is not 0 or 1, or the mask has another position.
+        ImportError: nibabel (for NIfTI) or pynrrd (for NRRD) is missing.
     """
     name = os.fspath(path)
     values, place = _image(name, affine, IMAGES)
@@ -34,20 +34,20 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         shift = np.linalg.norm(corners(values.shape) @ (place - affine).T, axis=1).max()
         if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
             raise ValueError(
-                f"{name}: the mask's affine places it up to {shift:.3g} away from the tensors'; expected the same "
-                "place. Resample the mask to the tensors' voxels"
+                f"{name}: the mask's affine displaces it by up to {shift:.3g} from the tensors; expected the same "
+                "position. Resample the mask to the tensors' voxels"
             )
     return as_mask(name, values)
 
 
 def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndarray, "*shape"]:
-    """Peel voxels off the rim of a mask, where voxels mix tissues and tensors are least reliable.
+    """Remove the boundary voxels of a mask, which contain several tissues and have the least reliable tensors.
 
-    A voxel goes when a face neighbour is outside, once per iteration. The image's own border is no rim: a volume
-    that ends inside the head keeps its last slices.
+    Each iteration removes the voxels with a face neighbour outside the mask. Voxels beyond the image count as inside,
+    so a volume that ends inside the head keeps its last slices.
 
     Raises:
-        ValueError: a negative number of iterations, or nothing left.
+        ValueError: the number of iterations is negative, or no voxel is left.
     """
     if iterations < 0:
         raise ValueError(f"iterations: got {iterations}; expected 0 or more")
@@ -55,19 +55,19 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
         return mask
     eroded = ndimage.binary_erosion(mask, iterations=iterations, border_value=1)
     if not eroded.any():
-        raise ValueError(f"iterations: eroding by {iterations} voxels leaves nothing of {int(mask.sum())} voxels")
+        raise ValueError(f"iterations: got {iterations}, which removes all {int(mask.sum())} voxels. Choose fewer")
     return eroded
 
 
 NEAR = 0.1
-"""By how many voxels two images may lie apart and still be on the same voxels."""
+"""The distance, in voxels, up to which two images count as being on the same voxels."""
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
-    """Read whole numbers, 0 for none, at the voxels of an image, or a mesh's vertices: NIfTI, or ``.npy`` of the shape.
+    """Read integer labels, with 0 for unlabelled, at an image's voxels or a mesh's vertices, from NIfTI or ``.npy``.
 
-    NIfTI has its place in space. Where the image has one, the two must have the same voxels; a slice takes its own from
-    a label map of the volume.
+    If both files have an affine, their voxels must coincide. For a slice, the file may have the labels of the whole
+    volume. Otherwise, the labels must have the shape of the image.
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
@@ -77,15 +77,15 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
     if values.shape != shape:
         raise ValueError(f"{name}: got labels of shape {values.shape}; expected the shape of the image, {shape}")
     if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
-        raise ValueError(f"{name}: got numbers that are not whole; expected labels. Resample by the nearest neighbour")
+        raise ValueError(f"{name}: got fractional numbers; expected integer labels. Resample by the nearest neighbour")
     return np.asarray(values).astype(np.int32)
 
 
 def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
-    """Read names of labels: a table with the columns ``index`` and ``name`` (BIDS), or lines of a number and a name.
+    """Read the names of labels from a table with the columns ``index`` and ``name`` (BIDS), or from FreeSurfer's table.
 
-    Of a line, the name goes from the number to the next tab, if there is one, and is without the four numbers of a
-    colour that FreeSurfer's tables end in.
+    A line of FreeSurfer's table has a number, a name and four numbers of a colour. Further tab-separated columns are
+    ignored.
     """
     file = existing(path)
     with reading(file, "a text in UTF-8"):
@@ -102,13 +102,13 @@ def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
 
 
 def names_beside(path: str | os.PathLike[str]) -> str | None:
-    """Return the table of names beside a label map, in BIDS ``…_dseg.tsv`` for ``…_dseg.nii.gz``, if it is there."""
+    """Return the path of the table of names beside a label map (BIDS: ``…_dseg.tsv``), or None if there is none."""
     table = Path(os.fspath(path).removesuffix(".gz")).with_suffix(".tsv")
     return str(table) if table.is_file() else None
 
 
 def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the voxel values, without a fourth axis of one entry, and the affine where the file has one."""
+    """Return the voxel values, without trailing axes of length one, and the affine or None."""
     read = format_of(name, suffixes).read_image
     assert read is not None
     values, place = read(name, affine)
@@ -118,7 +118,7 @@ def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> t
 
 
 def _at_voxels(name: str, values: np.ndarray, to_labels: np.ndarray, volume: TensorVolume) -> np.ndarray:
-    """Return the labels at an image's voxels; raise ValueError where the two are not on the same voxels."""
+    """Return the labels at an image's voxels; raise ValueError if labels and image are not on the same voxels."""
     size = list(volume.shape)
     if len(size) == 2:
         size.insert(volume.thin_axis, 1)
@@ -129,11 +129,11 @@ def _at_voxels(name: str, values: np.ndarray, to_labels: np.ndarray, volume: Ten
     if apart > NEAR or not inside:
         if values.shape != tuple(size) and np.allclose(to_labels, np.eye(4)):
             raise ValueError(
-                f"{name}: its affine is the image's, and its shape {values.shape} is not, which is {tuple(size)}; "
-                "expected labels of the image's voxels. One of them was cropped or resampled without its affine"
+                f"{name}: got labels of shape {values.shape} with the image's affine; expected the image's shape "
+                f"{tuple(size)}. One file was cropped or resampled without its affine: resample the labels to the image"
             )
         raise ValueError(
-            f"{name}: its affine places the labels on other voxels than the image's; expected the image's own. "
-            "Resample them to the image, by the nearest neighbour"
+            f"{name}: the affines put the labels and the image on different voxels; expected the same voxels. "
+            "Resample the labels to the image by the nearest neighbour"
         )
     return values[box].reshape(volume.shape)

@@ -1,4 +1,4 @@
-"""Meshes of triangles or tetrahedra in files: what reads which format, putting right, and writing through meshio."""
+"""Read meshes of triangles or tetrahedra, clean them, and write them through meshio."""
 
 import json
 import os
@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, SurfaceMesh, TetMesh
 from hks_jax.domain.triangulation import Triangulation
@@ -21,50 +20,49 @@ from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, throu
 from hks_jax.io.tables import write_json
 from hks_jax.io.vtk_image import holds_dataset
 from hks_jax.optional import optional
-from hks_jax.reading import existing
+from hks_jax.storage import atomic_path, existing
 
 READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", ".gii.gz")
-"""The suffixes of meshes; FreeSurfer's surfaces, which have none of their own, are known by their first bytes."""
+"""The suffixes of meshes. FreeSurfer's surfaces have no suffix and are recognised by their first bytes."""
 WRITTEN = {".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".ply": "ply"}
-"""The formats with room for values at the vertices, and what meshio calls them. PLY has triangles only."""
+"""The suffixes of formats with values at vertices, and meshio's names of the formats. PLY has only triangles."""
 _NEAR = 1e-8
-"""Distance, relative to the size of the mesh, up to which vertices lie at the same place."""
+"""The distance up to which vertices count as coincident, relative to the size of the mesh."""
 _THIN = 1e-7
-"""Height of a triangle, relative to its longest edge, up to which the edge is flipped."""
+"""The height of a triangle, relative to its longest edge, up to which that edge is flipped."""
 
 
 def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bool = False) -> SurfaceMesh | TetMesh:
-    """Read a mesh: tetrahedra, where the file has any, or else triangles.
+    """Read a mesh of tetrahedra or, if the file has none, of triangles.
 
-    ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply``, ``.stl`` through meshio; ``.obj`` and ``.off``; polygonal data in
-    ``.vtk`` and ``.vtp`` through VTK; GIFTI (``.gii``) and FreeSurfer's surfaces (``lh.white``, … by their first bytes)
-    through nibabel.
+    meshio reads ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply`` and ``.stl``; VTK reads polygonal data in ``.vtk`` and
+    ``.vtp``; nibabel reads GIFTI (``.gii``) and FreeSurfer's surfaces (``lh.white``, …, recognised by their first
+    bytes). The formats ``.obj`` and ``.off`` need no library.
 
-    Quadrilaterals (of polygonal data, OBJ and OFF all polygons) are cut into triangles; vertices keep their order. STL
-    has only corners: those at the same place become one vertex. Cells of lower dimension beside tetrahedra are passed
-    over. A warning says where vertices lie at the same place, as at the seams of a texture: the surface is torn there.
+    Quadrilaterals are cut into triangles. In polygonal data, OBJ and OFF, all polygons are cut. Vertices keep their
+    order. In STL, coincident corners of triangles become one vertex. Cells of lower dimension beside tetrahedra are
+    ignored. A warning reports coincident vertices, as at the seams of a texture, because the surface is torn there.
 
     Args:
         path: the file.
-        clean: drop vertices that are not finite, with their cells; make one vertex of those at the same place (up to
-            1e-8 of the mesh's size); flip the longest edges of triangles that have hardly a height; drop cells without
-            area or volume, cells that are there twice and vertices without a cell; and turn tetrahedra round whose
-            vertices are in the other order. The vertices are numbered anew, in the order of the file. A warning says
-            what was done.
-        in_space: take the coordinates of the scanner, in which images lie: FreeSurfer's are turned and moved by the
-            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Others, and all
-            without it, stay as they are.
+        clean: whether to clean the mesh. Cleaning removes vertices that are not finite and their cells, merges vertices
+            within 1e-8 of the mesh's size, flips the longest edge of triangles of nearly zero height, removes cells of
+            zero area or volume, duplicate cells and unused vertices, and reverses tetrahedra of negative orientation.
+            The remaining vertices are renumbered in the order of the file, and a warning lists the changes.
+        in_space: whether to return scanner coordinates, as images have. FreeSurfer's coordinates are transformed by the
+            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Other formats are
+            unchanged.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: an unknown kind of file, an unreadable one, other cells, a mesh in pieces that touch at vertices at
-            the same place, or one that `SurfaceMesh` or `TetMesh` refuses; with `in_space` a surface of FreeSurfer's
-            that does not say where its volume lies.
+        FileNotFoundError: the file does not exist.
+        ValueError: the kind of file is unknown, the file is unreadable or has other cells; the mesh has pieces that
+            touch at coincident vertices; `SurfaceMesh` or `TetMesh` rejects the mesh; with `in_space`, a FreeSurfer
+            file does not state the position of its volume.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
     loaded, said = _load(path, clean, in_space)
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
-    remedy = "" if clean else ". clean=True puts right what it can: see read_mesh"
+    remedy = "" if clean else ". clean=True repairs some defects: see read_mesh"
     try:
         mesh = make(loaded.vertices, loaded.cells)
         if not clean:
@@ -79,28 +77,28 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
 def read_mesh_arrays(
     path: str | os.PathLike[str], *, clean: bool = False
 ) -> dict[str, Float[np.ndarray, "V *components"]]:
-    """Read the arrays at the vertices of a mesh, by name, such as tensors or the signatures that `save` writes.
+    """Read the named arrays at the vertices of a mesh, such as tensors or the signatures that `save` writes.
 
-    Formats that have such arrays are ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply``; others give none.
+    The formats ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have such arrays; for others the result is empty.
 
     Args:
         path: the file.
-        clean: as for `read_mesh`: the arrays follow the numbering that it gives.
+        clean: whether to clean the mesh, as for `read_mesh`. The arrays follow the numbering of the cleaned mesh.
 
     Returns:
-        The arrays of real numbers, floating point, (V,) or (V, components): symmetric tensors of nine components
-        become (V, 3, 3) by ``array.reshape(-1, 3, 3)``.
+        The real arrays in floating point, (V,) or (V, components). ``array.reshape(-1, 3, 3)`` gives tensors of nine
+        components the shape (V, 3, 3).
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file that is no mesh, or unreadable.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not a mesh, or unreadable.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
     """
     return _load(path, clean)[0].arrays
 
 
 def is_mesh(path: Path) -> bool:
-    """Tell whether a file is one that `read_mesh` reads, by its suffix or, for want of one, its first bytes."""
+    """Return whether `read_mesh` reads a file, judged by the suffix or, without one, by the first bytes."""
     name = path.name.lower()
     if name.endswith(".vtk"):
         return path.is_file() and not holds_dataset(path, "STRUCTURED_POINTS")
@@ -108,14 +106,14 @@ def is_mesh(path: Path) -> bool:
 
 
 def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str) -> None:
-    """Write a mesh with values at its vertices, and a file ``path.json`` beside it that says where they came from."""
+    """Write a mesh with values at its vertices, and a record of their origin to the file ``path.json``."""
     suffix, solid = path.suffix.lower(), mesh.triangulation.dimension == 3
     allowed = [s for s in WRITTEN if not (solid and s == ".ply")]
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
-        raise ValueError(f"path: got {str(path)!r}; {what} are written as {', '.join(allowed)} or .npz")
+        raise ValueError(f"path: got {str(path)!r}; {what} can be written as {', '.join(allowed)} or .npz")
     library = optional("meshio")
-    cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # what PLY has room for
+    cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # PLY has no int64
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})
     with atomic_path(path) as temporary:
         getattr(library, WRITTEN[suffix]).write(str(temporary), whole)
@@ -123,7 +121,7 @@ def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: Simpl
 
 
 def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
-    """Return the mesh in a file, cleaned if asked to, and a text that lists the changes."""
+    """Return the mesh in a file, cleaned if `clean`, and a text that lists the changes."""
     file = existing(path)
     name = file.name.lower()
     if name.endswith((".gii", ".gii.gz")):
@@ -139,18 +137,18 @@ def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> 
     elif cortex.is_freesurfer(file):
         loaded = cortex.load_freesurfer(file, in_space)
     else:
-        raise ValueError(f"{file}: unknown kind of mesh; expected {', '.join(READ)}, or a surface of FreeSurfer's")
+        raise ValueError(f"{file}: the kind of mesh is unknown; expected {', '.join(READ)}, or a FreeSurfer surface")
     return _cleaned(loaded) if clean else (loaded, "")
 
 
 def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
-    """Return for each vertex the first one at its place; one that is not finite is at a place of its own."""
+    """Return for each vertex the first coincident vertex; a vertex that is not finite coincides with no other."""
     finite = np.flatnonzero(np.isfinite(vertices).all(axis=1))
     first = np.arange(len(vertices))
     if not finite.size:
         return first
     points = vertices[finite]
-    # Copies first: in a soup of triangles there are many at each place, and pairs of them more yet.
+    # Exact duplicates are merged first, because their number of pairs grows with the square of their multiplicity.
     _, copy, place = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     pairs = cKDTree(points[copy]).query_pairs(_NEAR * size, output_type="ndarray")
@@ -162,7 +160,7 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
 
 
 def _require_joined(loaded: Loaded) -> str:
-    """Return a warning if vertices lie at the same place, as at seams; the empty text if none do."""
+    """Return a warning if vertices coincide, as at seams, or the empty text; raise ValueError if pieces touch there."""
     first = _same_places(loaded.vertices)
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:
@@ -171,17 +169,17 @@ def _require_joined(loaded: Loaded) -> str:
         len(np.unique(Triangulation(cells, len(first)).labels[0][cells]))
         for cells in (loaded.cells, first[loaded.cells])
     )
-    what = f"{doubled} of {len(first)} vertices lie where another one lies"
+    what = f"{doubled} of {len(first)} vertices coincide with another vertex"
     if joined < pieces:
         raise ValueError(
-            f"vertices: {what}, and so the mesh falls into {pieces} pieces that touch; there would be {joined} if they "
-            "were one vertex each"
+            f"vertices: {what}, so the mesh has {pieces} pieces that touch; expected {joined}, the number of pieces "
+            "after coincident vertices are merged"
         )
-    return f"{what}: the mesh is torn there, as at the seams of a texture, and no heat goes across"
+    return f"{what}. The mesh is torn there, as at the seams of a texture, and no heat flows across"
 
 
 def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
-    """Return the mesh cleaned as `read_mesh` documents it, and a text that lists the changes, empty without any."""
+    """Return the mesh, cleaned as `read_mesh` documents, and a text that lists the changes."""
     words = WORDS[loaded.cells.shape[1] - 1]
     first, n_cells, done = _same_places(loaded.vertices), len(loaded.cells), []
 
@@ -190,22 +188,22 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
             done.append(f"{count} {what}")
 
     finite = np.isfinite(loaded.vertices).all(axis=1)
-    say(int((~finite).sum()), "vertices that are NaN or infinite removed")
+    say(int((~finite).sum()), "vertices with NaN or infinite coordinates removed")
     cells = first[loaded.cells[finite[loaded.cells].all(axis=1)]]
-    say(n_cells - len(cells), f"{words.simplices} at them removed")
-    say(int((first != np.arange(len(first))).sum()), "vertices merged with another one at the same place")
+    say(n_cells - len(cells), f"{words.simplices} at such vertices removed")
+    say(int((first != np.arange(len(first))).sum()), "vertices merged with a coincident vertex")
     flat = (np.diff(np.sort(cells, axis=1), axis=1) == 0).any(axis=1)
     if cells.shape[1] == 3:
         cells, flipped = _without_thin(loaded.vertices, cells[~flat])
-        say(flipped, "edges flipped that passed through a vertex")
+        say(flipped, "edges through a vertex flipped")
     else:
         inverted = signed_measure(loaded.vertices, cells)[0] < 0
-        say(int(inverted.sum()), f"{words.simplices} turned round")
+        say(int(inverted.sum()), f"{words.simplices} of negative orientation reversed")
         cells = np.where(inverted[:, None], cells[:, [1, 0, 2, 3]], cells)[~flat]
     sound = signed_measure(loaded.vertices, cells)[1]
     say(int(flat.sum() + (~sound).sum()), f"{words.simplices} without {words.measure} removed")
     _, once = np.unique(np.sort(cells[sound], axis=1), axis=0, return_index=True)
-    say(int(sound.sum()) - len(once), f"{words.simplices} removed that are there twice")
+    say(int(sound.sum()) - len(once), f"duplicate {words.simplices} removed")
     cells = cells[sound][np.sort(once)]
     used, numbered = np.unique(cells, return_inverse=True)
     say(int((finite & (first == np.arange(len(first)))).sum()) - len(used), f"vertices without a {words.one} removed")
@@ -216,7 +214,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
 def _without_thin(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "m 3"], int]:
-    """Return triangles after flips at those with hardly a height, which go at a boundary, and the number of flips."""
+    """Flip triangles of nearly zero height, or remove them at a boundary; return triangles and number of flips."""
     cells, gone, flipped = cells.copy(), np.zeros(len(cells), bool), 0
     corners = vertices[cells]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

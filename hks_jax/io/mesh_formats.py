@@ -1,6 +1,6 @@
-"""Meshes as meshio reads them, VTK's polygonal data, and OBJ and OFF files, whose variants it does not know.
+"""Read meshes through meshio, polygonal data through VTK, and variants of OBJ and OFF that meshio does not support.
 
-Of a damaged mesh, meshio does not notice numbers that are not those declared, and cells that it leaves out.
+In a damaged file, meshio may omit cells or read a wrong number of points without an error, so this module checks both.
 """
 
 import re
@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 
 from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
-from hks_jax.reading import reading
+from hks_jax.storage import reading
 
 
 class Loaded(NamedTuple):
-    """What is in a file: places, triangles or tetrahedra, and arrays at the vertices."""
+    """The content of a file: vertices, triangles or tetrahedra, and arrays at the vertices."""
 
     vertices: Float[np.ndarray, "V 3"]
     cells: Int[np.ndarray, "n corners"]
@@ -27,31 +27,31 @@ _OF_SURFACES, _OF_BOUNDARIES = {"triangle", "quad"}, {"triangle", "quad", "line"
 
 
 def through_meshio(path: Path) -> Loaded:
-    """Load triangles or tetrahedra through meshio."""
+    """Load triangles or tetrahedra through meshio; raise ValueError for other cells and damaged files."""
     suffix = path.suffix.lower()
     library = optional("meshio")
-    # Overflow is of a text's letters, which it takes for a number of triangles first.
+    # For STL in text form, meshio first reads letters as a number of triangles, which overflows.
     with reading(path, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
         content = path.read_bytes()
         declared = _declared(content, suffix)
-        # The format's own reader: meshio.read ends the process where it cannot read a file.
+        # The reader of the format is called, because meshio.read ends the process if it cannot read a file.
         read = getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(path))
         _compare(content, suffix, declared, read)
         points = np.asarray(read.points, np.float64)
         tetrahedra = [_corners(block.data, 4) for block in read.cells if block.type == "tetra"]
         if points.ndim != 2 or points.shape[1] not in (2, 3):
-            raise ValueError(f"points of shape {points.shape}")
+            raise ValueError(f"got points of shape {points.shape}; expected (V, 2) or (V, 3)")
         points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
         triangles = [_triangles(block.data, points) for block in read.cells if block.type in _OF_SURFACES]
         arrays = _real_arrays(read.point_data, len(points))
     others = {block.type for block in read.cells} - _OF_BOUNDARIES - {"tetra"}
     if others:
         raise ValueError(
-            f"{path}: has {', '.join(sorted(others))} cells; expected triangles (or quadrilaterals), or tetrahedra"
+            f"{path}: got {', '.join(sorted(others))} cells; expected triangles, quadrilaterals or tetrahedra"
         )
     blocks = tetrahedra or triangles
     if not blocks:
-        raise ValueError(f"{path}: has no triangles and no tetrahedra; expected a mesh in two or three dimensions")
+        raise ValueError(f"{path}: the mesh has no triangles and no tetrahedra; expected one of these kinds of cell")
     return Loaded(points, np.concatenate(blocks).astype(np.int64), arrays)
 
 
@@ -61,35 +61,35 @@ _COUNTS = {
     ".vtk": (rb"\bPOINTS\s+(-?\d+)", rb"\bCELL_TYPES\s+(-?\d+)"),
     ".vtu": (rb"NumberOfPoints\s*=\s*[\"'](-?\d+)", rb"NumberOfCells\s*=\s*[\"'](-?\d+)"),
 }
-"""Where each format says how many points and cells it has; .stl, whose length meshio compares, does not."""
+"""Patterns of the declared numbers of points and cells in each format. For .stl, meshio compares the length itself."""
 
 _PLY = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-"""The bytes of the types of .ply that NumPy calls otherwise."""
+"""The size in bytes of types in .ply that have other names in NumPy."""
 
 
 def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
-    """Return the numbers of points and cells that a file declares, and for Gmsh the largest tag of a point."""
+    """Return the declared numbers of points and cells, and for Gmsh also the largest tag of a point."""
     patterns = _COUNTS.get(suffix, ())
     declared = tuple(sum(map(int, re.findall(pattern, content))) for pattern in patterns)
     if suffix == ".msh":
         declared = _declared_by_gmsh(content)
     if max(declared, default=0) > 8 * len(content):
-        raise ValueError(f"it declares {max(declared)} points or cells in {len(content)} bytes")
+        raise ValueError(f"the file declares {max(declared)} points or cells, but has only {len(content)} bytes")
     return declared
 
 
 def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) -> None:
-    """Raise ValueError unless meshio found as many points and cells as are declared, and nothing follows them."""
+    """Raise ValueError unless meshio found the declared numbers of points and cells, and nothing follows them."""
     counts = (len(mesh.points), sum(len(block.data) for block in mesh.cells))
     if declared and declared[:2] != counts:
-        what = "it declares {} points and {} cells, of which {} and {} are there"
+        what = "the file declares {} points and {} cells, but has {} and {}"
         raise ValueError(what.format(*declared[:2], *counts))
     corners = sum(block.data.size for block in mesh.cells)
     lists = re.search(rb"\bCELLS\s+(\d+)\s+(\d+)", content) if suffix == ".vtk" else None
-    if lists is not None:  # before version 5 with each cell's own number
+    if lists is not None:  # before version 5, the declared number also counts one entry per cell
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
-        if listed != corners:  # of a type that is damaged, meshio leaves some out
-            raise ValueError(f"its cells declare {listed} corners, and have {corners} by their types")
+        if listed != corners:  # meshio omits corners of cells whose type is damaged
+            raise ValueError(f"the file declares {listed} corners of cells; expected {corners} from the cells' types")
     if suffix == ".ply":
         _compare_ply(content, mesh)
 
@@ -100,7 +100,7 @@ def _compare_ply(content: bytes, mesh: Any) -> None:
     of_points, _, of_cells = head.partition(b"element face")
     lists = re.findall(rb"property\s+list\s+(\w+)\s+(\w+)", of_cells)
     if len(lists) != 1:
-        return  # the lengths of further lists are nowhere else
+        return  # the file declares no total length of other lists
 
     def size(name: bytes) -> int:
         return 1 if ascii_ else _PLY.get(name.decode()) or np.dtype(name.decode()).itemsize
@@ -111,15 +111,15 @@ def _compare_ply(content: bytes, mesh: Any) -> None:
     of_blocks = (len(b.data) * (length + index * b.data.shape[1] + cell) for b in mesh.cells)
     wanted, got = len(mesh.points) * point + sum(of_blocks), len(body.split() if ascii_ else body)
     if wanted != got:
-        raise ValueError(f"its points and cells take {wanted} {'words' if ascii_ else 'bytes'}, and there are {got}")
+        raise ValueError(f"got {got} {'words' if ascii_ else 'bytes'}; expected {wanted} for its points and cells")
 
 
 def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
-    """Return the numbers of nodes and elements, and the largest tag of a node: meshio makes a table as long as that."""
+    """Return the numbers of nodes and elements, and the largest node tag, which is the length of a table in meshio."""
     head = _GMSH.match(content)
     if head is None or head[1] not in (b"2", b"2.2", b"4", b"4.1"):
-        version = "no format of Gmsh's" if head is None else f"format {head[1].decode(errors='replace')}"
-        raise ValueError(f"{version}; expected 2.2 or 4.1, as gmsh -format msh41 writes")
+        version = "no Gmsh format" if head is None else f"Gmsh format {head[1].decode(errors='replace')}"
+        raise ValueError(f"got {version}; expected 2.2 or 4.1. Convert the file by gmsh -format msh41")
     text, width = head[2] == b"0", int(head[3])
     nodes, elements = (_section(content, name) for name in (b"Nodes", b"Elements"))
     if head[1].startswith(b"4"):
@@ -131,8 +131,8 @@ def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
         n_nodes, n_elements = (int(each.partition(b"\n")[0]) for each in (nodes, elements))
         for each, declared in ((nodes, n_nodes), (elements, n_elements)) if text else ():
             there = sum(1 for line in each.splitlines()[1:] if line.strip())
-            if there != declared:  # meshio passes over the rest
-                raise ValueError(f"it declares {declared} nodes or elements, and has {there} lines for them")
+            if there != declared:  # meshio ignores further lines
+                raise ValueError(f"the file declares {declared} nodes or elements, but has {there} lines for them")
         rows, node = nodes.partition(b"\n")[2], np.dtype("<i4, (3,)<f8")
         tags = map(int, rows.split()[::4]) if text else np.frombuffer(rows[: n_nodes * node.itemsize], node)["f0"]
         largest = int(max(tags, default=0))
@@ -142,23 +142,23 @@ def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
 def _section(content: bytes, name: bytes) -> bytes:
     start, end = re.search(rb"\$" + name + rb"[ \t]*\r?\n", content), content.rfind(b"$End" + name)
     if start is None or end < start.end():
-        raise ValueError(f"it has no section ${name.decode()}, or one without an end")
+        raise ValueError(f"the file has no complete section ${name.decode()}")
     return content[start.end() : end]
 
 
 def polygonal(path: Path) -> Loaded:
-    """Load polygonal data through VTK, its polygons cut into triangles."""
+    """Load polygonal data through VTK, with polygons cut into triangles."""
     with reading(path, "readable polygonal data"):
         data = through_vtk(path)
         if "faces" not in data:
-            raise ValueError(f"it holds {data['kind']}")
+            raise ValueError(f"got {data['kind']}; expected vtkPolyData")
         points = data["points"].astype(np.float64)
     arrays = {key.removeprefix("point:"): values for key, values in data.items() if key.startswith("point:")}
     return Loaded(points, data["faces"].astype(np.int64), _real_arrays(arrays, len(points)))
 
 
 def _real_arrays(named: dict[str, Any], n_points: int) -> dict[str, Float[np.ndarray, "V *components"]]:
-    """Return the arrays of real numbers that have a row for each point, but for the tags that Gmsh's files have."""
+    """Return the real arrays that have one row per point, without Gmsh's tags."""
     arrays = {key: np.asarray(values) for key, values in named.items() if not key.startswith("gmsh:")}
     return {
         key: values.astype(np.result_type(values.dtype, np.float32))
@@ -169,32 +169,32 @@ def _real_arrays(named: dict[str, Any], n_points: int) -> dict[str, Float[np.nda
 
 def _corners(cells: Int[np.ndarray, "n corners"], corners: int) -> Int[np.ndarray, "n corners"]:
     if cells.ndim != 2 or cells.shape[1] != corners:
-        raise ValueError(f"cells of {corners} corners with the shape {cells.shape}")
+        raise ValueError(f"got cells of shape {cells.shape}; expected (n, {corners})")
     return cells
 
 
 def _triangles(cells: Int[np.ndarray, "n corners"], points: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, "m 3"]:
     if cells.ndim != 2 or cells.shape[1] not in (3, 4):
-        raise ValueError(f"triangles or quadrilaterals of shape {cells.shape}")
+        raise ValueError(f"got triangles or quadrilaterals of shape {cells.shape}; expected (n, 3) or (n, 4)")
     if cells.shape[1] == 3:
         return cells
     if cells.size and not 0 <= cells.min() <= cells.max() < len(points):
-        raise ValueError(f"a quadrilateral has the corner {cells.max()} of {len(points)} points")
+        raise ValueError(f"a quadrilateral refers to vertex {cells.max()}; expected 0 … {len(points) - 1}")
     cut = fans(points, cells)
     if (cut < 0).any():
-        raise ValueError("a quadrilateral whose sides cross")
+        raise ValueError("the sides of a quadrilateral cross; expected simple quadrilaterals")
     return cut.reshape(-1, 3)
 
 
 def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "n m 3"]:
-    """Return polygons cut into triangles around the first corner that sees all others; −1 where none does."""
+    """Cut polygons into triangles that share the first corner from which all others are visible; −1 without one."""
     n, size = polygons.shape
     found = np.full((n, size - 2, 3), -1)
     for first in reversed(range(size)):
         turned = np.roll(polygons, -first, axis=1)
         fan = np.stack([np.broadcast_to(turned[:, :1], (n, size - 2)), turned[:, 1:-1], turned[:, 2:]], axis=-1)
         a, b, c = np.moveaxis(points[fan], 2, 0)
-        with np.errstate(over="ignore", invalid="ignore"):  # of vertices that are far away or not finite
+        with np.errstate(over="ignore", invalid="ignore"):  # vertices may be far away or not finite
             normals = np.cross(b - a, c - a)
             along = np.einsum("nmx,nx->nm", normals, normals.sum(axis=1))
         seen = ~(along < 0).any(axis=1)
@@ -203,11 +203,11 @@ def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"
 
 
 _KEYWORD = re.compile(r"(ST)?C?N?OFF")
-"""What OFF files begin with; the letters say that vertices also have coordinates of a texture, colours and normals."""
+"""The first word of OFF files. ST, C and N mean that vertices have texture coordinates, colours and normals."""
 
 
 def load_obj(file: Path) -> Loaded:
-    """Load the vertices and faces of an OBJ file; normals, texture coordinates, colours and groups are passed over."""
+    """Load the vertices and faces of an OBJ file; ignore normals, texture coordinates, colours and groups."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
     with reading(file, "a readable OBJ mesh"):
@@ -216,53 +216,53 @@ def load_obj(file: Path) -> Loaded:
             words = line.partition("#")[0].split()
             if words[:1] == ["v"]:
                 if len(words) < 4:
-                    raise ValueError(f"line {number}: a vertex of {len(words) - 1} coordinates")
+                    raise ValueError(f"line {number}: got {len(words) - 1} coordinates for a vertex; expected 3")
                 vertices.append([float(word) for word in words[1:4]])
             elif words[:1] == ["f"]:
                 corners = [int(word.partition("/")[0]) for word in words[1:]]
                 if 0 in corners or len(corners) < 3:
-                    raise ValueError(f"line {number}: a face {' '.join(words[1:])}")
-                # They count from 1; negative ones count back from the vertices so far.
+                    raise ValueError(f"line {number}: got the face {' '.join(words[1:])}; expected 3 vertices or more")
+                # Vertices are numbered from 1. A negative number counts backwards from the last vertex above the line.
                 polygons.append([corner - 1 if corner > 0 else len(vertices) + corner for corner in corners])
     return _triangulated(file, vertices, polygons)
 
 
 def load_off(file: Path) -> Loaded:
-    """Load the vertices and faces of an OFF file; colours, normals and texture coordinates are passed over."""
+    """Load the vertices and faces of an OFF file; ignore colours, normals and texture coordinates."""
     with reading(file, "a readable OFF mesh"):
         text = file.read_text(encoding="utf-8", errors="replace")
         lines = [line for line in (line.partition("#")[0].strip() for line in text.splitlines()) if line]
         keyword = _KEYWORD.match(lines[0]) if lines else None
         if keyword is None:
-            raise ValueError("it does not begin with OFF, COFF, NOFF or STOFF")
-        # The numbers follow on the same line, also without a space, or on the next.
+            raise ValueError("the file does not begin with OFF, COFF, NOFF or STOFF")
+        # The numbers of vertices and faces follow on the same line, even without a space, or on the next line.
         head, *rest = filter(None, (lines[0][keyword.end() :].strip(), *lines[1:]))
         n_vertices, n_faces = (int(word) for word in head.split()[:2])
         if min(n_vertices, n_faces) < 0 or len(rest) != n_vertices + n_faces:
             raise ValueError(
-                f"it declares {n_vertices} vertices and {n_faces} faces, and has {len(rest)} lines of them"
+                f"the file declares {n_vertices} vertices and {n_faces} faces, but has {len(rest)} lines for them"
             )
         rows = [line.split() for line in rest]
         if len({len(row) for row in rows[:n_vertices]}) != 1:
-            raise ValueError("its vertices do not have the same number of columns, one vertex a line")
+            raise ValueError("lines of vertices differ in the number of columns; expected one vertex per line")
         vertices = [[float(word) for word in row[:3]] for row in rows[:n_vertices]]
         polygons = [[int(word) for word in row[1 : 1 + int(row[0])]] for row in rows[n_vertices:]]
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
-            # Behind the corners: a colour, by its index or three or four numbers.
+            # A colour may follow the corners, as an index or as three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
-                raise ValueError(f"a face {' '.join(row)[:60]}")
+                raise ValueError(f"got the face {' '.join(row)[:60]}; expected a count of corners, corners, a colour")
     return _triangulated(file, vertices, polygons)
 
 
 def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[int]]) -> Loaded:
-    """Return the mesh with its polygons cut into triangles, in the order of the file."""
+    """Return the mesh with polygons cut into triangles, in the order of the file."""
     if not polygons:
-        raise ValueError(f"{file}: has no triangles; expected a mesh")
+        raise ValueError(f"{file}: the mesh has no triangles; expected at least one face")
     with reading(file, "a readable mesh"):
         points = np.array(vertices, np.float64).reshape(-1, 3)
         low, high = min(map(min, polygons)), max(map(max, polygons))
         if low < 0 or high >= len(points):
-            raise ValueError(f"a face has the vertex {low if low < 0 else high} of 0 … {len(points) - 1}")
+            raise ValueError(f"a face refers to vertex {low if low < 0 else high}; expected 0 … {len(points) - 1}")
     order, triangles = [], []
     for size in {len(polygon) for polygon in polygons}:
         which = np.flatnonzero([len(polygon) == size for polygon in polygons])
@@ -270,7 +270,7 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
         if (cut < 0).any():
             bad = which[np.argmax((cut < 0).any(axis=(1, 2)))]
             raise ValueError(
-                f"{file}: face {bad} of {size} corners is not convex; expected triangles: cut it into some"
+                f"{file}: face {bad} with {size} corners is not star-shaped from a corner. Cut it into triangles"
             )
         order.append(np.repeat(which, size - 2))
         triangles.append(cut.reshape(-1, 3))

@@ -1,7 +1,7 @@
-"""MRtrix's image format, .mif and .mif.gz: tensors as dwi2tensor writes them, and masks.
+"""Read tensors and masks in MRtrix's image format, .mif and .mif.gz.
 
-https://mrtrix.readthedocs.io/en/latest/getting_started/image_data.html describes it: a header of lines ``key: value``
-up to ``END``, and the voxels at the offset that ``file`` names, in the order that ``layout`` gives.
+The header has lines ``key: value`` up to ``END``. The key ``file`` gives the offset of the voxels, and ``layout`` gives
+their order (https://mrtrix.readthedocs.io/en/latest/getting_started/image_data.html).
 """
 
 import gzip
@@ -12,25 +12,25 @@ from jaxtyping import Float
 
 from hks_jax.io.tensor_order import FRAMES, matrices
 from hks_jax.io.volume import Format, TensorVolume, placed
-from hks_jax.reading import existing, reading
+from hks_jax.storage import existing, reading
 
 _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
 def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"]]:
-    """Return the voxel values, with the header's axes, and the affine to the scanner's coordinates in mm."""
+    """Return the voxel values along the header's axes, and the affine to scanner coordinates in mm."""
     file = existing(name)
-    with reading(file, "a readable image of MRtrix (.mif)"):
+    with reading(file, "a readable MRtrix image (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
         header, offset = _header(content)
         shape = tuple(int(n) for n in header["dim"][0].split(","))
         if min(shape) < 1 or len(shape) < 3:
-            raise ValueError(f"dim is {header['dim'][0]}")
+            raise ValueError(f"dim: got {header['dim'][0]}; expected three positive sizes or more")
         count, dtype = math.prod(shape), header["datatype"][0].strip()
         length = -(-count // 8) if dtype == "Bit" else count * _dtype(dtype).itemsize
         if len(content) != offset + length:
-            raise ValueError(f"{dtype} of shape {shape} end at byte {offset + length}, the file at {len(content)}")
+            raise ValueError(f"got {len(content)} bytes; expected {offset + length} for {dtype} of shape {shape}")
         raw = np.frombuffer(content, np.uint8 if dtype == "Bit" else _dtype(dtype), offset=offset)
         flat = np.unpackbits(raw)[:count] if dtype == "Bit" else raw
         values = _in_order(flat, shape, header["layout"][0])
@@ -41,16 +41,16 @@ def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float
         affine[:3] = [[float(word) for word in row.split(",")] for row in header["transform"]]
         affine[:3, :3] *= [float(word) for word in header["vox"][0].split(",")[:3]]
         if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
-            raise ValueError("transform and vox place the voxels nowhere")
+            raise ValueError("transform, vox: got an affine that is singular or not finite")
     return values, affine
 
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`. Unless an order is given, it is that of all MRtrix's programs."""
+    """Read tensors; see `hks_jax.io.read_tensors`. Without `order`, the components are in MRtrix's order."""
     values, affine = load(name)
     if values.ndim != 4 or values.shape[-1] != 6:
         raise ValueError(
-            f"{name}: got an image of shape {values.shape}; expected the six components of dwi2tensor, (nx, ny, nz, 6)"
+            f"{name}: got an image of shape {values.shape}; expected (nx, ny, nz, 6), the components from dwi2tensor"
         )
     components = np.ascontiguousarray(values, np.float32 if values.dtype.itemsize <= 4 else np.float64)
     found = matrices(name, components, order, "mrtrix")
@@ -58,35 +58,35 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
-    """Return the values of each key, and where the voxels begin."""
+    """Return the values of each key, and the byte offset of the voxels."""
     end = content.find(b"\nEND\n")
     if not content.startswith(_MAGIC) or end < 0:
-        raise ValueError(f"it does not begin with {_MAGIC.decode()!r} and a header up to END")
+        raise ValueError(f"the file does not begin with {_MAGIC.decode()!r} and a header that ends with END")
     header: dict[str, list[str]] = {}
     for line in content[:end].decode().splitlines()[1:]:
         key, _, value = line.partition(":")
         header.setdefault(key.strip(), []).append(value.strip())
     where, offset = header["file"][0].split()
     if where != "." or int(offset) < end:
-        raise ValueError(f"its voxels are not in it, but in {header['file'][0]!r}")
+        raise ValueError(f"file: got {header['file'][0]!r}; expected voxels in the file itself, '. OFFSET'")
     return header, int(offset)
 
 
 def _dtype(name: str) -> np.dtype:
-    """Return the dtype of Float32LE, Int16BE, UInt8 and so on."""
+    """Return the NumPy dtype of a name such as Float32LE, Int16BE or UInt8."""
     bare, order = (name[:-2], "<" if name.endswith("LE") else ">") if name[-2:] in ("LE", "BE") else (name, "=")
     kind = bare.rstrip("0123456789")
     if kind not in _KINDS:
-        raise ValueError(f"voxels are of type {name}; expected real numbers")
+        raise ValueError(f"datatype: got {name}; expected real numbers")
     return np.dtype(f"{order}{_KINDS[kind]}{int(bare[len(kind) :]) // 8}")
 
 
 def _in_order(flat: np.ndarray, shape: tuple[int, ...], layout: str) -> np.ndarray:
-    """Return the values with the header's axes; a layout such as ``-0,+1,+2`` has each axis's rank and direction."""
+    """Return the values along the header's axes; a layout such as ``-0,+1,+2`` gives each axis's rank and direction."""
     words = [word.strip() for word in layout.split(",")]
     ranks = [int(word.lstrip("+-")) for word in words]
     if sorted(ranks) != list(range(len(shape))):
-        raise ValueError(f"layout is {layout}, of {len(shape)} axes")
+        raise ValueError(f"layout: got {layout}; expected a permutation of {len(shape)} axes")
     slowest_first = sorted(range(len(shape)), key=lambda axis: -ranks[axis])
     stored = flat.reshape([shape[axis] for axis in slowest_first])
     values = stored.transpose(np.argsort(slowest_first))

@@ -1,4 +1,4 @@
-"""NIfTI through nibabel, which is optional."""
+"""Read and write NIfTI through the optional library nibabel."""
 
 import gzip
 import json
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.atomic import atomic_path
 from hks_jax.checks import require_real
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
@@ -20,26 +19,26 @@ from hks_jax.io.tensor_order import FRAMES, matrices, pack
 from hks_jax.io.units import by_axis, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
 SYMMETRIC_MATRIX = 1005
 """NIfTI's intent code for symmetric matrices."""
 COMMENT = 6
-"""NIfTI's code for an extension of the header that is a comment."""
+"""NIfTI's code for a comment in an extension of the header."""
 _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
-"""NIfTI's codes for units of space, and how many mm each is; no unit is taken for mm, as programs do."""
+"""The unit of space for each of NIfTI's codes, and its length in mm. A missing unit means mm, as in other programs."""
 _REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world", "scanner": "world"}
-"""The frame that BIDS names by the field Reference of OrientationEncoding, in its drafts' words, too."""
+"""The frame for each value of Reference in BIDS's field OrientationEncoding, including the values of its drafts."""
 
 
 def is_nifti(path: str | os.PathLike[str]) -> bool:
-    """Tell by the name whether a file is NIfTI."""
+    """Return whether a path has a suffix of NIfTI."""
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
 def load(name: str) -> Any:
-    """Open a NIfTI image. A compressed one is read to its end, where its checksum is compared."""
+    """Open a NIfTI image and check its length; read compressed files to the end, which checks the checksum."""
     nib, file = optional("nibabel"), existing(name)
     with reading(file, "a readable NIfTI image"):
         image, length = nib.load(file), file.stat().st_size
@@ -50,44 +49,44 @@ def load(name: str) -> Any:
         data = image.dataobj
         declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
         if declared != length:
-            raise ValueError(f"{data.dtype} of shape {image.shape} end at byte {declared}, the file at {length}")
+            raise ValueError(f"got {length} bytes; expected {declared} for {data.dtype} of shape {image.shape}")
     return image
 
 
 def voxels(name: str, image: Any) -> np.ndarray:
-    """Return the voxel values of an image that was loaded, scaled, floating point as stored or float64."""
+    """Return the scaled voxel values of a loaded image, in the stored floating-point type or float64."""
     with reading(name, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
     require_real(name, data)
     if data.dtype.kind not in "fiub":
-        raise ValueError(f"{name}: has voxels of type {data.dtype}; expected real numbers")
+        raise ValueError(f"{name}: got voxels of type {data.dtype}; expected real numbers")
     dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
     return np.ascontiguousarray(data, dtype=dtype.newbyteorder("="))
 
 
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
-    """Return the affine with lengths in mm, and the unit that the file declares; the empty text if none."""
+    """Return the affine with lengths in mm, and the declared unit, or the empty text if there is none."""
     code = int(image.header["xyzt_units"]) & 7
     if code not in _LENGTHS:
-        raise ValueError(f"{name}: its unit of space has the code {code}; expected one of NIfTI's, 0 to 3")
+        raise ValueError(f"{name}: got the code {code} for the unit of space; expected 0 to 3. Correct xyzt_units")
     unit, scale = _LENGTHS[code]
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
 def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image's voxel values, and its affine in mm; without a unit, in that of the image `beside` it."""
+    """Return voxel values and the affine in mm; if the file has no unit, guess it from the related affine `beside`."""
     image = load(name)
     own, unit = affine_in_mm(name, image)
     return voxels(name, image), own if unit or beside is None else scaled_beside(own, beside)
 
 
 def sidecar_of(path: str | os.PathLike[str]) -> Path:
-    """Return the path of the BIDS sidecar beside an image, which need not be there."""
+    """Return the path of an image's BIDS sidecar, whether or not that file exists."""
     return Path(os.fspath(path).removesuffix(".gz")).with_suffix(".json")
 
 
 def _encoding(path: str) -> dict[str, Any]:
-    """Return the field OrientationEncoding of the sidecar beside an image; empty if there is none."""
+    """Return the field OrientationEncoding of an image's sidecar, or an empty dictionary."""
     sidecar = sidecar_of(path)
     if not sidecar.is_file():
         return {}
@@ -105,7 +104,7 @@ def _encoding(path: str) -> dict[str, Any]:
 
 
 def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
-    """Return the record of `save_tensors`; empty if another program wrote the file, or turned its voxels since."""
+    """Return the record of `save_tensors`, or an empty one if another program wrote or reoriented the image."""
     for extension in image.header.extensions:
         record = own_record(extension.get_content()) if extension.get_code() == COMMENT else {}
         if "axes" in record and np.allclose(record["axes"], affine[:3, :3], rtol=1e-4, atol=1e-4):
@@ -119,12 +118,12 @@ def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolum
 
 
 def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> TensorVolume:
-    """Return the tensors of an image that was loaded."""
+    """Return the tensors of a loaded image."""
     shape = image.shape
     if shape[3:] not in ((6,), (1, 6)):
-        remedy = "Fit tensors to diffusion-weighted images first: hks_jax.io.fit_dwi, or --bval and --bvec"
+        remedy = "Fit tensors to diffusion-weighted images first by hks_jax.io.fit_dwi, or by --bval and --bvec"
         if shape[3:] == (8,):
-            remedy += '. Camino has an exit code and log S₀ before the six: leave them out, and pass the order "fsl"'
+            remedy += '. Camino writes an exit code and log S₀ before the six: remove both, and pass the order "fsl"'
         raise ValueError(
             f"{name}: got an image of shape {shape}; expected six components per voxel, (nx, ny, nz, 1, 6) or "
             f"(nx, ny, nz, 6). {remedy}"
@@ -135,34 +134,34 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
     by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # xx xy xz yy yz zz
     found = matrices(name, voxels(name, image).reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
     if declared and found.order != "nifti":
-        notes.append(f'read in order "{order}" as asked, though the file declares NIfTI\'s symmetric-matrix order')
+        notes.append(f'components read in order "{order}", as asked; the file declares NIfTI\'s symmetric-matrix order')
     declared_frame = _REFERENCES.get(encoding.get("Reference", ""), record.get("frame"))
     open_frame = frame is None and declared_frame is None and found.order == "nifti"
     if frame is not None and declared_frame not in (None, frame):
-        notes.append(f"the {declared_frame} axes that the file declares are set aside for the {frame} axes, as asked")
+        notes.append(f"components read along the {frame} axes, as asked; the file declares the {declared_frame} axes")
     frame = frame or declared_frame or FRAMES[found.order]
     volume = placed(name, found, frame, affine, unit=record.get("unit", ""))
     notes += placement_notes(image)
     axes = affine[:3, :3] / volume.spacing
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
-        notes.append("the affine's axes are not orthogonal: the shear is ignored")
+        notes.append("the affine's axes are not orthogonal, and the shear is ignored")
     stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
     if length_unit not in ("", "mm"):
-        notes.append(f"lengths in {length_unit}, as the file declares: voxels of {by_axis(stored)} are in mm here")
+        notes.append(f"voxel sizes {by_axis(stored)} converted from {length_unit}, which the file declares, to mm")
     header = np.asarray(image.header.get_zooms()[:3], np.float64)
     if np.abs(header / stored - 1).max() > 1e-3:
-        notes.append(f"voxel sizes {by_axis(stored)} are those of the affine; the header's own are {by_axis(header)}")
+        notes.append(f"voxel sizes {by_axis(stored)} taken from the affine; the header's pixdim says {by_axis(header)}")
     if open_frame and np.linalg.det(affine[:3, :3]) > 0:
         notes.append(OPEN_FRAME)
     return replace(volume, notes=(*notes, *volume.notes))
 
 
 def placement_notes(image: Any) -> list[str]:
-    """Say if the place of an image is in doubt: its sform and qform differ, or there is neither."""
+    """Return a note if the position of an image is uncertain: sform and qform differ, or both are missing."""
     by_sform, sform = image.header.get_sform(coded=True)
     by_qform, qform = image.header.get_qform(coded=True)
     if not (sform or qform):
-        return ["neither sform nor qform places the voxels in space: which side is left is a guess"]
+        return ["the file has neither sform nor qform, so left and right are a guess"]
     if not (sform and qform):
         return []
     apart = float(np.linalg.norm(corners(image.shape) @ (by_sform - by_qform).T, axis=1).max())
@@ -170,16 +169,16 @@ def placement_notes(image: Any) -> list[str]:
         return []
     mirrored = np.linalg.det(by_sform[:3, :3]) * np.linalg.det(by_qform[:3, :3]) < 0
     return [
-        f"the file places its voxels twice, by its sform (code {sform}) and its qform (code {qform}), up to "
-        f"{apart:.3g} apart{', and one mirrors the other' * bool(mirrored)}: the sform is used"
+        f"the positions by the file's sform (code {sform}) and qform (code {qform}) differ by up to {apart:.3g}"
+        f"{', and one mirrors the other' * bool(mirrored)}; the sform is used"
     ]
 
 
 def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars with times along the fourth axis, a slice one voxel thick; see `hks_jax.io.save`."""
+    """Write scalars with times along the fourth axis, and a slice one voxel thick; see `hks_jax.io.save`."""
     others = sorted(extra.keys() - {"times"})
     if others:
-        raise ValueError(f"extra: got {', '.join(others)}; NIfTI has no place for more arrays. Write an .npz too")
+        raise ValueError(f"extra: got {', '.join(others)}, but NIfTI allows only times. Write an .npz as well")
     if "times" in extra:
         sources = [Path(volume.source).name] if volume.source else []
         write_json(sidecar_of(path), {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources})
@@ -193,7 +192,7 @@ def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra:
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     """Write a symmetric-matrix image; see `hks_jax.io.save_tensors`."""
     if volume.dimension != 3:
-        raise ValueError("volume: NIfTI has no 2×2 tensors; write the whole volume, or an .npz, .nrrd or .vti")
+        raise ValueError("volume: got a slice, but NIfTI has no 2×2 tensors. Write the volume, or .npz, .nrrd or .vti")
     require_symmetric(volume)
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)

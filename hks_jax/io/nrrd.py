@@ -1,4 +1,4 @@
-"""NRRD through pynrrd, which is optional: tensors of every kind that the format defines, masks and results."""
+"""Read and write tensors (of all kinds that NRRD defines), masks and results through the optional library pynrrd."""
 
 import warnings
 from collections.abc import Mapping
@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.atomic import atomic_path
 from hks_jax.io.nrrd_checks import PATIENT, check_data, check_header, space_of
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, reading
 
 KINDS = {
     f"{d}D-{masked}{symmetric}matrix": (d * (d + 1) // 2 if symmetric else d * d) + bool(masked)
@@ -23,23 +22,23 @@ KINDS = {
     for masked in ("", "masked-")
     for symmetric in ("", "symmetric-")
 }
-"""The kinds of axes of tensor components, and how many numbers each has, its confidence among them."""
+"""The kinds of axes that hold tensor components, and their number of entries including the confidence."""
 
 
 class Placement(NamedTuple):
-    """Where the voxels lie, in mm where the file declares a unit."""
+    """The position of the voxels, in mm if the file declares a unit."""
 
-    directions: Float[np.ndarray, "d d"]  # the step along each voxel axis as a column, in the file's space
-    origin: Float[np.ndarray, " d"]  # in the file's space
-    # The signs that take the file's space to right, anterior, superior; None where it is not patient-based.
+    directions: Float[np.ndarray, "d d"]  # column a is the step along voxel axis a, in the file's space
+    origin: Float[np.ndarray, " d"]  # the position of voxel 0, in the file's space
+    # The signs that transform the file's space to right, anterior, superior; None if it is not patient-based.
     signs: Float[np.ndarray, " d"] | None
     measured: Float[np.ndarray, "m n"] | None  # the vectors of the measurement frame as columns
-    placed: bool  # whether the file gives directions at all, and not spacings alone
-    unit: str  # of length in the file; empty if it declares none
+    placed: bool  # whether the file gives directions, and not only spacings
+    unit: str  # the file's unit of length; empty if there is none
 
     @property
     def affine(self) -> Float[np.ndarray, "4 4"] | None:
-        """Voxel indices to world coordinates, for volumes whose place is more than spacing and origin."""
+        """The map from voxel indices to world coordinates; None if spacing and origin describe it completely."""
         d = len(self.origin)
         diagonal = np.array_equal(self.directions, np.diag(np.abs(np.diag(self.directions))))
         if d != 3 or (self.signs is None and diagonal):
@@ -51,10 +50,10 @@ class Placement(NamedTuple):
 
 
 def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the array, first axis fastest in the file, in native floating point or as it is; and the header."""
+    """Return the header and the array in native byte order; its first axis is the fastest in the file."""
     nrrd, file = optional("nrrd"), existing(name)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
-        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # text that is not
+        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # malformed text
         header = dict(nrrd.read_header(stream))
         start = stream.tell()
         stream.seek(0)
@@ -66,7 +65,7 @@ def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
-    """Return an image's voxel values, and its affine if any; without a unit, in that of the image `beside` it."""
+    """Return voxel values and any affine; if the file has no unit, guess it from the related affine `beside`."""
     data, header = load(name)
     place = _placement(name, header, list(range(data.ndim)))
     affine = place.affine
@@ -83,23 +82,23 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
     notes, mask = [], None
     if label is not None and "masked" in label:
         mask, components = components[..., 0] > confidence, components[..., 1:]
-        notes.append(f"inside where the file's confidence exceeds {confidence:g}: {int(mask.sum())} voxels")
+        notes.append(f"the mask has the {int(mask.sum())} voxels where the file's confidence exceeds {confidence:g}")
     found = matrices(name, components, order, "" if label is None else "nrrd")
     if label is not None and order is not None:
-        notes.append(f'read in order "{order}" as asked, though the file declares {label}')
+        notes.append(f'components read in order "{order}", as asked; the file declares {label}')
     d = found.tensors.shape[-1]
     if len(domain) != d:
-        raise ValueError(f"{name}: {d}×{d} tensors on {len(domain)} axes of voxels; expected {d} axes")
+        raise ValueError(f"{name}: got {d}×{d} tensors on {len(domain)} axes of voxels; expected {d} axes")
     place = _placement(name, header, domain)
     spacing = np.linalg.norm(place.directions, axis=0)
     affine = place.affine
     tensors, frame = _to_voxel_axes(name, found.tensors, frame, place, notes)
     if affine is not None and place.signs is None:
-        notes.append(f"space {header.get('space', 'unnamed')!r}: the affine's axes are those of the file")
+        notes.append(f"the affine's axes are the axes of the file's space, {header.get('space', 'unnamed')!r}")
     elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
-        notes.append("the grid's axes are those of the voxels; their directions in the plane are not kept")
+        notes.append("the grid's axes are the voxel axes; the directions of these axes in the plane are ignored")
     if place.unit not in ("", "mm"):
-        notes.append(f"lengths in {place.unit}, as the file declares, are in mm here")
+        notes.append(f"lengths converted from {place.unit}, which the file declares, to mm")
     notes.append(found._replace(of=f" ({label or 'as asked'})").note(frame))
     return TensorVolume(
         np.ascontiguousarray(tensors),
@@ -112,7 +111,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
         notes=tuple(notes),
         source=name,
         invalid_by_order=found.invalid,
-        length_unit="mm" if place.unit or place.signs is not None else "",  # patients are measured in mm
+        length_unit="mm" if place.unit or place.signs is not None else "",  # patient spaces are in mm
         unit=own_record(header.get("provenance", "")).get("unit", ""),
     )
 
@@ -127,7 +126,7 @@ def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra:
 
 
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
-    """Write tensors as masked symmetric matrices, the mask as confidence, the voxel axes as measurement frame."""
+    """Write masked symmetric matrices, with the mask as confidence and the voxel axes as measurement frame."""
     require_symmetric(volume)
     confidence = volume.inside[..., None].astype(volume.tensors.dtype)
     components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
@@ -137,10 +136,10 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
 
 
 def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
-    """Write an array over the voxels of a volume, in axes right, anterior, superior where it has an affine.
+    """Write an array over the voxels of a volume, with the axes right, anterior, superior if there is an affine.
 
-    Tensor components, of some `kind`, are along the first axis, times along the last. A slice with an affine must come
-    one voxel thick. More arrays go as text into the header.
+    The array has tensor components of the kind `kind` along the first axis, or times along the last. A slice with an
+    affine must be one voxel thick. The header receives the arrays in `more` as text.
     """
     nrrd = optional("nrrd")
     placed = volume.affine is not None and not kind.startswith("2D")
@@ -149,12 +148,12 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
     else:
         d = volume.dimension
         linear, origin = np.diag(volume.spacing), np.asarray(volume.origin)
-    # pynrrd writes a direction of NaN as "none", which is what axes have that are not in space.
+    # pynrrd writes a direction of NaN as "none", the value for axes without a direction in space.
     directions, kinds, none = linear.T, ["space"] * d, np.full((1, d), np.nan)
     header: dict[str, Any] = {"space": "right-anterior-superior"} if placed else {"space dimension": d}
     if kind:
         directions, kinds = np.concatenate([none, directions]), [kind, *kinds]
-        header["measurement frame"] = nearest_rotation(linear).T  # its vectors, which are the matrix's columns
+        header["measurement frame"] = nearest_rotation(linear).T  # the file lists the columns
     elif array.ndim > d:
         directions, kinds = np.concatenate([directions, none]), [*kinds, "list"]
     if placed or volume.length_unit:
@@ -168,13 +167,13 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
 
 
 def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -> tuple[int, str | None]:
-    """Return the axis of the components, and its kind; None where the file leaves the kind open."""
+    """Return the axis of the components, and its kind or None if the file declares none."""
     kinds = header.get("kinds", ["???"] * len(shape))
     matrix_axes = [(axis, kind) for axis, kind in enumerate(kinds) if kind in KINDS]
     if len(matrix_axes) == 1:
         axis, kind = matrix_axes[0]
         if shape[axis] != KINDS[kind]:
-            raise ValueError(f"{name}: axis {axis} is a {kind} of {shape[axis]} components; expected {KINDS[kind]}")
+            raise ValueError(f"{name}: got axis {axis}, a {kind}, of {shape[axis]} components; expected {KINDS[kind]}")
         return axis, kind
     count = {4: 6, 3: 3}.get(len(shape))
     rows = _rows(header, len(shape))
@@ -182,14 +181,14 @@ def _tensor_axis(name: str, shape: tuple[int, ...], header: Mapping[str, Any]) -
     outside = outside or [a for a in (0, len(shape) - 1) if shape[a] == count]
     if matrix_axes or len(outside) != 1:
         raise ValueError(
-            f"{name}: got axes of sizes {tuple(shape)} and kinds {list(kinds)}; expected one axis of components, "
-            f"whose kind is one of {', '.join(KINDS)}; or one of six components, or three in the plane"
+            f"{name}: got axes of sizes {tuple(shape)} and kinds {list(kinds)}; expected one axis of components of the "
+            f"kind {', '.join(KINDS)}, or one axis of six components (three in the plane)"
         )
     return outside[0], None
 
 
 def _rows(header: Mapping[str, Any], n: int) -> Float[np.ndarray, "n d"] | None:
-    """Return the direction of each axis, NaN where it has none; None if the file gives no directions."""
+    """Return the direction of each axis, or NaN for an axis without one; None if the file gives no directions."""
     given = header.get("space directions")
     if given is None:
         return None
@@ -209,7 +208,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
     directions = rows[domain].T
     if directions.shape != (d, d) or not np.isfinite(directions).all() or np.linalg.norm(directions, axis=0).min() == 0:
         raise ValueError(
-            f"{name}: space directions {rows[domain].tolist()}; expected {d} of {d} finite numbers, none of them zero"
+            f"{name}: got space directions {rows[domain].tolist()}; expected {d} nonzero vectors of {d} finite numbers"
         )
     origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
     signs = PATIENT.get(space_of(header)) if d == 3 else None
@@ -218,7 +217,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
 
 
 def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
-    """Return the unit of the file's lengths, empty if it declares none, and how many mm it is along each axis."""
+    """Return the file's unit of length, empty if there is none, and its length in mm along each axis."""
     if "space directions" in header:
         field, given = "space units", list(header.get("space units", ()))[: len(domain)]
     else:
@@ -229,37 +228,37 @@ def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[s
     if not declared:
         return "", np.ones(len(domain))
     if len(declared) < len(domain):
-        raise ValueError(f"{name}: {field} {given}; expected one for each of the {len(domain)} axes, or none")
+        raise ValueError(f"{name}: got {field} {given}; expected a unit for each of {len(domain)} axes, or no unit")
     return " ".join(dict.fromkeys(declared)), np.array(scales, np.float64)
 
 
 def _to_voxel_axes(
     name: str, tensors: Float[np.ndarray, "*shape d d"], frame: str | None, place: Placement, notes: list[str]
 ) -> tuple[Float[np.ndarray, "*shape d d"], str]:
-    """Return the tensors along the voxel axes, and the frame that they were in."""
+    """Return the tensors along the voxel axes, and the frame in which the file gives them."""
     d, directions, columns = tensors.shape[-1], place.directions, place.measured
     if columns is None:
         if frame == "measurement":
-            raise ValueError(f'frame: {name} has no measurement frame; expected "voxel" or "world"')
+            raise ValueError(f'frame: got {frame!r}, but {name} has no measurement frame; expected "voxel" or "world"')
         rotation = nearest_rotation(directions)
-        # With all axes along or all against those of space, both readings give the same tensors.
+        # If all voxel axes have the directions of the space's axes, or all are reversed, both frames agree.
         same = np.allclose(rotation, np.eye(d), atol=1e-6) or np.allclose(rotation, -np.eye(d), atol=1e-6)
         if frame is None and not same:
             raise ValueError(
-                f"{name}: no measurement frame says along which axes the tensors are, and the voxel axes are not those "
-                'of space. Pass frame: "world" (the axes of the file\'s space, as ITK and 3D Slicer take it) or "voxel"'
+                f"{name}: got no measurement frame, and voxel axes that differ from the axes of space; expected a "
+                'frame. Pass frame: "world" (the axes of space, as in ITK and 3D Slicer) or "voxel"'
             )
         frame = frame or ("world" if place.placed else "voxel")
     elif frame in (None, "measurement"):
         if columns.shape != (d, d):
             raise ValueError(f"{name}: got a measurement frame of shape {columns.shape}; expected {(d, d)}")
         if np.abs(columns.T @ columns - np.eye(d)).max() > 1e-3:
-            notes.append("the measurement frame is not orthonormal: it scales the tensors, as NRRD defines")
+            notes.append("the measurement frame is not orthonormal and scales the tensors, as NRRD defines")
         columns = columns.astype(tensors.dtype)
         return to_voxel_axes(columns @ tensors @ columns.T, "world", directions), "measurement"
     else:
-        notes.append(f"the file's measurement frame is set aside for the {frame} axes, as asked")
-    if frame == "fsl" and place.signs is not None:  # FSL's rule is about the axes right, anterior, superior
+        notes.append(f"components read along the {frame} axes, as asked; the file declares a measurement frame")
+    if frame == "fsl" and place.signs is not None:  # FSL's convention refers to right, anterior, superior
         directions = place.signs[:, None] * directions
     return to_voxel_axes(tensors, frame, directions), frame
 

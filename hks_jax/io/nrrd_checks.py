@@ -1,4 +1,4 @@
-"""What pynrrd does not notice in a damaged NRRD file: fields that are none, and data that end early or late."""
+"""Check NRRD files for damage that pynrrd ignores: unknown fields, and data of a wrong length."""
 
 import bz2
 import math
@@ -20,14 +20,14 @@ _FIELDS = frozenset(
     )
     for name in names.split(", ")
 )
-"""All fields that the format has (Teem, "Definition of NRRD File Format")."""
+"""All fields of the format (Teem, "Definition of NRRD File Format")."""
 
 PATIENT = {
     "right-anterior-superior": (1.0, 1.0, 1.0),
     "left-anterior-superior": (-1.0, 1.0, 1.0),
     "left-posterior-superior": (-1.0, -1.0, 1.0),
 }
-"""The spaces about a patient, and the signs that take them to right, anterior, superior, as NIfTI has them."""
+"""The patient-based spaces, and the signs that transform them to right, anterior, superior, NIfTI's axes."""
 
 _SHORT = {"".join(word[0] for word in name.split("-")): name for name in PATIENT}
 _SPACES = (*PATIENT, "scanner-xyz", "3d-right-handed", "3d-left-handed")
@@ -40,9 +40,9 @@ _DECOMPRESSORS: dict[str, Any] = {
 
 
 def check_header(text: bytes, header: Mapping[str, Any]) -> None:
-    """Raise ValueError for lines that are neither fields of the format nor keys, and for fields of another length.
+    """Raise ValueError for a line that is neither a field of the format nor a key, and for a field of wrong length.
 
-    A field whose name is damaged would be passed over, and its default taken: a spacing of one, no frame.
+    Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of one.
     """
     for line in text.splitlines()[1:]:
         if line.startswith(b"#") or not line:
@@ -50,25 +50,25 @@ def check_header(text: bytes, header: Mapping[str, Any]) -> None:
         key, colon, value = line.partition(b":")
         name, is_key = key.decode("latin-1"), value.startswith(b"=")
         if not colon or (name in _FIELDS) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
-            raise ValueError(f"the header's line {line[:60]!r} is neither a field of the format nor a key with a value")
+            raise ValueError(f"got the header line {line[:60]!r}; expected a field of the format, or a key and a value")
     n = int(header["dimension"])
     for name in _PER_AXIS:
         if name in header and len(header[name]) != n:
-            raise ValueError(f"{name}: {len(header[name])} entries for {n} axes")
+            raise ValueError(f"{name}: got {len(header[name])} entries; expected {n}, one per axis")
     space_of(header)
 
 
 def space_of(header: Mapping[str, Any]) -> str:
-    """Return the space in full and in lower case, without its time; the empty text if there is none."""
+    """Return the full name of the space in lower case, without its time axis, or the empty text."""
     space = str(header.get("space", "")).lower()
     name = _SHORT.get(space.removesuffix("t"), space.removesuffix("-time"))
     if "space" in header and name not in _SPACES:
-        raise ValueError(f"space: {space!r} is none of the format's, such as left-posterior-superior")
+        raise ValueError(f"space: got {space!r}; expected a space of the format, such as left-posterior-superior")
     return name
 
 
 def check_data(file: Path, header: Mapping[str, Any], stream: BufferedReader, start: int) -> None:
-    """Raise ValueError where compressed data do not end as they should, checksum included, or raw ones do not fit."""
+    """Raise ValueError if compressed data are incomplete or fail their checksum, or raw data have a wrong length."""
     beside = header.get("data file", header.get("datafile"))
     encoding = str(header["encoding"]).lower()
     with ExitStack() as opened:
@@ -86,14 +86,14 @@ def _check_stream(source: BufferedReader, decompressor: Any) -> None:
     while not decompressor.eof:
         chunk = source.read(1 << 20)
         if not chunk:
-            raise ValueError("the compressed data end early")
+            raise ValueError("the compressed data are incomplete")
         decompressor.decompress(chunk)
     if (decompressor.unused_data + source.read()).strip(b"\0"):
-        raise ValueError("something follows the compressed data")
+        raise ValueError("bytes follow the end of the compressed data")
 
 
 def _check_length(source: BufferedReader, header: Mapping[str, Any]) -> None:
     start, count = source.tell(), math.prod(int(size) for size in header["sizes"])
     held = source.seek(0, os.SEEK_END) - start
     if count <= 0 or held % count:
-        raise ValueError(f"{held} bytes of data for {count} values")
+        raise ValueError(f"got {held} bytes of data; expected a multiple of the {count} values")

@@ -1,4 +1,4 @@
-"""Eigenpairs in files, so that other times take no other computation."""
+"""Save and load eigenpairs, so that signatures at other times need no new eigenvalue computation."""
 
 import os
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ import numpy as np
 
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.npz import load_npz, write_npz
+from hks_jax.storage import load_npz, write_npz
 
 ARRAYS = (
     "eigenvalues",
@@ -25,26 +25,26 @@ ARRAYS = (
     "complete_below",
     "multiplet_tolerance",
 )
-"""What of `hks_jax.Eigenpairs` is in a file; the matrices are assembled again."""
+"""The fields of `hks_jax.Eigenpairs` that a file contains; the matrices are not saved."""
 _FAR = 1e-3
-"""The residual relative to the first eigenvalue beyond from which on pairs are those of another pencil."""
+"""The residual, relative to the next eigenvalue, above which pairs count as belonging to another pencil."""
 
 
 def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[str, Any] | None = None) -> Path:
-    """Write eigenpairs as an npz that `load_pairs` reads: k·(number of unknowns) numbers, not compressed.
+    """Write eigenpairs to an uncompressed npz for `load_pairs`, about k numbers for each degree of freedom.
 
-    The matrices are not in it: keep the tensors and the mask, or give them as `extra`.
+    The matrices are not written. To assemble them again, keep the tensors and the mask, or pass them as `extra`.
 
     Args:
-        path: the file, ``.npz``; missing folders are made. It appears whole or not at all.
-        pairs: from `hks_jax.eigenpairs`, with concrete values.
-        extra: more arrays by name.
+        path: the file, ``.npz``, which is written atomically; missing folders are created.
+        pairs: the result of `hks_jax.eigenpairs`, with concrete values.
+        extra: more named arrays.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: another suffix.
+        ValueError: the suffix is not ``.npz``.
     """
     if not os.fspath(path).endswith(".npz"):
         raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in .npz")
@@ -55,29 +55,29 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
 
 
 def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
-    """Read eigenpairs that `save_pairs` wrote, for the pencil that they belong to.
+    """Read eigenpairs that `save_pairs` wrote, for the same pencil.
 
-    Signatures and all that is computed from the pairs are those of the pairs that were saved. Derivatives with respect
-    to tensors run through the computation of the pairs, which is not repeated: there are none.
+    Signatures of the loaded pairs equal signatures of the saved pairs. Derivatives with respect to the tensors are not
+    available, because they need the computation of the pairs, which is not repeated.
 
     Args:
         path: the file.
-        pencil: from `hks_jax.assemble`, of the same field with the same boundary.
+        pencil: the result of `hks_jax.assemble` for the same field and boundary.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not such a file, or pairs of another pencil: of other unknowns, or that do not solve Kφ = λMφ.
+        FileNotFoundError: the file does not exist.
+        ValueError: `save_pairs` did not write the file, or the pairs have a wrong length or do not solve Kφ = λMφ.
     """
     return pairs_of(os.fspath(path), load_npz(path), pencil)
 
 
 def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> Eigenpairs:
-    """Return the pairs that were read from a file; see `load_pairs`."""
+    """Return the pairs in arrays from a file; see `load_pairs`."""
     doubled = len(pencil.parts) > 1
     names = [key for key in ARRAYS if key != "part" or doubled]
     missing = [key for key in (*names, "solver_name") if key not in arrays]
     if missing:
-        raise ValueError(f"{name}: lacks {', '.join(missing)}; expected eigenpairs as save_pairs writes them")
+        raise ValueError(f"{name}: the file lacks {', '.join(missing)}; expected a file that save_pairs wrote")
     dtype = pencil.parts[0].stiffness.dtype
     values: dict[str, Any] = {
         key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in names for a in [arrays[key]]
@@ -85,8 +85,8 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     k, n = values["eigenvalues"].shape[-1], pencil.space.n_dof
     if values["vectors"].shape != (k, n):
         raise ValueError(
-            f"{name}: got eigenfunctions of shape {values['vectors'].shape}; expected {(k, n)}, those of this pencil. "
-            "Are mask and boundary those that the pairs were computed with?"
+            f"{name}: got eigenfunctions of shape {values['vectors'].shape}; expected {(k, n)} for this pencil. Use "
+            "the mask and the boundary with which the pairs were computed"
         )
     lowest = bool(values.pop("lowest"))
     solver_name = str(np.asarray(arrays["solver_name"]))
@@ -98,14 +98,14 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     worst = float(np.max(gap, initial=0)) / max(size, np.finfo(ends.dtype).tiny)
     if not worst < _FAR:
         raise ValueError(
-            f"{name}: these pairs do not solve Kφ = λMφ for this pencil (relative residual {worst:.1e}); expected the "
-            "tensors, the mask, the boundary and the interpolation that they were computed with"
+            f"{name}: the pairs do not solve Kφ = λMφ for this pencil; got the relative residual {worst:.1e}, expected "
+            f"at most {_FAR:g}. Use the tensors, mask, boundary and interpolation of the saved pairs"
         )
     return pairs
 
 
 def _residuals(pairs: Eigenpairs, number: int) -> np.ndarray:
-    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ of the pairs of one part of a doubled domain."""
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ for the pairs of one part of a doubled domain."""
     part = pairs.pencil.parts[number]
     own = slice(None) if pairs.part is None else np.flatnonzero(np.asarray(pairs.part) == number)
     vectors = pairs.space.transfer(pairs.vectors[own], part.space)

@@ -1,4 +1,4 @@
-"""What makes one doubt that tensors were read as they were meant: units, frames, and how fibres cohere."""
+"""Detect tensors that were read in a wrong unit or frame, from their size and from the coherence of fibres."""
 
 import math
 from dataclasses import replace
@@ -12,41 +12,41 @@ from hks_jax.io.units import length_question, unit_question
 from hks_jax.io.volume import AXES, TensorVolume
 
 ANISOTROPIC = 0.3
-"""The fractional anisotropy from which on a tensor's principal direction is taken for a fibre's."""
+"""The fractional anisotropy above which a tensor's principal direction counts as the direction of a fibre."""
 _ENOUGH = 1000
-"""Fewer voxels with both neighbours along their direction decide nothing."""
+"""The least number of voxels with both neighbours along their direction for which frames are compared."""
 _BLOCK, _BLOCKS = 8, 8
-"""Voxels, per axis, of the blocks whose scatter tells the error of a mean, as neighbours are not independent; and the
-least number of blocks that tells it."""
+"""The size of blocks, in voxels per axis, and their least number. The standard error of a mean comes from the scatter
+between blocks, because neighbouring voxels are correlated."""
 CLEAR = 3.5
-"""Standard errors by which one mean must be below another."""
+"""The number of standard errors by which two means must differ."""
 _SMOOTH = 3.0
-"""Degrees below which fibres go on so well that the difference is one of the steps from voxel to voxel."""
+"""The mean angle, in degrees, below which differences between frames come from the discrete steps between voxels."""
 
-_SAID = "Principal directions and those of the two neighbours along them differ by"
+_SAID = "Principal directions differ from those of the two neighbours along them by"
 
 
 class Alternative(NamedTuple):
-    """Other axes that a file's components may be along."""
+    """Alternative axes for the components of a file."""
 
-    name: str  # a frame, or an axis of the voxels or of the scanner that is reversed
-    is_frame: bool  # whether it is a frame
-    angle: float  # the mean, in degrees, between a principal direction and the mean of the two neighbours' along it
-    errors: float  # by how many standard errors that is less than with the axes in which the file was read
+    name: str  # a frame, or a reversed axis of the voxels or of the scanner
+    is_frame: bool  # whether `name` is a frame
+    angle: float  # the mean angle, in degrees, between a principal direction and the mean of its two neighbours'
+    errors: float  # the decrease of `angle` relative to the axes in which the file was read, in standard errors
 
 
 class Coherence(NamedTuple):
-    """How well the fibres of neighbours continue each other, as the file was read, and along other axes."""
+    """How well fibres of neighbouring voxels line up, in the frame of the file and along alternative axes."""
 
-    frame: str  # in which the file was read
-    angle: float  # the mean, in degrees, between a principal direction and the mean of the two neighbours' along it
-    others: tuple[Alternative, ...]  # the same along other axes
+    frame: str  # the frame in which the file was read
+    angle: float  # the mean angle, in degrees, between a principal direction and the mean of its two neighbours'
+    others: tuple[Alternative, ...]  # results for alternative axes
 
     @property
     def better(self) -> Alternative | None:
-        """The axes along which fibres clearly continue best, if they are not those of the file as it was read.
+        """The alternative axes with the best alignment of fibres, if it is clearly better than in the file's frame.
 
-        A frame comes before a reversed axis that gains hardly more: the two may differ by a small turn only.
+        A frame is preferred to a reversed axis of almost equal gain, because the two may differ by a small rotation.
         """
         clear = [a for a in self.others if a.errors > CLEAR and self.angle > _SMOOTH]
         best = min(clear, key=lambda a: a.angle, default=None)
@@ -55,36 +55,36 @@ class Coherence(NamedTuple):
 
     @property
     def worse(self) -> tuple[Alternative, ...]:
-        """The axes along which fibres clearly continue worse than along those of the file as it was read."""
+        """The alternative axes along which fibres line up clearly worse than in the frame of the file."""
         return tuple(a for a in self.others if a.errors < -CLEAR)
 
     @property
     def note(self) -> str:
-        """Say how well fibres continue, and along which axes worse; the empty text where they tell nothing."""
+        """A sentence that compares the alignment of fibres with clearly worse axes; empty if there are none."""
         worse = [f"along the {a.name} axes" for a in self.worse if a.is_frame]
         if flips := [a.name for a in self.worse if not a.is_frame]:
             worse.append(f"with {', '.join(flips)} reversed")
-        return f"{_SAID} {self.angle:.1f}° in the mean, and clearly more {', or '.join(worse)}" if worse else ""
+        return f"{_SAID} {self.angle:.1f}° on average, and clearly more {', or '.join(worse)}" if worse else ""
 
     def question(self, option: str) -> str:
-        """Ask whether the frame, which `option` says, is wrong; the empty text where no other axes are better."""
-        best, said = self.better, f"Wrong frame? {_SAID} {self.angle:.1f}° in the mean along the {self.frame} axes"
+        """Return a question whether the argument `option` is wrong, or the empty text if no other axes are better."""
+        best, said = self.better, f"Wrong frame? {_SAID} {self.angle:.1f}° on average along the {self.frame} axes"
         if best is None:
             return ""
         if best.is_frame:
-            return f'{said}, and by {best.angle:.1f}° along the {best.name} axes: try {option} "{best.name}"'
+            return f'{said}, but only by {best.angle:.1f}° along the {best.name} axes: try {option} "{best.name}"'
         return (
-            f"{said}, and by {best.angle:.1f}° with the {best.name} axis reversed: look at the signs of the gradient "
-            "directions, or at what turned the image but not its tensors"
+            f"{said}, but only by {best.angle:.1f}° with the {best.name} axis reversed. Check the signs of the "
+            "gradient directions, and whether a program reoriented the image without its tensors"
         )
 
 
 def coherence(volume: TensorVolume) -> Coherence | None:
-    """Measure whether fibres continue along their own direction, along the axes of the file and along others.
+    """Measure how well fibres of neighbouring voxels line up, in the frame of the file and along alternative axes.
 
-    A principal direction v is compared with the mean of those of the two neighbours nearest to ±v, where both are
-    anisotropic, too. Tensors along the right axes agree best. Compared are the frames of `hks_jax.io.read_tensors`, and
-    the file's own with one axis reversed. None for a slice, and for fewer than a thousand voxels with such neighbours.
+    At an anisotropic voxel, the principal direction v is compared with the mean of the directions at the neighbours
+    nearest to ±v, if both are anisotropic. The angle is smallest in the correct frame. Alternatives are the frames of
+    `read_tensors` and reversals of an axis. The result is None for a slice, and for fewer than 1000 such voxels.
     """
     if volume.dimension != 3:
         return None
@@ -103,7 +103,7 @@ def coherence(volume: TensorVolume) -> Coherence | None:
         angles = _angles(voxels, directions @ turn.T.astype(directions.dtype), index, spacing)
         both = np.isfinite(own) & np.isfinite(angles)
         gain = (own - angles)[both]
-        # Where every fibre goes on straight, whichever the axes, there is no gain at all.
+        # The gain is zero everywhere if all fibres are straight along both sets of axes.
         if len(gain) < _ENOUGH or len(np.unique(block[both])) < _BLOCKS or not gain.any():
             continue
         scatter = math.sqrt(float((np.bincount(block[both], gain - gain.mean()) ** 2).sum()))
@@ -113,8 +113,8 @@ def coherence(volume: TensorVolume) -> Coherence | None:
 
 
 def _fibres(volume: TensorVolume) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return the anisotropic voxels inside, and their principal directions."""
-    traces = np.trace(volume.tensors, axis1=-2, axis2=-1)  # zero where the background is
+    """Return the anisotropic voxels inside the mask, and their principal directions."""
+    traces = np.trace(volume.tensors, axis1=-2, axis2=-1)  # zero in the background
     usable: Bool[np.ndarray, "*shape"] = volume.inside & np.isfinite(volume.tensors).all(axis=(-2, -1)) & (traces > 0)
     tensors = volume.tensors[usable].astype(np.float64)
     values, vectors = np.linalg.eigh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)))
@@ -129,10 +129,10 @@ def _angles(
     index: Int[np.ndarray, "nx ny nz"],
     spacing: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, " n"]:
-    """Return the angle, in degrees, to the mean direction of the two neighbours along a voxel's own; NaN without both.
+    """Return the angle, in degrees, between a direction and the mean of its two neighbours'; NaN without both.
 
-    A fibre that bends turns one way before a voxel and the other way behind it: their mean does not feel that. Each
-    neighbour by itself would, and circles around a heart would seem to go on best along their radii.
+    Along a curved fibre, the directions at the two neighbours deviate to opposite sides, and the mean cancels this. A
+    single neighbour would not: circular fibres around a heart would then seem to line up best along radii.
     """
     steps = directions / spacing
     steps = np.rint(steps / np.abs(steps).max(axis=1, keepdims=True)).astype(int)
@@ -149,7 +149,7 @@ def _angles(
 
 
 def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarray, "3 3"]]]:
-    """Return other axes, frames first: name, whether they are a frame, and a matrix that turns directions to them."""
+    """Return alternative axes, frames first: the name, whether it is a frame, and the matrix applied to directions."""
     affine = volume.volume_affine
     to_voxel = {
         "voxel": np.eye(3),
@@ -166,40 +166,40 @@ def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarra
     candidates += [(f"scanner's {AXES[a]}", False, turn @ flip @ turn.T) for a, flip in enumerate(flips)]
     kept = [("own", True, np.eye(3))]
     for name, is_frame, turn in candidates:
-        # A turn and its negative are the same of a direction's two ends; below 5° nobody could tell.
+        # A rotation and its negative are equivalent for fibres, and rotations below 5° cannot be distinguished.
         if all(np.linalg.norm(turn - s * other, 2) > 0.09 for _, _, other in kept for s in (1, -1)):
             kept.append((name, is_frame, turn))
     return kept[1:]
 
 
 OPEN_FRAME = (
-    "NIfTI does not declare the axes of its tensors: taken for those of the voxels; if they were fitted with FSL's "
-    'b-vectors as they are, as DIPY does, pass frame "fsl"'
+    "The NIfTI file does not declare the axes of its tensors, which are read along the voxel axes. If the tensors were "
+    'fitted with unchanged FSL b-vectors, as DIPY does, pass frame "fsl"'
 )
-"""The note of a NIfTI file whose frame is open, where it matters."""
+"""The note for a NIfTI file that declares no frame, if the frames "voxel" and "fsl" differ."""
 
 
 def questions(volume: TensorVolume) -> tuple[str, ...]:
-    """Ask about tensors that look wrong: "Wrong frame?", "Wrong unit of length?", "Wrong unit?".
+    """Check tensors for a wrong frame or unit, and return the questions "Wrong frame?", "Wrong unit?" and similar.
 
-    Mirrored or turned tensors are as positive definite as right ones, but the fibres of neighbours no longer continue
-    each other: the mean angle between a principal direction and those of the two neighbours along it is compared with
-    the mean angle along other axes. This needs some thousand anisotropic voxels; lay the mask over the volume first.
+    Reflected or rotated tensors are still positive definite, but fibres of neighbouring voxels do not line up. The
+    function therefore computes the mean angle between a principal direction and those of the two neighbours along it,
+    and compares the angle for several frames. This needs about a thousand anisotropic voxels; set the mask first.
 
-    Units are asked about where lengths are in mm, and no living tissue has the median mean diffusivity, or no scan has
-    voxels of this size.
+    If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
+    mean diffusivity occurs in living tissue.
 
     Args:
-        volume: from `read_tensors` or `fit_dwi`; of a slice, only units are asked about.
+        volume: the result of `read_tensors` or `fit_dwi`. For a slice, only the units are checked.
 
     Returns:
-        Sentences, with the remedy; none where nothing is to be asked.
+        The questions, each with a remedy; empty if no value looks wrong.
     """
     return reviewed(volume)[1]
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the volume with notes about its fibres, in place of the note of an open frame, and the questions."""
+    """Return the questions, and the volume with a note about its fibres in place of the note about its frame."""
     found = coherence(volume) if volume.length_unit == "mm" else None
     notes = [note for note in volume.notes if note != OPEN_FRAME]
     wrong_frame, settled = "", False

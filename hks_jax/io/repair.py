@@ -1,4 +1,4 @@
-"""Tensors that are not positive definite: finding, counting and, if asked, repairing them."""
+"""Find, count and repair tensors that are not positive definite."""
 
 import math
 from collections.abc import Callable
@@ -34,19 +34,19 @@ Repair = Literal["clip", "mask", "nearest"]
 REPAIRS: dict[str, str] = {
     "clip": "raise eigenvalues to a floor",
     "mask": "leave the voxels out",
-    "nearest": "take the nearest voxel's tensor",
+    "nearest": "use the tensor of the nearest valid voxel",
 }
-"""The choices, for messages."""
+"""The methods of repair, with descriptions for messages."""
 
 LISTED = 20
-"""The number of voxels that a report lists."""
+"""The largest number of voxels that a report lists."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
-"""Relative difference of tensors that are the same; relative size of tensors that are nothing; least share of them."""
+"""The tolerances for equal and for zero tensors, both relative, and the least share of voxels in the background."""
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
-    """Mark the voxels inside whose tensor is not finite and positive definite, or has an eigenvalue below `floor`."""
+    """Return the voxels inside whose tensor is not finite, not positive definite, or has an eigenvalue < `floor`."""
     if floor is not None:
         require_number("floor", floor, above=-math.inf)
     inside = volume.inside
@@ -59,12 +59,12 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
 
 
 def find_unsymmetric(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
-    """Mark the voxels inside whose matrix is unsymmetric beyond rounding, as `hks_jax.TensorField` refuses them."""
+    """Return the voxels inside whose tensor is unsymmetric beyond rounding, as `hks_jax.TensorField` defines it."""
     return volume.inside & unsymmetric(volume.tensors)
 
 
 def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
-    """Raise ValueError where tensors inside are not positive definite: how many, where the first is, the choices."""
+    """Raise ValueError if tensors inside are not positive definite, with their number, the first one and remedies."""
     bad = find_invalid(volume)
     if bad.any():
         tensors = volume.tensors[bad]
@@ -76,30 +76,31 @@ def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
         choices = ", ".join(f'"{name}" ({does})' for name, does in REPAIRS.items())
         remedy = f"Choose {argument}: {choices}"
         if bad.sum() > MANY * volume.inside.sum():
-            remedy = f"{_why_so_many(volume, tensors[finite])}. For a few exceptions c{remedy[1:]}"
+            remedy = f"{_why_so_many(volume, tensors[finite])}. If only a few tensors are invalid, c{remedy[1:]}"
         refuse("tensors", bad, volume.inside, "voxel", what, remedy)
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
-    """Return the volume with the tensors inside its mask positive definite, and a report of the changes.
+    """Return the volume with positive definite tensors inside its mask, and a report of the changes.
 
     Args:
-        volume: the tensors. Without a mask, voxels whose tensor is exactly zero are left out first: programs write the
-            background so.
-        method: what to do with tensors that are not positive definite (or have an eigenvalue below `floor`):
-            ``"clip"`` raises their eigenvalues to the floor, which gives the nearest such tensor in the Frobenius norm;
-            ``"mask"`` takes them out of the mask; ``"nearest"`` puts the tensor of the nearest valid voxel (by
-            distance in space) in their place.
-        floor: the least eigenvalue allowed, in the tensors' units. None: any positive one is allowed, and ``"clip"``
-            raises to a hundredth of the median mean eigenvalue of the valid tensors.
+        volume: the tensors. If there is no mask, voxels whose tensor is exactly zero are left out first, because many
+            programs write the background as zero.
+        method: the treatment of tensors that are not positive definite or have an eigenvalue below `floor`. ``"clip"``
+            raises their eigenvalues to the floor, which gives the nearest admissible tensor in the Frobenius norm.
+            ``"mask"`` removes their voxels from the mask. ``"nearest"`` replaces each by the tensor of the nearest
+            valid voxel in space.
+        floor: the least admissible eigenvalue, in the tensors' unit. If None, all positive eigenvalues are admissible,
+            and ``"clip"`` uses 1 % of the median, over valid tensors, of the mean eigenvalue.
 
     Returns:
-        The volume; its ``repair`` holds method, floor, how many voxels of how many, how many of them are not finite,
-        the worst eigenvalue, the box that holds them and the first indices. A note says the same in a sentence.
+        The volume. Its ``repair`` contains the method, the floor, the number of repaired voxels and of all voxels, the
+        number of tensors that are not finite, the worst eigenvalue, a bounding box and the first indices. A note
+        summarises this.
 
     Raises:
-        ValueError: an unknown method, a floor that is not positive; no valid tensor at all; NaN or infinite tensors
-            for ``"clip"``.
+        ValueError: the method is unknown, the floor is not positive, no tensor is valid, or ``"clip"`` meets NaN or
+            infinite tensors.
     """
     if method not in REPAIRS:
         raise ValueError(f"repair: got {method!r}; expected {', '.join(map(repr, REPAIRS))}")
@@ -122,21 +123,22 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     if not count:
         return replace(volume, repair=report)
     if count == of:
-        raise ValueError(f"repair: none of the {of} tensors is positive definite; check order and units")
+        raise ValueError(f"repair: none of the {of} tensors is positive definite. Check the order of components")
     if count > MANY * of:
         warn_of_accuracy(
-            f"repair: {count} of {of} tensors ({count / of:.0%}) are not as required, and the signature is to that "
-            f"part one of the repair. {_why_so_many(volume, volume.tensors[finite])}"
+            f"repair: {count} of {of} tensors ({count / of:.0%}) are not positive definite, so the signature depends "
+            f"strongly on the repair. {_why_so_many(volume, volume.tensors[finite])}"
         )
     wrong = "are not positive definite" if floor is None else f"have an eigenvalue below {floor:g}"
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
-    mask, tensors, covariance = volume.mask, volume.tensors.copy(), volume.covariance
+    mask, tensors = volume.mask, volume.tensors.copy()
+    noise: dict[str, Any] = {"covariance": volume.covariance, "modes": volume.modes}
     if method == "mask":
-        mask, done = inside & ~bad, "left out"
+        mask, done = inside & ~bad, "their voxels are left out"
     elif method == "clip":
         if report["not_finite"]:
             raise ValueError(
-                f"repair: {report['not_finite']} tensors are NaN or infinite and have no eigenvalues to clip; choose "
+                f"repair: {report['not_finite']} tensors are NaN or infinite and have no eigenvalues to clip. Choose "
                 '"mask" or "nearest"'
             )
         if floor is None:
@@ -144,59 +146,59 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             report["floor"] = floor = 0.01 * float(np.median(typical))
         tensors[bad], done = (
             _of_eigenvalues(tensors[bad], partial(np.maximum, floor)),
-            f"eigenvalues raised to {floor:.3g}",
+            f"their eigenvalues are raised to {floor:.3g}",
         )
     else:
         nearest = ndimage.distance_transform_edt(
             bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
         )
-        source, done = tuple(index[bad] for index in nearest), "replaced by the nearest valid one"
+        source, done = tuple(index[bad] for index in nearest), "they are replaced by the nearest valid tensor"
         tensors[bad] = tensors[source]
-        if covariance is not None:
-            covariance = covariance.copy()
-            covariance[bad] = covariance[source]
+        for name, known in noise.items():
+            if known is not None:
+                noise[name] = known.copy()
+                noise[name][bad] = known[source]
     notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}: {done}")
-    return replace(volume, tensors=tensors, mask=mask, covariance=covariance, repair=report, notes=notes)
+    return replace(volume, tensors=tensors, mask=mask, **noise, repair=report, notes=notes)
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
-    """Ask why more than a few tensors, whose finite ones are given, are invalid: a wrong order, or no diffusion."""
+    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` holds their finite ones."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if question or not len(finite):
-        return question or "So many are no noise: NaN is often what lies outside a mask"
+        return question or "Noise does not explain this number. Programs often write NaN outside a mask"
     largest = np.abs(np.linalg.eigvalsh(finite.astype(np.float64))).max()
     return (
-        "So many are no noise. Tensors that are indefinite by nature, such as stress, become a metric by a map of all "
-        f"of them: exp(S/s) with a scale s (eigenvalues of the invalid ones reach {largest:.3g} in size), or "
-        f"S + c·I with a shift c > {-least_eigenvalue(finite):.3g}; see positive_tensors, on the command line "
-        "--positive"
+        "Noise does not explain this number. Tensors that are naturally indefinite, such as stress S, need a map to "
+        f"positive definite ones: exp(S/s) with a scale s (|eigenvalue| ≤ {largest:.3g} for the invalid tensors), or "
+        f"S + c·I with a shift c > {-least_eigenvalue(finite):.3g}. Use positive_tensors or --positive"
     )
 
 
 def without_background(volume: TensorVolume) -> TensorVolume:
-    """Take voxels whose tensor is exactly zero, which is how programs write the background, as outside."""
+    """Return the volume with a mask that excludes zero tensors, which many programs write in the background."""
     if volume.mask is not None:
         return volume
     inside = np.any(volume.tensors != 0, axis=(-2, -1))
     if inside.all() or not inside.any():
         return volume
-    note = f"no mask: the {int((~inside).sum())} voxels whose tensor is zero count as outside"
+    note = f"no mask given: the {int((~inside).sum())} voxels with a zero tensor count as outside"
     return replace(volume, mask=inside, notes=(*volume.notes, note))
 
 
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
-    """Return the voxels that a program seems to have filled in as background, and a sentence; None if few do.
+    """Return the voxels that a program seems to have filled as background, and a sentence; None if there are few.
 
-    No measurement gives the same isotropic tensor twice, nor one that is a millionth of the others: programs such as
-    ANTs write either where there is no signal. Of a volume with a mask, and of one that is alike everywhere, None.
+    Measured tensors are never exactly equal and isotropic, nor a millionth of the others. Programs such as ANTs write
+    such tensors where there is no signal. The result is None for a volume with a mask, and for a constant field.
     """
     if volume.mask is not None:
         return None
     tensors, d = volume.tensors, volume.dimension
-    with np.errstate(invalid="ignore", over="ignore"):  # of tensors that are not finite
+    with np.errstate(invalid="ignore", over="ignore"):  # tensors may be NaN or infinite
         mean = np.trace(tensors, axis1=-2, axis2=-1, dtype=np.float64) / d
         isotropic = mean > 0
-        for i, j in product(range(d), repeat=2):  # one by one: volumes are large
+        for i, j in product(range(d), repeat=2):  # a loop saves memory
             isotropic &= np.abs(tensors[..., i, j] - (mean if i == j else 0.0)) <= _SAME * mean
     if not (mean > 0).any():
         return None
@@ -209,31 +211,31 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
         return None
     what = f"have the same isotropic tensor, {filled:.3g}·I" if found is same else "have tensors near zero"
     return found, (
-        f"no mask: {int(found.sum())} of {found.size} voxels {what}, as programs write background, and count as inside"
+        f"no mask given: {int(found.sum())} of {found.size} voxels {what}, probably background, and count as inside"
     )
 
 
 def _of_eigenvalues(
     tensors: Float[np.ndarray, "n d d"], function: Callable[[np.ndarray], np.ndarray]
 ) -> Float[np.ndarray, "n d d"]:
-    """Return the symmetric parts of tensors with a function of their eigenvalues in place of these."""
+    """Return the matrix function, given by a function of the eigenvalues, of the symmetric parts of tensors."""
     values, vectors = np.linalg.eigh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)).astype(np.float64))
     mapped = (vectors * function(values)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
     return (0.5 * (mapped + np.swapaxes(mapped, -1, -2))).astype(tensors.dtype)
 
 
 def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
-    """Return the volume with all of its tensors S mapped to positive definite ones, for tensors such as stress.
+    """Map all tensors S inside, such as stresses, to positive definite ones, and return the volume.
 
-    ``"exp"`` takes exp(S/number), ``"shift"`` takes S + number·I: the maps of `hks_jax.TensorField.from_indefinite`.
-    The result is a metric itself: go on with ``metric="tensor"``.
+    ``"exp"`` computes exp(S/number), and ``"shift"`` computes S + number·I, as `hks_jax.TensorField.from_indefinite`
+    does. The mapped tensors are a metric, so continue with ``metric="tensor"``.
 
     Returns:
-        The volume; its ``repair`` holds the map, its number, and how many tensors of how many were not positive
-        definite before. A note says the same in a sentence.
+        The volume. Its ``repair`` contains the map, its number, the number of tensors that were not positive definite,
+        and the number of all tensors. A note summarises this.
 
     Raises:
-        ValueError: an unknown map; NaN, infinite or unsymmetric tensors; a scale or shift that is too small.
+        ValueError: the map is unknown; a tensor is NaN, infinite or unsymmetric; the scale or shift is too small.
     """
     how = checked_map(how)
     check_number("tensors", how, number)
@@ -241,7 +243,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     inside, before = volume.inside, int(find_invalid(volume).sum())
     require_finite_symmetric("tensors", volume.tensors, inside, "voxel")
     check_shift("tensors", volume.tensors[inside], how, number)
-    with np.errstate(over="ignore"):  # told below
+    with np.errstate(over="ignore"):  # check_mapped reports overflow
         mapped = _of_eigenvalues(
             volume.tensors[inside], lambda values: np.exp(values / number) if how == "exp" else values + number
         )
@@ -249,15 +251,15 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     tensors = volume.tensors.copy()
     tensors[inside] = mapped
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
-    note = f"{formula} of all tensors S, {before} of {int(inside.sum())} not positive definite"
+    note = f"{formula} of all tensors S, of which {before} of {int(inside.sum())} were not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
-    return replace(volume, tensors=tensors, covariance=None, repair=report, notes=(*volume.notes, note))
+    return replace(volume, tensors=tensors, covariance=None, modes=None, repair=report, notes=(*volume.notes, note))
 
 
 def require_symmetric(volume: TensorVolume) -> None:
-    """Raise ValueError where a format that keeps one half of each tensor would lose the other."""
+    """Raise ValueError if a tensor is unsymmetric, for formats that store only one half of each tensor."""
     if unsymmetric := int(find_unsymmetric(volume).sum()):
         raise ValueError(
-            f"volume: {unsymmetric} tensors are unsymmetric, and this format keeps one half of them only. Write their "
-            "symmetric part (T + Tᵀ)/2, or an .npz or .vti"
+            f"volume: got {unsymmetric} unsymmetric tensors, but this format stores only one half of a tensor. Write "
+            "the symmetric parts (T + Tᵀ)/2, or use .npz or .vti"
         )

@@ -1,4 +1,4 @@
-"""Results: signatures and other scalar fields, which are saved, read back, drawn, explored, tabulated or fitted."""
+"""The class of results (signatures and other scalar fields), which commands save, read, draw, tabulate and fit."""
 
 import json
 import math
@@ -17,25 +17,25 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.volume import TensorVolume
-from hks_jax.npz import load_npz
+from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A signature, or another scalar field, on a volume or slice whose mask is the domain, or on a mesh.
+    """A signature or another scalar field on a mesh, or on a volume or slice whose mask is the domain.
 
     Attributes:
-        place: the volume or slice, or the mesh. Where a file has no tensors they are the identity.
+        place: the volume, slice or mesh. If a file has no tensors, they are the identity.
         values: (n_times, *shape).
-        times: (n_times,), or (0,) for a result without.
-        eigenvalues: (k,), or (0,) where they are not known.
-        report: facts about the computation; ``settings`` are those of the computation.
-        arrays: more arrays by name, which are saved with it: ``deviation``, ``bias`` and ``noise_maps`` (n_draws,
-            n_times, *shape) of error bars; ``scaled_times`` λ₁t; ``input_tensors``, where they are known.
+        times: (n_times,), or (0,) for a result without times.
+        eigenvalues: (k,), or (0,) if they are unknown.
+        report: facts about the computation; the entry ``settings`` contains its settings.
+        arrays: more named arrays, saved with the result: ``deviation``, ``bias`` and ``noise_maps`` (n_draws, n_times,
+            *shape) for error bars, the products ``scaled_times`` of λ₁ and t, and ``input_tensors`` if known.
         name: ``"hks"`` or ``"curvature"``.
-        source: the file that it was read from.
+        source: the file from which the result was read.
     """
 
     place: TensorVolume | SimplicialMesh
@@ -49,16 +49,16 @@ class Result:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], name: str | None = None, over_times: bool = False) -> "Result":
-        """Read a result that `save` or the command line wrote as npz.
+        """Read a result from an npz that `save` or the command line wrote.
 
         Args:
             path: the file, or the folder of a signature.
-            name: the array; None: ``hks``, else ``curvature``.
-            over_times: whether it must be a signature over times.
+            name: the name of the array. None means ``hks`` or, if the file has no such array, ``curvature``.
+            over_times: whether the result must have an axis of times.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: no npz; arrays that are missing or of shapes that disagree.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is not an npz, arrays are missing, or their shapes disagree.
         """
         path = signature_file(Path(path))
         arrays = load_npz(path)
@@ -67,8 +67,8 @@ class Result:
         needed = (name, *["times"] * over_times, *(() if on_mesh else ("spacing", "origin")))
         if lacking := [n for n in needed if n not in arrays]:
             raise ValueError(
-                f"{path}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {', '.join(needed)}, as "
-                f"'hks-jax hks' and 'hks-jax curvature' write them. Add {', '.join(lacking)}"
+                f"{path}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected {', '.join(needed)}, as in "
+                f"files of 'hks-jax hks' and 'hks-jax curvature'. Add {', '.join(lacking)}"
             )
         values, d = np.asarray(arrays[name]), 1 if on_mesh else np.size(arrays["spacing"])
         over_times = over_times or values.ndim > d
@@ -76,8 +76,8 @@ class Result:
         numbers = values.dtype.kind in "fiu" and (on_mesh or d in (2, 3)) and values.ndim - d == over_times
         if not numbers or (over_times and times.shape != values.shape[:1]):
             raise ValueError(
-                f"{path}: got {name} of shape {values.shape}, dtype {values.dtype}, times of shape {times.shape} for "
-                f"{d} axes; expected real numbers, one per node, or (n_times, *shape) with (n_times,)"
+                f"{path}: got {name} of shape {values.shape} and dtype {values.dtype}, times of shape {times.shape}; "
+                f"expected real numbers (*shape,) or (n_times, *shape), where *shape has {d} axes, and times (n_times,)"
             )
         record = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
         values = values.reshape(-1, *values.shape[values.ndim - d :]).astype(np.float64)
@@ -101,15 +101,15 @@ class Result:
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:
-        """Write it as `stem` with ``.npz`` after it and, unless that is empty, with the suffix of an image or a mesh.
+        """Write the result as an npz and, if `image` is not empty, also as an image or a mesh.
 
-        The npz also has the times, the eigenvalues, the tensors, and all other arrays. Where the tensors
-        are of single precision the values are, too: more digits mean nothing and take room.
+        The npz contains the times, the eigenvalues, the tensors and all other arrays. If the tensors are in single
+        precision, so are the written values, because further digits are not significant.
 
         Args:
-            stem: the files' path without a suffix.
-            image: the suffix; see `hks_jax.io.save`.
-            origin: more entries of the files' provenance, beside the settings and the times.
+            stem: the path of the files without suffix.
+            image: the suffix of the image or mesh; see `hks_jax.io.save`.
+            origin: more entries of the files' provenance, in addition to the settings and the times.
         """
         single = isinstance(self.place, TensorVolume) and self.place.tensors.dtype == np.float32
         values = self.values.astype(np.float32) if single else self.values
@@ -125,25 +125,25 @@ class Result:
 
     @property
     def volume(self) -> TensorVolume:
-        """The volume or slice that it is on; raises ValueError where it is on a mesh."""
+        """The volume or slice of the result; raises ValueError for a mesh."""
         if not isinstance(self.place, TensorVolume):
-            raise ValueError(f"{self.source}: is on a mesh; expected a grid of voxels")
+            raise ValueError(f"{self.source}: got a result on a mesh; expected a result on a grid of voxels")
         return self.place
 
     @property
     def grid(self) -> Grid:
-        """The grid, whose mask is the domain."""
+        """The grid of the result, whose mask is the domain."""
         return self.volume.grid("all")
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """The settings of the computation; empty where the file does not say them."""
+        """The settings of the computation; empty if the file does not contain them."""
         settings: Mapping[str, Any] = self.report["settings"]
         return settings
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """By how many standard deviations the signature differs from that of flat space, or from its median."""
+        """The difference from flat space or, for other normalisations, from the median, in standard deviations."""
         if "deviation" not in self.arrays:
             return None
         ones, normalisation = (-1, *[1] * (self.values.ndim - 1)), self.settings["normalisation"]
@@ -155,18 +155,18 @@ class Result:
 
     @property
     def unit(self) -> str:
-        """The unit of t: fitted tensors are in mm²/s, and their grids in mm. Else it is not known."""
+        """The unit of t: seconds for tensors from `fit_dwi`, whose units are mm²/s and mm; otherwise empty."""
         fitted = isinstance(self.place, TensorVolume) and self.place.order == "fit"
         return "s" if fitted and self.settings.get("metric") == "inverse" else ""
 
 
 def signature_file(result: Path) -> Path:
-    """Return the file of the signature in a folder that ``hks-jax hks`` has written; a file is its own."""
+    """Return the signature's file in a folder that ``hks-jax hks`` wrote; return any other path unchanged."""
     return result / "hks.npz" if result.is_dir() else result
 
 
 def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
-    """Return the boundary that settings read from JSON name, if they do: its lists are tuples."""
+    """Return the boundary in settings from JSON, with tuples in place of lists, or None."""
 
     def tuples(value: Any) -> Any:
         return tuple(map(tuples, value)) if isinstance(value, list) else value
@@ -176,7 +176,7 @@ def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold: no NaN or infinity, no tuples, paths or NumPy scalars."""
+    """Return a value with None for NaN and infinity, and without tuples, paths or NumPy scalars, for JSON."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

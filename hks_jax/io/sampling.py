@@ -1,4 +1,4 @@
-"""Tensors of a volume at points in space, such as the vertices of a cortex."""
+"""Interpolate the tensors of a volume at points in space, such as the vertices of a cortical surface."""
 
 from typing import Any
 
@@ -14,19 +14,19 @@ from hks_jax.io.volume import TensorVolume
 def sample_tensors(volume: TensorVolume, points: Any) -> Float[np.ndarray, "n 3 3"]:
     """Return the tensors of a volume at points in space, with components along the axes of space.
 
-    So ``SurfaceMesh.from_tensors(mesh.vertices, mesh.faces, sample_tensors(volume, mesh.vertices), "inverse")`` is the
-    metric of a surface in a volume, with ``mesh = read_mesh(path, in_space=True)``. Components are interpolated
-    linearly between the centres of the voxels inside the mask; those outside have no weight.
+    With ``mesh = read_mesh(path, in_space=True)``, ``SurfaceMesh.from_tensors(mesh.vertices, mesh.faces,
+    sample_tensors(volume, mesh.vertices), "inverse")`` gives a surface the metric of the volume. Components are
+    interpolated linearly between centres of voxels inside the mask. Voxels outside have no weight.
 
     Args:
-        volume: of three dimensions, with an affine.
-        points: (n, 3) in the coordinates that the affine maps voxels to, those of the scanner in mm.
+        volume: a three-dimensional volume with an affine.
+        points: (n, 3), in the coordinates to which the affine maps voxel indices, which are scanner coordinates in mm.
 
     Raises:
-        ValueError: a slice, or a volume without an affine; points around which no voxel is inside the mask.
+        ValueError: the volume is a slice or has no affine, or no voxel around a point is inside the mask.
     """
     if volume.affine is None or volume.dimension != 3:
-        raise ValueError("volume: got a slice, or one without an affine; expected a volume that has a place in space")
+        raise ValueError("volume: got a slice, or a volume without an affine; expected a volume with an affine")
     require_real("points", points)
     places = np.asarray(points, np.float64)
     if places.ndim != 2 or places.shape[1] != 3:
@@ -46,9 +46,9 @@ def sample_tensors(volume: TensorVolume, points: Any) -> Float[np.ndarray, "n 3 
             for low, high in [(x.min(axis=0), x.max(axis=0))]
         ]
         raise ValueError(
-            f"points: {int(lost.sum())} of {len(places)} have no voxel inside the mask around them (the first is point "
-            f"{int(np.argmax(lost))}); they span {ends[0]}, the mask {ends[1]}, in mm. Read surfaces with "
-            "in_space=True; take a larger mask, or leave these points out"
+            f"points: got {int(lost.sum())} of {len(places)} points without a voxel inside the mask around them (the "
+            f"first is point {int(np.argmax(lost))}). The points span {ends[0]} and the mask spans {ends[1]}, in mm. "
+            "Read surfaces with in_space=True, use a larger mask, or leave these points out"
         )
     sampled = np.zeros((len(places), 3, 3))
     for i, j in zip(*np.triu_indices(3), strict=True):

@@ -1,4 +1,4 @@
-"""Tables of tab-separated values as BIDS has them: a header, n/a for what is missing, JSON about the columns."""
+"""Read and write tables as BIDS defines them: tab-separated, n/a for missing values, columns described in JSON."""
 
 import csv
 import json
@@ -7,8 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hks_jax.atomic import atomic_path
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, reading
 
 MISSING = "n/a"
 
@@ -16,9 +15,9 @@ MISSING = "n/a"
 def write_table(
     path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]], about: Mapping[str, Any] | None = None
 ) -> list[Path]:
-    """Write a table, and beside it, where there is something to say about it, a JSON file; return their paths.
+    """Write a table and, if `about` is given, a JSON file beside it; return the paths.
 
-    Both appear whole or not at all, the JSON file last: where it is there, the table is.
+    Both files are written atomically, the JSON file last, so its existence implies that of the table.
     """
     written = [path]
     with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as stream:
@@ -30,21 +29,21 @@ def write_table(
 
 
 def cell(value: Any) -> str:
-    """Return a value as text without tabs or line ends: numbers to nine digits, ``n/a`` for None, NaN and nothing."""
+    """Return a value as one line without tabs: nine digits of a number, ``n/a`` for None, NaN, infinity and ``""``."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return MISSING
     return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split()) or MISSING
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> Path:
-    """Write a JSON file, whole or not at all."""
+    """Write a JSON file atomically and return its path."""
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return path
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; an empty one if there is no such file, or it holds something else."""
+    """Return the object in a JSON file; an empty one if the file is missing, invalid or contains no object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -53,9 +52,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a table with a header, tab-separated, or separated by commas if its name ends in ``.csv``.
+    """Return the rows of a table with a header; commas separate the cells of a ``.csv`` file, tabs those of any other.
 
-    Cells that are empty or ``n/a`` are left out, and rows of nothing else.
+    Empty rows are left out, and so are cells that are empty or ``n/a``.
     """
     file = existing(path)
     separator = "," if file.name.lower().endswith(".csv") else "\t"
@@ -66,9 +65,9 @@ def read_table(path: Path) -> list[dict[str, str]]:
     if not rows or not all(header) or len(set(header)) < len(header):
         raise ValueError(
             f"{file}: got the columns {', '.join(header) or 'none'} and {len(rows)} rows; expected a header of "
-            f"different names, separated by {'commas' if separator == ',' else 'tabs'}, and rows below it"
+            f"different names, separated by {'commas' if separator == ',' else 'tabs'}, and at least one row"
         )
     for number, row in enumerate(rows, 2):
         if len(row) > len(header):
-            raise ValueError(f"{file}: row {number} has {len(row)} cells; expected {len(header)}, as the header")
+            raise ValueError(f"{file}: got {len(row)} cells in row {number}; expected {len(header)}, as in the header")
     return [{k: v for k, v in zip(header, row, strict=False) if v and v.lower() != MISSING} for row in rows]

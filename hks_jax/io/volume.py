@@ -1,4 +1,4 @@
-"""A field of diffusion tensors as it came from a file: NumPy arrays, where they lie in space, where they came from."""
+"""The class of tensor fields from files, with their position in space and their origin, and the class of formats."""
 
 import hashlib
 import json
@@ -16,34 +16,35 @@ from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
 from hks_jax.domain.grid import Grid
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
+from hks_jax.uncertainty.noise import TensorNoise
 
 AXES = "xyz"
 
 
 @dataclass(frozen=True)
 class Format:
-    """A file format of images on grids. A new one is a module with a `Format`, which `hks_jax.io.formats` lists."""
+    """A file format of images on grids. `hks_jax.io.formats` lists all formats; a new format is a new module."""
 
-    names: tuple[str, ...]  # how the names of its files end
-    read_tensors: Callable[..., "TensorVolume"]  # of a name, the order and the frame asked for, and the `options`
-    options: tuple[str, ...] = ()  # what of the arguments of `hks_jax.io.read_tensors` it takes
-    # Masks, labels: of a path, and the affine of the image beside which it belongs, to values and their own affine.
+    names: tuple[str, ...]  # the suffixes of its files
+    read_tensors: Callable[..., "TensorVolume"]  # called with a name, the order, the frame and the `options`
+    options: tuple[str, ...] = ()  # further arguments of `hks_jax.io.read_tensors` that the format accepts
+    # Reads masks and labels: from a path and the affine of the related image, it returns values and their own affine.
     read_image: Callable[..., tuple[np.ndarray, np.ndarray | None]] | None = None
-    written: tuple[str, ...] = ()  # which of the names it writes
-    # Results: of a path, an array, the volume, the array's name, more arrays, and the provenance.
+    written: tuple[str, ...] = ()  # the suffixes that can be written
+    # Writes results; called with a path, an array, the volume, the array's name, more arrays and the provenance.
     write: Callable[[Path, np.ndarray, "TensorVolume", str, dict[str, Any], str], None] | None = None
     write_tensors: Callable[[Path, "TensorVolume", Mapping[str, Any] | None], None] | None = None
-    image: str = ""  # the suffix of results beside tensors in this format; empty where an npz is enough
+    image: str = ""  # the suffix of result images for tensors in this format; empty if only an npz is written
 
 
 @dataclass(frozen=True, eq=False)
 class TensorVolume:
-    """Tensors on a regular grid of voxels, along the voxel axes.
+    """Tensors on a regular grid of voxels, with components along the voxel axes.
 
     Attributes:
-        tensors: (*shape, d, d); values outside the mask mean nothing.
-        spacing: distance between voxels per axis.
-        origin: coordinates of voxel (0, …, 0) on the grid (the affine places it in space).
+        tensors: (*shape, d, d); values outside the mask are ignored.
+        spacing: the distance between voxels along each axis.
+        origin: the coordinates of voxel (0, …, 0) on the grid; the affine gives its position in space.
         mask: bool (*shape), or None for all voxels.
         affine: (4, 4) voxel indices to world coordinates, or None; for a slice, those of a volume one voxel thick.
         slice_axis: for a slice, the axis of the volume that it cuts; None for a volume.
@@ -59,9 +60,11 @@ class TensorVolume:
         unit: ``"mm²/s"`` where the tensors' unit is known, because it was told, or they were fitted; else empty.
         covariance: (*shape, m, m) of the components xx xy yy (xz yz zz) along the voxel axes, in the squared unit of
             the tensors, where it is known (`fit_dwi`); else None.
+        modes: (*shape, n, m), the part of each of the n images in the noise of these components, where residuals tell
+            it (`fit_dwi`, in float32); else None. What voxels share of an image's noise is in them.
 
     Raises:
-        ValueError: shapes that do not agree; spacings that are not positive, numbers that are not finite.
+        ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
     """
 
     tensors: Float[np.ndarray, "*shape d d"]
@@ -80,6 +83,7 @@ class TensorVolume:
     length_unit: str = ""
     unit: str = ""
     covariance: Float[np.ndarray, "*shape m m"] | None = None
+    modes: Float[np.ndarray, "*shape n m"] | None = None
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
@@ -103,7 +107,7 @@ class TensorVolume:
             raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected (*shape, m, m), m = d(d+1)/2")
 
     def __repr__(self) -> str:
-        """Return one line without the arrays."""
+        """Return a summary in one line, without the arrays."""
         inside = "" if self.mask is None else f", mask={int(self.mask.sum())} of {self.mask.size} voxels"
         cut = "" if self.slice_axis is None else f", slice_axis={self.slice_axis}"
         return (
@@ -123,11 +127,11 @@ class TensorVolume:
 
     @property
     def inside(self) -> Bool[np.ndarray, "*shape"]:
-        """The mask, or True everywhere."""
+        """The mask, or True everywhere if there is no mask."""
         return np.ones(self.shape, bool) if self.mask is None else self.mask
 
     def grid(self, components: Literal["raise", "largest", "all"] = "raise") -> Grid:
-        """Return the grid of the voxel centres, with the mask. See `hks_jax.Grid` for `components`."""
+        """Return the grid of voxel centres with the mask. See `hks_jax.Grid` for `components`."""
         return Grid(self.shape, self.spacing, self.origin, self.mask, components)
 
     def with_mask(self, mask: Bool[np.ndarray, "*shape"] | None) -> "TensorVolume":
@@ -135,18 +139,18 @@ class TensorVolume:
         return replace(self, mask=mask)
 
     def slice(self, axis: int | str, index: int) -> "TensorVolume":
-        """Return the slice at one index of an axis (0, 1, 2 or ``"x"``, ``"y"``, ``"z"``): a two-dimensional volume.
+        """Return the slice at an index along an axis (0, 1, 2 or ``"x"``, ``"y"``, ``"z"``) as a volume with d = 2.
 
-        The slice carries the in-plane 2×2 block of each tensor. For diffusion tensors this means diffusion confined to
-        the slice, with the in-plane diffusivities that were measured, and the metric is chosen from that block:
-        g = (block of D)⁻¹. The other reading, the block of D⁻¹, is the metric that the slice inherits as a surface in
-        the volume; the two differ wherever a principal axis is oblique to the slice.
+        The slice has the in-plane 2×2 block of each tensor. For a diffusion tensor D this describes diffusion confined
+        to the slice with the measured in-plane diffusivities, and gives the metric g = (block of D)⁻¹. The block of D⁻¹
+        would instead be the metric induced on the slice as a surface in the volume. The two metrics differ if a
+        principal axis is oblique to the slice.
 
         Raises:
-            ValueError: a volume that is a slice already; an axis or index out of range; a mask empty in this slice.
+            ValueError: the volume is a slice, the axis or index is out of range, or the mask is empty in this slice.
         """
         if self.dimension != 3:
-            raise ValueError("slice: this is a slice already (two axes); only volumes can be sliced")
+            raise ValueError("slice: got a slice; expected a volume with three axes")
         a = AXES.find(axis) if isinstance(axis, str) and len(axis) == 1 else axis
         if a not in (0, 1, 2):
             raise ValueError(f'axis: got {axis!r}; expected 0, 1, 2 or "x", "y", "z"')
@@ -158,13 +162,15 @@ class TensorVolume:
             if not mask.any():
                 filled = np.flatnonzero(self.mask.any(axis=tuple(b for b in range(3) if b != a)))
                 where = f"{AXES[a]} = {filled[0]} … {filled[-1]}" if filled.size else "no slice at all"
-                raise ValueError(f"mask: empty in slice {AXES[a]} = {index}; it has voxels inside at {where}")
+                raise ValueError(f"mask: got no voxels in slice {AXES[a]} = {index}; the mask has voxels at {where}")
         keep = [b for b in range(3) if b != a]
-        affine = covariance = None
+        affine = covariance = modes = None
+        rows, columns = np.tril_indices(3)
+        within = np.flatnonzero((rows != a) & (columns != a))
         if self.covariance is not None:
-            rows, columns = np.tril_indices(3)
-            within = np.flatnonzero((rows != a) & (columns != a))
             covariance = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
+        if self.modes is not None:
+            modes = np.take(self.modes, index, axis=a)[..., within]
         if self.affine is not None:
             affine = self.affine.copy()
             affine[:3, 3] += index * affine[:3, a]
@@ -177,12 +183,28 @@ class TensorVolume:
             affine=affine,
             slice_axis=a,
             covariance=covariance,
+            modes=modes,
             notes=(*self.notes, f"slice {AXES[a]} = {index}: the in-plane block of each tensor"),
         )
 
+    def noise(self, grid: Grid) -> TensorNoise:
+        """Return the noise that the fit of the tensors has told (`fit_dwi`): of images, if residuals have.
+
+        Raises:
+            ValueError: nothing is known of it.
+        """
+        if self.modes is not None:
+            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # of a fit, a signal without weighting included
+        if self.covariance is None:
+            raise ValueError(
+                "noise: nothing is known of it; fit the tensors by `fit_dwi` with noise=, or state it by "
+                "`TensorNoise.relative`"
+            )
+        return TensorNoise(self.covariance, grid)
+
     @property
     def volume_affine(self) -> Float[np.ndarray, "4 4"]:
-        """The affine, or where there is none the one that spacing and origin make."""
+        """The affine; if it is None, the affine with the volume's spacing and origin."""
         if self.affine is not None:
             return self.affine
         affine = np.eye(4)
@@ -193,15 +215,15 @@ class TensorVolume:
 
     @property
     def thin_axis(self) -> int:
-        """For a slice, the axis along which it is one voxel thick as a volume: z unless it was cut otherwise."""
+        """The axis along which a slice is one voxel thick when it is written as a volume; z by default."""
         return 2 if self.slice_axis is None else self.slice_axis
 
 
 def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 4"], **known: Any) -> TensorVolume:
-    """Return the tensors of a file whose voxels an affine places, taken from the axes of `frame` to the voxels'."""
+    """Return a volume with an affine, after transforming the tensors from the axes of `frame` to the voxel axes."""
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not (np.isfinite(affine).all() and spacing.min() > 0):
-        raise ValueError(f"{name}: the affine is singular or not finite; expected one that places the voxels in space")
+        raise ValueError(f"{name}: got an affine that is singular or not finite; expected an invertible affine")
     return TensorVolume(
         np.ascontiguousarray(to_voxel_axes(found.tensors, frame, affine)),
         tuple(spacing.tolist()),
@@ -217,12 +239,12 @@ def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 
 
 
 def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
-    """Return the indices of the voxels at the corners of a volume, with a 1 behind each, which affines map."""
+    """Return the indices of the voxels at the corners of a volume as homogeneous coordinates."""
     return np.stack(np.meshgrid(*((0, n - 1) for n in shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
 
 
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
-    """Return scalars (*shape,) or (n_times, *shape) as image files have them: slices one voxel thick, times last."""
+    """Return scalars (*shape,) or (n_times, *shape) for image files, with slices one voxel thick and times last."""
     n = array.ndim - volume.dimension
     if volume.dimension == 2:
         array = np.expand_dims(array, n + volume.thin_axis)
@@ -234,7 +256,7 @@ def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
     array = np.asarray(values)
     require_real(name, array)
     if array.dtype != bool and not np.isin(array, (0, 1)).all():
-        raise ValueError(f"{name}: got mask values other than 0 and 1; threshold it first, for example mask > 0.5")
+        raise ValueError(f"{name}: got mask values other than 0 and 1. Threshold the mask, for example mask > 0.5")
     return array.astype(bool)
 
 
@@ -245,25 +267,25 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str:
-    """Return one line of JSON: the version, the tensors' file, the reader's decisions, and `more`."""
+    """Return a record in one line of JSON: the version, the tensors' file, the reader's notes, and `more`."""
     record: dict[str, Any] = {"software": f"hks-jax {__version__}"}
     if volume is not None:
         record |= {"source": volume.source, "sha256": volume.digest, "order": volume.order, "frame": volume.frame}
         record |= {"notes": list(volume.notes)}
     return json.dumps(
         {**record, **(more or {})}, default=lambda value: value.tolist() if hasattr(value, "tolist") else str(value)
-    )  # in ASCII, which NRRD's header needs
+    )  # NRRD's header requires ASCII
 
 
 def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:
-    """Return the same of tensors that are written, with their order, frame, axes and units in the new file."""
+    """Return the record of written tensors, with their order, frame, axes and units in the new file."""
     stored = {"order": order, "frame": frame, "source_order": volume.order, "source_frame": volume.frame}
     stored |= {"axes": volume.volume_affine[:3, :3].tolist(), "length_unit": volume.length_unit, "unit": volume.unit}
     return describe(volume, {**stored, **(more or {})})
 
 
 def own_record(text: str | bytes) -> dict[str, Any]:
-    """Return what `describe_tensors` wrote; empty where the text is anything else."""
+    """Return the record that `describe_tensors` wrote, or an empty one for any other text."""
     try:
         record = json.loads(text.rstrip(b"\0") if isinstance(text, bytes) else text)
     except ValueError:

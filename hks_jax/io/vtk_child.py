@@ -1,7 +1,7 @@
-"""Reads a file of VTK's, as a script in a process of its own: ``vtk_child.py FILE ARRAYS.npz BYTES``.
+"""Read a VTK file in a separate process, as the script ``vtk_child.py FILE ARRAYS.npz BYTES``.
 
-VTK follows damaged files into memory that is not its own, and ends the process where it cannot allocate the memory
-that they declare. The script imports nothing of this package, which would take longer than the reading.
+For a damaged file, VTK may access invalid memory, or end the process if it cannot allocate the declared memory. The
+script does not import this package, because the import would take longer than the reading.
 """
 
 import contextlib
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def image(data: Any) -> dict[str, Any]:
-    """Return where image data lie."""
+    """Return the extent, spacing, origin and directions of image data."""
     matrix = data.GetDirectionMatrix()
     direction = [[matrix.GetElement(i, j) for j in range(3)] for i in range(3)]
     place = {"extent": data.GetExtent(), "spacing": data.GetSpacing(), "origin": data.GetOrigin()}
@@ -21,7 +21,7 @@ def image(data: Any) -> dict[str, Any]:
 
 
 def surface(data: Any) -> dict[str, Any]:
-    """Return the points of polygonal data, and their polygons and strips cut into triangles."""
+    """Return the points of polygonal data, and the triangles of their polygons and strips."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkTriangleFilter
 
@@ -30,30 +30,30 @@ def surface(data: Any) -> dict[str, Any]:
             np.asarray(vtk_to_numpy(array), np.int64)
             for array in (cells.GetConnectivityArray(), cells.GetOffsetsArray())
         )
-        # The filter reads at any index without checking it.
+        # vtkTriangleFilter does not check indices.
         if corners.size and not 0 <= corners.min() <= corners.max() < data.GetNumberOfPoints():
-            raise ValueError(f"a polygon has the corner {corners.max()} of {data.GetNumberOfPoints()} points")
+            raise ValueError(f"a polygon refers to point {corners.max()}; expected 0 … {data.GetNumberOfPoints() - 1}")
         if ends.size and (ends[0] != 0 or ends[-1] != corners.size or (np.diff(ends) < 3).any()):
-            raise ValueError("the polygons' offsets do not ascend from none to all corners, three or more each")
+            raise ValueError("got offsets of polygons that do not ascend from 0 to all corners by steps of 3 or more")
     cut = vtkTriangleFilter()
     cut.PassLinesOff()
     cut.PassVertsOff()
     cut.SetInputData(data)
     cut.Update()
     if not cut.GetOutput().GetNumberOfPolys():
-        raise ValueError("it has no triangles")
+        raise ValueError("the file has no triangles")
     faces = vtk_to_numpy(cut.GetOutput().GetPolys().GetConnectivityArray()).reshape(-1, 3)
     return {"points": vtk_to_numpy(cut.GetOutput().GetPoints().GetData()), "faces": faces}
 
 
 def main(path: str, output: str, room: str) -> None:
-    """Write the content of a file as an npz, using at most `room` bytes of memory."""
+    """Write the content of a file to an npz, using at most `room` bytes of memory."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
     from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
     from vtkmodules.vtkIOXML import vtkXMLGenericDataObjectReader
 
-    with contextlib.suppress(ImportError):  # Windows has no limits
+    with contextlib.suppress(ImportError):  # Windows has no such limits
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (int(room), int(room)))
@@ -65,7 +65,7 @@ def main(path: str, output: str, room: str) -> None:
     data = reader.GetOutput()
     if messages.GetOutput().strip() or data is None:
         said = re.findall(r"\(0x[0-9a-f]+\): (.*)", messages.GetOutput())
-        raise ValueError(said[0] if said else "VTK finds nothing in it")
+        raise ValueError(said[0] if said else "VTK finds no data in the file")
     content = image(data) if data.IsA("vtkImageData") else surface(data) if data.IsA("vtkPolyData") else {}
     for place, attributes in (("point", data.GetPointData()), ("cell", data.GetCellData())):
         for array in map(attributes.GetArray, range(attributes.GetNumberOfArrays())):

@@ -1,4 +1,4 @@
-"""VTK's image data (.vti, and structured points in .vtk) through VTK, which is optional."""
+"""Read and write image data (.vti, and structured points in .vtk) through the optional library VTK."""
 
 import math
 import os
@@ -14,28 +14,26 @@ from urllib.parse import quote
 
 import numpy as np
 
-from hks_jax.atomic import atomic_path
 from hks_jax.io.tensor_order import matrices, nearest_rotation
 from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors, placed
-from hks_jax.npz import load_npz
 from hks_jax.optional import optional
-from hks_jax.reading import existing, reading
+from hks_jax.storage import atomic_path, existing, load_npz, reading
 
 _ROOM, _RATIO = 8 << 30, 200
-"""Bytes of memory that VTK may take in reading a file, and how many more for each byte of the file."""
+"""The limit of memory for reading a file, in bytes, and its increase per byte of the file."""
 _PATIENCE, _SPEED = 60.0, 1e6
-"""Seconds that it may take, and bytes a second beyond them."""
+"""The limit of time for reading a file, in seconds, and the bytes of the file that add one second."""
 
 
 def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
-    """Tell whether a legacy .vtk file holds a dataset of this kind, such as STRUCTURED_POINTS."""
+    """Return whether a legacy .vtk file holds a dataset of a kind such as STRUCTURED_POINTS."""
     with open(path, "rb") as stream:
         head = stream.read(1024)
     return head.startswith(b"# vtk DataFile") and kind.encode() in head.upper()
 
 
 def load(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays that `vtk_child` finds in a file, in a process of its own."""
+    """Return the arrays that the script `vtk_child` reads from a file in a separate process."""
     size = existing(path).stat().st_size
     with tempfile.TemporaryDirectory() as folder:
         arrays = Path(folder) / "arrays.npz"
@@ -51,7 +49,7 @@ def load(path: Path) -> dict[str, np.ndarray]:
             return load_npz(arrays)
     optional("vtkmodules.vtkIOXML")
     said = child.stderr.decode(errors="replace").splitlines()
-    raise ValueError(said[-1] if said and child.returncode > 0 else f"VTK died over it: {child.returncode}")
+    raise ValueError(said[-1] if said and child.returncode > 0 else f"VTK crashed with status {child.returncode}")
 
 
 def read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
@@ -64,9 +62,9 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
             _check_pieces(content)
         image = load(file)
         if "extent" not in image:
-            raise ValueError(f"it holds {image['kind']}, and neither image data nor structured points")
+            raise ValueError(f"got {image['kind']}; expected image data or structured points")
         if np.abs(image["direction"].T @ image["direction"] - np.eye(3)).max() > 1e-3:
-            raise ValueError(f"Direction: {image['direction'].tolist()}; expected orthogonal columns of length one")
+            raise ValueError(f"Direction: got {image['direction'].tolist()}; expected orthonormal columns")
     place = "point" if _tensors_at(image, "point", array) or not _tensors_at(image, "cell", array) else "cell"
     chosen, declared = _tensor_array(name, image, place, array)
     components = image[f"{place}:{chosen}"]
@@ -76,9 +74,9 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     found = matrices(name, components, order, "vtk" if declared else "")
     lower, upper = image["extent"].reshape(3, 2).T
     thick = upper > lower
-    of_cells = thick & (place == "cell")  # a cell's value is at its centre
+    of_cells = thick & (place == "cell")  # values of cells belong to their centres
     shape = tuple((upper - lower + np.where(of_cells, 0, 1)).tolist())
-    steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # an axis without thickness has 0
+    steps = np.where((image["spacing"] == 0) & ~thick, 1.0, image["spacing"])  # a flat image may have spacing 0
     affine = np.eye(4)
     affine[:3, :3] = image["direction"] * steps
     affine[:3, 3] = image["origin"] + affine[:3, :3] @ (lower + np.where(of_cells, 0.5, 0.0))
@@ -92,12 +90,12 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
 
 
 def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars as arrays of points, one per time; see `hks_jax.io.save`."""
+    """Write scalars as point data, one array per time; see `hks_jax.io.save`."""
     _write(path, by_time(name, array, array.ndim - volume.dimension, extra), volume, record, extra)
 
 
 def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
-    """Write tensors, along the axes of space; those of a slice with zeros out of its plane."""
+    """Write tensors along the axes of space; for a slice, the components across its plane are zero."""
     tensors = volume.tensors
     if volume.dimension == 2:
         tensors = np.insert(np.insert(tensors, volume.thin_axis, 0, axis=-1), volume.thin_axis, 0, axis=-2)
@@ -107,7 +105,7 @@ def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return one array per time, where `n` is 1, by names that say which."""
+    """Return `array` under its name if n = 0, or one array per time under names with the time if n = 1."""
     if n == 0:
         return {name: array}
     times = np.ravel(extra.get("times", ()))
@@ -116,7 +114,7 @@ def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> d
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, record: str, more: dict[str, Any]) -> None:
-    """Write arrays of points, (*shape, 3, 3) as tensors, the mask, and `more` and the provenance as field data."""
+    """Write point data, with (*shape, 3, 3) as tensors, and the mask; write `more` and the record as field data."""
     optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -154,11 +152,11 @@ def _write(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, reco
         writer.SetFileName(str(temporary))
         writer.SetInputData(image)
         if not writer.Write():
-            raise OSError(f"{path}: VTK could not write it")
+            raise OSError(f"{path}: VTK could not write the file")
 
 
 def _check_pieces(content: bytes) -> None:
-    """Raise ValueError unless the pieces of an image fill its whole extent: VTK makes up values for missing pieces."""
+    """Raise ValueError unless the pieces of an image fill its whole extent; VTK would invent the missing values."""
     head = content.partition(b"<AppendedData")[0]
 
     def cells(extent: bytes) -> int:
@@ -171,43 +169,43 @@ def _check_pieces(content: bytes) -> None:
         for name in (b"WholeExtent", b"Extent")
     )
     if whole != there:
-        raise ValueError(f"its pieces have {there} cells; expected the {whole} of the whole extent")
+        raise ValueError(f"got pieces with {there} cells; expected the {whole} cells of the whole extent")
 
 
 def _check_range(content: bytes, array: str, values: np.ndarray) -> None:
-    """Raise ValueError unless an array's rows have lengths in the range that its file gives, where it gives one."""
+    """Raise ValueError if the norms of an array's rows contradict the range that the file declares, if it does."""
     tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
     told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
-    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # which do not count
+    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # the range omits ghosts
         return
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(values, axis=-1)
     if not any(np.allclose([each.min(), each.max()], told, rtol=1e-4) for each in (lengths, values)):
         raise ValueError(
-            f"array {array!r} has rows of lengths {lengths.min():.4g} to {lengths.max():.4g}, and its file says "
-            f"{told[0]:.4g} to {told[1]:.4g}"
+            f"array {array!r} has rows with norms from {lengths.min():.4g} to {lengths.max():.4g}; expected "
+            f"{told[0]:.4g} to {told[1]:.4g}, as the file declares"
         )
 
 
 def _check_length(content: bytes, array: str, values: np.ndarray) -> None:
-    """Raise ValueError where a legacy file ends before an array does, which VTK hardly notices."""
+    """Raise ValueError if a legacy file ends before the end of an array, which VTK may not detect."""
     key = re.escape(quote(array).encode())
     line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
     if line is None:
-        return  # a name that is written otherwise: nothing to measure from
+        return  # the array's start is not found, because its name is written differently
     rest, text = content[line.end() :], b"ASCII" in content.split(maxsplit=40)[:40]
     if len(rest.split(maxsplit=values.size)) < values.size if text else len(rest) < values.nbytes:
-        raise ValueError(f"it ends before the {values.size} values of {array!r} do")
+        raise ValueError(f"the file ends before the end of the array {array!r}; expected {values.size} values")
 
 
 def _tensors_at(image: Mapping[str, np.ndarray], place: str, name: str | None) -> list[str]:
-    """Return the names of the arrays that may be tensors."""
+    """Return the names of the arrays with 6 or 9 components per row, only `name` unless it is None."""
     keys = [key for key, a in image.items() if key.startswith(f"{place}:") and a.ndim == 2 and a.shape[1] in (6, 9)]
     return [key.partition(":")[2] for key in keys if name in (None, key.partition(":")[2])]
 
 
 def _tensor_array(name: str, image: Mapping[str, np.ndarray], place: str, wanted: str | None) -> tuple[str, bool]:
-    """Return the name of the array of tensors, and whether the file declares it as such."""
+    """Return the name of the array of tensors, and whether the file declares that array as tensors."""
     declared = str(image.get(f"{place}s declared", ""))
     candidates = _tensors_at(image, place, wanted or declared or None)
     if len(candidates) != 1:
@@ -215,25 +213,25 @@ def _tensor_array(name: str, image: Mapping[str, np.ndarray], place: str, wanted
         listed = ", ".join(f"{key!r} ({n[0] if n else 1})" for key, n in had.items()) or "none"
         asked = "" if wanted is None else f" named {wanted!r}"
         raise ValueError(
-            f"{name}: expected one array of 6 or 9 components{asked}; it has (with components) {listed}. Pass array"
+            f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass array"
         )
     return candidates[0], candidates[0] == declared
 
 
 def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return values (n, …) as (*shape, …): the first axis runs fastest in VTK."""
+    """Return values (n, …) as (*shape, …), where VTK's fastest axis becomes the first."""
     return np.moveaxis(values.reshape(*shape[::-1], *values.shape[1:]), (0, 1, 2), (2, 1, 0))
 
 
 def _as_plane(volume: TensorVolume) -> TensorVolume:
-    """Return a field in a plane as one: an image one voxel thick whose tensors vanish across it."""
+    """Return an image one voxel thick as a slice if its tensors vanish across the plane."""
     size = np.abs(volume.tensors).max()
-    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # of turning to the voxel axes
+    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # from the rotation to voxel axes
     for axis in range(3):
         if volume.shape[axis] == 1 and size > 0 and np.abs(volume.tensors[..., axis, :]).max() <= rounding:
             plane = volume.slice(("x", "y", "z")[axis], 0)
             affine = volume.volume_affine if volume.origin[axis] else volume.affine
-            return replace(plane, affine=affine, notes=(*volume.notes, "a field in the plane: no components across it"))
+            return replace(plane, affine=affine, notes=(*volume.notes, "read as 2×2 tensors in the plane"))
     return volume
 
 

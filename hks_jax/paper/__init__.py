@@ -11,22 +11,22 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from hks_jax import plot
-from hks_jax.atomic import atomic_path
-from hks_jax.paper import fields, figure1, figure2, figure6, table1, triangles
+from hks_jax.paper import figure6, figures, table1, triangles
+from hks_jax.storage import atomic_path
 
 Echo = Callable[[str], None]
 
 ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
     "table1": table1.make,
-    "figure1": figure1.make,
-    "figure2": figure2.make,
-    "figure3": fields.figure3,
-    "figure4": fields.figure4,
-    "figure5": fields.figure5,
+    "figure1": figures.figure1,
+    "figure2": figures.figure2,
+    "figure3": figures.figure3,
+    "figure4": figures.figure4,
+    "figure5": figures.figure5,
     "figure6": figure6.make,
     "triangles": triangles.make,
 }
-"""What makes each: a picture, or texts by the names of their files."""
+"""A function for each, which returns a picture, or texts by the names of their files."""
 
 
 def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:

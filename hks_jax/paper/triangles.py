@@ -14,7 +14,7 @@ from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, f
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.paper.fields import INDICES
+from hks_jax.paper.figures import INDICES
 
 QUICK, FULL = ((51,), (50, 100)), ((201,), (50, 100, 200, 400))  # nodes per axis of the figures' fields, of the torus
 COARSE = 11
@@ -42,7 +42,7 @@ LENGTHS: dict[str, Callable[[Tensors, Tensors, Vectors], Float[np.ndarray, " n"]
 
 
 class Count(NamedTuple):
-    """What is wrong with the edge lengths of a triangulated grid."""
+    """The faults of the edge lengths of a triangulated grid."""
 
     triangles: int  # how many triangles there are
     violating: int  # how many have a side longer than the other two together

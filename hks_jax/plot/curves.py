@@ -57,7 +57,7 @@ def hks_curves(
     Raises:
         ValueError: shapes that do not agree, or a point whose nearest node is outside the mask.
     """
-    t = checked_times(times, grid, values=values, expansion=expansion)
+    t = checked_times(times, grid.shape, values=values, expansion=expansion)
     curves = np.asarray(values, dtype=np.float64)
     series = None if expansion is None else np.asarray(expansion, dtype=np.float64)
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)

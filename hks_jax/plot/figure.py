@@ -1,4 +1,4 @@
-"""Figures, axes of grids and colour bars: what all pictures share."""
+"""Figures, axes of grids and colour bars, which all pictures share."""
 
 import math
 import os
@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, Locator, MaxNLocator, ScalarFormatter
 from matplotlib.transforms import ScaledTranslation
 
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
+from hks_jax.storage import atomic_path
 
 SMALL = "small"
 LABELS = 21

@@ -1,4 +1,4 @@
-"""How well a fitted metric explains a signature, and what it is."""
+"""Pictures of fits: the metric, and how well it explains the signature."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -40,9 +40,9 @@ def fit_panels(
     and the loss over the steps, a curve for each start, broken where a stage begins or a fit was resumed.
 
     Args:
-        fit: what `hks_jax.fit_metric` returned.
-        target: (n_times, *grid.shape), what was fitted; NaN where it was not observed.
-        times: (n_times,), or energies; None: those of the fit.
+        fit: the result of `hks_jax.fit_metric`.
+        target: (n_times, *grid.shape), of the fit; NaN where it was not observed.
+        times: (n_times,), or energies; None: the fit's.
         max_times: the most rows.
         title: the figure's title.
         orientation: how the grid lies in space, as for `scalar_image`.
@@ -59,7 +59,7 @@ def fit_panels(
     if max_times < 1:
         raise ValueError(f"max_times: got {max_times}; expected at least 1")
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
-    t = checked_times(times, grid, **{"target": wanted, "fit.hks": fitted})
+    t = checked_times(times, grid.shape, **{"target": wanted, "fit.hks": fitted})
     with np.errstate(divide="ignore", invalid="ignore"):
         difference = np.where(wanted != 0, (fitted - wanted) / np.abs(wanted), np.nan)
     rows = np.unique(np.linspace(0, t.size - 1, max_times).round().astype(int))

@@ -100,7 +100,7 @@ def influence_map(
     label: str = "boundary's influence",
     **kwargs: Any,
 ) -> AxesImage:
-    """Draw what part of the HKS the boundary decides at one time, with lines at a few levels.
+    """Draw the share of the HKS that the boundary decides at one time, with lines at a few levels.
 
     Args:
         ax: the axes to draw on.

@@ -52,7 +52,7 @@ def hks_panels(
         ValueError: shapes that do not agree; no time at all.
     """
     require_plane("grid", grid)
-    t = checked_times(times, grid, values=values)
+    t = checked_times(times, grid.shape, values=values)
     titles = panel_titles(t, titles, unit)
     images = [masked("values", v, grid) for v in np.asarray(values)]
     if shared_range:
@@ -108,7 +108,7 @@ def time_rows(
         raise ValueError(f'shared: got {shared!r}; expected "none" or "row"')
     if not rows:
         raise ValueError("rows: got none; expected one scalar or more")
-    t = checked_times(times, grid, **{f"rows: {name}": values for name, values in rows.items()})
+    t = checked_times(times, grid.shape, **{f"rows: {name}": values for name, values in rows.items()})
     width, height = panel_size(grid, 1.9)
     figure = new_figure(t.size * (width + 0.65) + 0.6, len(rows) * (height + 0.2) + 0.5 + 0.3 * bool(suptitle))
     panels = figure.subplots(len(rows), t.size, squeeze=False)
@@ -126,14 +126,14 @@ def time_rows(
     return finished(figure, suptitle)
 
 
-def checked_times(times: Any, grid: Grid, **arrays: Any) -> Float[np.ndarray, " n_times"]:
+def checked_times(times: Any, shape: tuple[int, ...], **arrays: Any) -> Float[np.ndarray, " n_times"]:
     """Return the times; raise ValueError unless there are some, and one value of each array per time and node."""
     t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     for name, array in arrays.items():
-        if array is not None and (np.shape(array) != (t.size, *grid.shape) or t.ndim != 1 or t.size == 0):
+        if array is not None and (np.shape(array) != (t.size, *shape) or t.ndim != 1 or t.size == 0):
             raise ValueError(
                 f"{name}: got shape {np.shape(array)} and times of shape {t.shape}; expected "
-                f"(n_times, *grid.shape) = {(t.size, *grid.shape)} and at least one time"
+                f"(n_times, *shape) = {(t.size, *shape)} and at least one time"
             )
     return t
 

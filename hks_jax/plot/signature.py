@@ -27,7 +27,7 @@ LABELS = {
     "volume": "HKS · volume",
     "flat": r"HKS · $(4\pi t)^{3/2}$",
 }
-"""What the colours of a volume's picture are; t has the unit of the squared lengths in the metric."""
+"""The labels of the colours of a volume's picture; t has the unit of the squared lengths in the metric."""
 LEAST_RANGE = 0.01
 """The least range of the colours, relative to the values: less contrast than this looks like what it is."""
 RIM = 5
@@ -51,7 +51,7 @@ def signature_panels(
     noise could make of flat space fades.
 
     Args:
-        result: what to draw.
+        result: the signature to draw.
         path: where to save the figure; None: nowhere.
         titles: of a slice, one per time; None: “t = …”.
         first: a title and a scalar (*shape,), drawn before the signature of a slice in grey.

@@ -143,7 +143,7 @@ def volume_panels(
         ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
     """
     require_volume(grid)
-    t = checked_times(times, grid, values=values)
+    t = checked_times(times, grid.shape, values=values)
     titles = panel_titles(t, titles, unit)
     volumes = [masked("values", each, grid) for each in np.asarray(values)]
     noise = [None] * t.size if z is None else [masked("z", each, grid) for each in np.asarray(z)]

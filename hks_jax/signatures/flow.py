@@ -114,8 +114,8 @@ def gaussian_scale_space(
 ) -> Float[np.ndarray, "n_times *functions_and_shape"]:
     """Blur functions by Gaussians, the same in all directions and everywhere, as far as heat spreads on average.
 
-    In coordinates the standard deviation is √(2t/s), s the mean of |T|^(1/d) over the domain. Masks are kept: we divide
-    by the blurred mask, and reflection continues functions beyond the sides of the grid: constants stay as they are.
+    In coordinates the standard deviation is √(2t/s), s the mean of |T|^(1/d) over the domain. Division by the
+    blurred mask and reflection at the sides of the grid keep constants as they are.
 
     Args:
         field: the metric, for its scale, its grid and its mask.

@@ -84,7 +84,9 @@ def colouring(
     memory: float = 2e9,
     slack: float = 1.0,
 ) -> Colouring:
-    """Choose spacing and degree for `hks_spectrum_free`, with its arguments, from the error bound; no traced values.
+    """Choose spacing and degree for `hks_spectrum_free`, whose arguments these are, from the error bound.
+
+    Needs concrete values.
 
     Args:
         memory: bytes that the working vectors may take; fewer vectors at once where it is short.

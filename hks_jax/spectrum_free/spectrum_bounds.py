@@ -19,7 +19,7 @@ _STEPS, _MASS_STEPS = 50, 200
 
 
 class Bounds(NamedTuple):
-    """What a pencil's polynomials must be fit for: of JAX, or of NumPy in double precision where they are known.
+    """What a pencil's polynomials must be fit for; once known, NumPy's numbers in double precision.
 
     Attributes:
         top: an upper bound on the eigenvalues of PK.

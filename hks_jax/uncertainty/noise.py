@@ -32,6 +32,8 @@ class TensorNoise(eqx.Module):
         correlation: how far neighbours share their noise, in coordinate units: white noise blurred by a Gaussian of
             this standard deviation, and scaled to the covariance. Nodes a distance r apart then have the correlation
             exp(−r²/4w²). 0: independent.
+        modes: (*shape, n, m), the fields of which the noise is the sum (see `from_modes`), or None.
+        freedom: the degrees of freedom with which the covariance is known; infinite for a stated one.
 
     Raises:
         ValueError: a covariance that is not positive semidefinite (at how many nodes, where, and by how much), or of
@@ -41,9 +43,20 @@ class TensorNoise(eqx.Module):
     covariance: Float[Array, "*shape m m"]
     grid: Grid | None = eqx.field(static=True)
     correlation: float = eqx.field(static=True)
+    modes: Float[Array, "*shape n m"] | None
+    freedom: float = eqx.field(static=True)
 
-    def __init__(self, covariance: Any, grid: Grid | None = None, correlation: float = 0.0) -> None:
+    def __init__(
+        self,
+        covariance: Any,
+        grid: Grid | None = None,
+        correlation: float = 0.0,
+        *,
+        modes: Any = None,
+        freedom: float = math.inf,
+    ) -> None:
         self.covariance = real_array("covariance", covariance)
+        self.modes, self.freedom = modes, freedom
         self.grid = grid
         require_number("correlation", correlation, inclusive=True)
         self.correlation = float(correlation)
@@ -59,6 +72,26 @@ class TensorNoise(eqx.Module):
             raise ValueError("correlation: got a length but no grid; give the grid whose nodes share their noise")
         if not is_traced(self.covariance):
             _check_semidefinite(np.asarray(self.covariance))
+
+    @classmethod
+    def from_modes(cls, modes: Any, grid: Grid | None = None, unknowns: int = 0) -> "TensorNoise":
+        """Return noise that is the sum of n fields, each times a standard normal number of its own.
+
+        The fields of a scan are what each of its images changes of the tensors by its residuals
+        (`hks_jax.io.TensorVolume.modes`): random signs of whole images, a wild bootstrap. Voxels share this noise just
+        as they share residuals: by the reconstruction, by drift of the scanner or motion between images, and by
+        diffusion that no tensor describes.
+
+        Args:
+            modes: (*shape, n, m) of the m components, along the axes of the tensors and in their unit.
+            grid: see `TensorNoise`.
+            unknowns: of the fit: n less as many are the degrees of freedom that intervals take account of.
+        """
+        values = real_array("modes", modes)
+        if values.ndim < 3 or values.shape[-2] <= unknowns:
+            raise ValueError(f"modes: got shape {values.shape}; expected (*shape, n, m), n > unknowns = {unknowns}")
+        covariance = jnp.einsum("...na,...nb->...ab", values, values, precision="highest")
+        return cls(covariance, grid, modes=values, freedom=values.shape[-2] - unknowns)
 
     @classmethod
     def relative(cls, tensors: Any, level: float, grid: Grid | None = None, correlation: float = 0.0) -> "TensorNoise":
@@ -159,13 +192,22 @@ class TensorNoise(eqx.Module):
         """The number of rows d of a tensor."""
         return 2 if self.covariance.shape[-1] == 3 else 3
 
-    def tensors(self, white: Float[Array, "*shape m"]) -> Float[Array, "*shape d d"]:
+    @property
+    def white_shape(self) -> tuple[int, ...]:
+        """The shape of the numbers of which `tensors` makes noise: (*shape, m), or (n,) of modes."""
+        return self.covariance.shape[:-1] if self.modes is None else self.modes.shape[-2:-1]
+
+    def tensors(self, white: Float[Array, "..."]) -> Float[Array, "*shape d d"]:
         """Return the noise that independent standard normal numbers make: linear in them, of this covariance."""
         if self.correlation:
             assert self.grid is not None
             kernels = [jnp.asarray(each, white.dtype) for each in gaussians(self.grid, self.correlation)]
             white = along_axes(kernels, white)
-        parts = jnp.einsum("...ab,...b->...a", _root(self.covariance).astype(white.dtype), white, precision="highest")
+        if self.modes is None:
+            root = _root(self.covariance).astype(white.dtype)
+            parts = jnp.einsum("...ab,...b->...a", root, white, precision="highest")
+        else:
+            parts = jnp.einsum("...na,n->...a", self.modes.astype(white.dtype), white, precision="highest")
         which = np.zeros((self.dimension, self.dimension), int)
         which[np.tril_indices(self.dimension)] = np.arange(parts.shape[-1])
         return parts[..., np.maximum(which, which.T)]

@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -17,7 +18,7 @@ from jaxtyping import Array
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import real_array, require_count, require_number
 from hks_jax.domain import spd
-from hks_jax.npz import load_npz, write_npz
+from hks_jax.storage import load_npz, write_npz
 from hks_jax.traced import is_traced
 from hks_jax.uncertainty.noise import TensorNoise
 from hks_jax.uncertainty.result import Uncertainty
@@ -25,8 +26,12 @@ from hks_jax.uncertainty.smoothing import smooth_tensors
 
 Method = Literal["auto", "resample", "linear", "exact"]
 
-_PAIRS = 4
-"""Antithetic pairs from which bias and departure from linearity are estimated where the deviation needs none."""
+_SIGNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+"""The corners of a tetrahedron: those of the cube that have an even number of minus signs."""
+_BALANCED = len(_SIGNS)
+"""How many noisy maps are one sample: as many as such corners."""
+_LEAST = 8
+"""Noisy maps from which bias and departure from linearity can be estimated."""
 _SCALE = 0.5
 """The size of the noise that is added to the measured tensors, which have some already, relative to the true one."""
 _FLOOR = 0.01
@@ -36,7 +41,7 @@ _LOUD = 3.0
 
 
 class _Moments(eqx.Module):
-    """Sums over antithetic pairs: of the odd parts' squares, and mean and squared deviations of the even parts."""
+    """Sums over balanced maps: of their linear parts' squares, and mean and squared deviations of their even parts."""
 
     n: Array
     odd: Any
@@ -45,14 +50,32 @@ class _Moments(eqx.Module):
     indefinite: Array
 
     @jax.jit
-    def add(self, plus: Any, minus: Any, value: Any, indefinite: Array) -> "_Moments":
-        """Return the moments with one pair more (Welford 1962)."""
+    def add(self, found: Any, even: Any, indefinite: Array) -> "_Moments":
+        """Return the moments with four maps more (Welford 1962)."""
         n = self.n + 1
-        odd = jax.tree.map(lambda s, p, m: s + ((p - m) / (2 * _SCALE)) ** 2, self.odd, plus, minus)
-        even = jax.tree.map(lambda p, m, v: ((p + m) / 2 - v) / _SCALE**2, plus, minus, value)
+        odd = jax.tree.map(lambda s, f: s + jnp.mean(f**2, axis=0), self.odd, found)
         mean = jax.tree.map(lambda mean, e: mean + (e - mean) / n, self.even, even)
         spread = jax.tree.map(lambda s, e, old, new: s + (e - old) * (e - new), self.spread, even, self.even, mean)
         return _Moments(n, odd, mean, spread, self.indefinite + indefinite)
+
+
+# Four maps y at D + sδ, with noise δ = (±η₁ ± η₂ ± η₃)/√3 at the corners of a tetrahedron of independent η, each of
+# which δ has the covariance Σ of η. The δ add up to zero, so that the mean of y less the value is of second order,
+# s² times the bias, for any η. To second order y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3, and likewise for η₂ and η₃: four maps
+# are three samples of the noise, where two antithetic pairs are two. The mean of four has a third of the variance that
+# a quadratic form of one δ has, which is what is beyond linear.
+@jax.jit
+def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
+    """Return the noise Jη (3, …) that four maps are made of, and their even part: the bias, on average."""
+
+    def linear(*y: Array) -> Array:
+        signs = jnp.asarray(_SIGNS.T * (math.sqrt(3) / (4 * _SCALE)), y[0].dtype)
+        return jnp.tensordot(signs, jnp.stack(y), 1, precision=jax.lax.Precision.HIGHEST)
+
+    return (
+        jax.tree.map(linear, *maps),
+        jax.tree.map(lambda v, *y: (sum(y) / _BALANCED - v) / _SCALE**2, value, *maps),
+    )
 
 
 def uncertainty(
@@ -61,7 +84,7 @@ def uncertainty(
     noise: TensorNoise,
     *,
     method: Method = "auto",
-    draws: int = 16,
+    draws: int = 8,
     smoothing: float = 0.0,
     seed: int = 0,
     compiled: bool = True,
@@ -78,31 +101,31 @@ def uncertainty(
         bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.1))
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
-    Noise δ is drawn in antithetic pairs, D + δ/2 and D − δ/2: their difference is linear in it to second order, and
-    their mean less the value, four times, is the bias. Half the noise, because measured tensors have a whole one
-    already: that of full size on top of it would exaggerate what is beyond linear. Of p pairs a deviation is sure to
-    1/√2p of itself: 25 % by default, enough for a picture; 100 draws or more for a table.
+    Noise δ is drawn four at a time, which add up to zero, and maps are computed of D + δ/2: their differences are
+    linear in the noise to second order, and their mean less the value, four times, is the bias. Half the noise, because
+    measured tensors have a whole one already: that of full size on top of it would exaggerate what is beyond linear.
+    Four maps are three samples: a deviation is sure to 29 % of itself by default, to 8 % with 100 draws.
 
     Args:
         function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays; JAX must be able to trace it,
             unless `compiled` is false. Times and energies should be fixed, not chosen by its eigenpairs.
         tensors: (*shape, d, d) as measured, at nodes or cells; positive definite where there is noise.
         noise: theirs: see `TensorNoise`.
-        method: ``"resample"``: all by antithetic pairs. ``"exact"``: one reverse product for each number that the
+        method: ``"resample"``: all by maps of noisy tensors. ``"exact"``: one reverse product for each number that the
             function returns, gᵀΣg. ``"linear"``: as many products with one linearisation as there are draws. These two
-            take a few pairs besides, for the bias and for what is beyond linear. ``"auto"``: exact if the function
+            take eight maps besides, for the bias and for what is beyond linear. ``"auto"``: exact if the function
             returns no more numbers than there are draws, else resampling: a product with the Jacobian of a signature
             takes as long as one or two signatures.
-        draws: how many maps of noisy tensors (or products, of ``"linear"``).
+        draws: how many maps of noisy tensors (or products, of ``"linear"``), 8 or more; the next multiple of four.
         smoothing: of the tensors before the function sees them, log-Euclidean, the standard deviation of the Gaussian
             in coordinate units (`smooth_tensors`); the noise must know its grid.
         seed: of the draws.
         compiled: whether to compile the function, once, for all draws. False for what cannot be traced: it is then
             called as it is.
-        progress: called with a short text after each pair.
-        checkpoint: a file to write after each pair. If it is there already, resampling goes on from it.
-        each: called with the noise that each pair found, of the structure of the value and of its deviation: what
-            covariances, or errors of means over regions, can be made of. Not again for pairs of a checkpoint.
+        progress: called with a short text after every four maps.
+        checkpoint: a file to write after every four maps. If it is there already, resampling goes on from it.
+        each: called with every sample of the noise, three for four maps, of the structure of the value: what
+            covariances, or errors of means over regions, can be made of. Not again for those of a checkpoint.
 
     Returns:
         Value, deviation and bias, and how sure they are. Under `jit` it works with a method that is named. The
@@ -136,16 +159,16 @@ def uncertainty(
             raise ValueError('method: "auto" is for known values; under jit name "resample", "linear" or "exact"')
         size = sum(leaf.size for leaf in jax.tree.leaves(value))
         method = "exact" if compiled and size <= draws else "resample"
-    half = -(-draws // 2)
-    pairs = half if method == "resample" else min(_PAIRS, half)
-    moments = _in_pairs(run, value, measured, noise, seed, pairs, progress, checkpoint, each)
-    variance = jax.tree.map(lambda odd: odd / pairs, moments.odd)
-    spread = jax.tree.map(lambda s: s / max(pairs - 1, 1), moments.spread)
-    freedom: float = pairs
+    samples = -(-draws // _BALANCED) if method == "resample" else _LEAST // _BALANCED
+    moments = _sampled(run, value, measured, noise, seed, samples, progress, checkpoint, each)
+    variance = jax.tree.map(lambda odd: odd / samples, moments.odd)
+    spread = jax.tree.map(lambda s: s / (samples - 1), moments.spread)
+    freedom: float = samples * (_BALANCED - 1)
     if method != "resample":
         freedom = math.inf if method == "exact" else draws
         rule = _exact if method == "exact" else partial(_linear, draws=draws)
         variance = rule(whole, measured, noise, seed)
+    freedom = 1 / (1 / freedom + 1 / noise.freedom) if min(freedom, noise.freedom) < math.inf else math.inf
     smear = None
     if smoothing:
         smear = jax.tree.map(jnp.subtract, run(smoothed(measured)), value)
@@ -153,14 +176,15 @@ def uncertainty(
         value,
         jax.tree.map(jnp.sqrt, variance),
         moments.even,
-        jax.tree.map(lambda s: jnp.sqrt(s / pairs), spread),
-        jax.tree.map(lambda s, t: s / jnp.where(t > 0, t, 1), spread, variance),
+        jax.tree.map(lambda s: jnp.sqrt(s / samples), spread),
+        jax.tree.map(lambda s, t: (_BALANCED - 1) * s / jnp.where(t > 0, t, 1), spread, variance),
         smear,
-        moments.indefinite / (2 * pairs),
+        moments.indefinite / (_BALANCED * samples),
         0.0 if math.isinf(freedom) else 1 / math.sqrt(2 * freedom),
         method,
-        2 * pairs,
+        _BALANCED * samples,
         float(freedom),
+        samples - 1,
     )
     if not is_traced(jax.lax.stop_gradient(variance)):
         for message in result.messages():
@@ -174,7 +198,7 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
         raise TypeError(f"noise: got {type(noise).__name__}; expected hks_jax.TensorNoise")
     if method not in get_args(Method):
         raise ValueError(f"method: got {method!r}; expected one of {', '.join(get_args(Method))}")
-    require_count("draws", draws, 4)
+    require_count("draws", draws, _LEAST)
     require_number("smoothing", smoothing, inclusive=True)
     if smoothing and noise.grid is None:
         raise ValueError("smoothing: got a length, but the noise has no grid; give TensorNoise the grid of the tensors")
@@ -220,54 +244,57 @@ def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
 def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
     """Return one of the draws: the numbers that the noise is made of."""
     key = jax.random.fold_in(jax.random.key(seed), index)
-    return jax.random.normal(key, noise.covariance.shape[:-1], dtype)
+    return jax.random.normal(key, noise.white_shape, dtype)
 
 
 @jax.jit
-def _pair(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[Array, Array, Array]:
-    """Return tensors with one draw of noise added, with it taken off, and the share that had to be raised in both."""
-    change = noise.tensors(_white(noise, seed, index, measured.dtype))
-    lost = [_positive(measured, measured + sign * change)[1] for sign in (1, -1)]
-    plus, minus = (_positive(measured, measured + sign * _SCALE * change)[0] for sign in (1, -1))
-    return plus, minus, lost[0] + lost[1]
+def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
+    """Return tensors with noise that adds up to zero, and the share that whole noise makes indefinite, in all four."""
+    each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
+    changes = jnp.tensordot(
+        jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1, precision=jax.lax.Precision.HIGHEST
+    )
+    lost = jnp.stack([_positive(measured, measured + change)[1] for change in changes])
+    return [_positive(measured, measured + _SCALE * change)[0] for change in changes], lost.sum()
 
 
-def _in_pairs(
+def _sampled(
     run: Callable[[Array], Any],
     value: Any,
     measured: Array,
     noise: TensorNoise,
     seed: int,
-    pairs: int,
+    samples: int,
     progress: Callable[[str], None] | None,
     checkpoint: str | os.PathLike[str] | None,
     each: Callable[[Any], None] | None,
 ) -> _Moments:
-    """Return the moments of antithetic pairs."""
+    """Return the moments of four maps each."""
     nothing = jax.tree.map(jnp.zeros_like, value)
     none = jnp.zeros((), measured.dtype)
     moments = _Moments(none, nothing, nothing, nothing, none)
 
     def step(index: Any, moments: _Moments) -> _Moments:
-        more, less, raised = _pair(measured, noise, seed, index)
-        plus, minus = run(more), run(less)
+        noisy, lost = _four(measured, noise, seed, index)
+        found, even = _parts([run(one) for one in noisy], value)
         if each is not None:
-            each(jax.tree.map(lambda p, m: (p - m) / (2 * _SCALE), plus, minus))
-        return moments.add(plus, minus, value, raised)
+            for i in range(len(_SIGNS[0])):
+                each(jax.tree.map(itemgetter(i), found))
+        return moments.add(found, even, lost)
 
     if is_traced(value):
-        return jax.lax.fori_loop(0, pairs, step, moments)
+        return jax.lax.fori_loop(0, samples, step, moments)
     mark, first = "", 0
     if checkpoint is not None:
         from hks_jax.inverse.checkpoint import fingerprint  # fits are slow to import
 
-        mark = fingerprint(value, _pair(measured, noise, seed, 0))
+        mark = fingerprint(value, _four(measured, noise, seed, 0))
         if Path(checkpoint).exists():
             moments, first = _load(checkpoint, mark, moments)
-    for index in range(first, pairs):
+    for index in range(first, samples):
         moments = jax.block_until_ready(step(index, moments))
         if progress is not None:
-            progress(f"{2 * index + 2} of {2 * pairs} noisy maps")
+            progress(f"{_BALANCED * (index + 1)} of {_BALANCED * samples} noisy maps")
         if checkpoint is not None:
             arrays = {f"arr_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(moments))}
             write_npz(checkpoint, {**arrays, "mark": mark}, compressed=False)
@@ -275,7 +302,7 @@ def _in_pairs(
 
 
 def _load(path: str | os.PathLike[str], mark: str, like: _Moments) -> tuple[_Moments, int]:
-    """Read moments, and how many pairs they are of."""
+    """Read moments, and how many samples they are of."""
     data = load_npz(path)
     if str(data.get("mark")) != mark:
         raise ValueError(

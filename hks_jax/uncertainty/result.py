@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.special import stdtrit
+from scipy.special import fdtri, stdtrit
 
 from hks_jax.checks import require_number
 
@@ -35,7 +35,8 @@ class Uncertainty(eqx.Module):
         sampling_error: the relative standard deviation of ``deviation``, from few draws; 0 if it is exact.
         method: ``"resample"``, ``"linear"`` or ``"exact"``.
         draws: how many maps of noisy tensors were computed.
-        freedom: the degrees of freedom of the deviation; infinite if it is exact.
+        freedom: the degrees of freedom of the deviation, those of the noise included; infinite if it is exact.
+        samples: the degrees of freedom of `beyond_linear`.
     """
 
     value: Any
@@ -49,6 +50,7 @@ class Uncertainty(eqx.Module):
     method: str = eqx.field(static=True)
     draws: int = eqx.field(static=True)
     freedom: float = eqx.field(static=True)
+    samples: int = eqx.field(static=True)
 
     def __repr__(self) -> str:
         """Return one line."""
@@ -87,7 +89,9 @@ class Uncertainty(eqx.Module):
             maps = (len(deviation) if deviation.ndim > 1 else deviation.size, -1)
             share = jnp.abs(bias / jnp.where(deviation > 0, deviation, jnp.nan)).reshape(maps)
             second = jnp.where(deviation > 0, beyond, jnp.nan).reshape(maps)
-            small = (jnp.nanmedian(second, axis=1) <= BEYOND) & (jnp.nanmedian(share, axis=1) <= 1)
+            # Estimates from few draws are below their mean more often than not: by the median of their distribution.
+            limit = BEYOND * float(fdtri(self.samples, min(self.freedom, 1e6), 0.5))
+            small = (jnp.nanmedian(second, axis=1) <= limit) & (jnp.nanmedian(share, axis=1) <= 1)
             return (small & (self.indefinite <= INDEFINITE)).reshape(deviation.shape[:1])
 
         return jax.tree.map(of, self.deviation, self.bias, self.beyond_linear)
@@ -136,7 +140,7 @@ class Uncertainty(eqx.Module):
         how = {
             "exact": "deviations exact to first order, by reverse products",
             "linear": "deviations by random directions of one linearisation",
-            "resample": "deviations of maps of noisy tensors, in antithetic pairs",
+            "resample": "deviations of maps of noisy tensors",
         }[self.method]
         sure = f", each to {self.sampling_error:.0%}" if self.sampling_error else ""
         lines = [f"{how}{sure}; {self.draws} noisy maps"]

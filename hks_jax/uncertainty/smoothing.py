@@ -35,10 +35,11 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
     require_number("width", width, inclusive=True)
     if width == 0:
         return values
-    weights = [jnp.asarray(each, values.dtype) for each in gaussians(grid, width)]
-    inside = jnp.asarray(grid.inside, values.dtype)[..., None, None]
-    logarithms = spd.log(spd.identity_outside(values, grid.inside)) * inside
-    mean = along_axes(weights, logarithms) / jnp.where(inside > 0, along_axes(weights, inside), 1)
+    with jax.ensure_compile_time_eval():  # XLA folds these constants slowly
+        weights = [jnp.asarray(each, values.dtype) for each in gaussians(grid, width)]
+        inside = jnp.asarray(grid.inside, values.dtype)[..., None, None]
+        total = jnp.where(inside > 0, along_axes(weights, inside), 1)
+    mean = along_axes(weights, spd.log(spd.identity_outside(values, grid.inside)) * inside) / total
     return spd.exp(jnp.where(inside > 0, mean, 0))
 
 

@@ -16,6 +16,7 @@ import jax
 import nibabel as nib
 import numpy as np
 from brain_study import tissues
+from scipy.special import fdtri
 
 import hks_jax as hj
 from hks_jax.plot.signature import cropped, placed
@@ -65,6 +66,43 @@ def correlation(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
     return float(np.corrcoef(a[where], b[where])[0, 1])
 
 
+def maps(
+    signature, tensors: np.ndarray, noise: hj.TensorNoise, draws: int = DRAWS
+) -> tuple[hj.Uncertainty, np.ndarray]:
+    """Return error bars, and the samples of noise of which they are made."""
+    samples: list[np.ndarray] = []
+    settings = {"draws": draws, "method": "resample", "progress": print}
+    bars = hj.uncertainty(signature, tensors, noise, **settings, each=lambda one: samples.append(np.asarray(one)))
+    print(bars.summary())
+    return bars, np.stack(samples)
+
+
+def variance_ratio(apart: np.ndarray, predicted: np.ndarray, freedom: float) -> np.ndarray:
+    """Return the variance of differences (n_times, n) over the predicted one, by the median over the nodes.
+
+    The median, since the mean over nodes is that of the few noisiest.
+    """
+    share = (apart - apart.mean(axis=-1, keepdims=True)) ** 2 / predicted
+    return np.median(share, axis=-1) / fdtri(1, freedom, 0.5)
+
+
+def ratios(halves: list[tuple[hj.Uncertainty, np.ndarray]], known: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the ratio of the halves' difference, and the range that it has by chance where the prediction is right.
+
+    The latter is that of differences of two samples of noise, predicted by the other samples: 5th to 95th percentile.
+    """
+    (first, a), (second, b) = halves
+    a, b = a[:, :, known], b[:, :, known]
+    apart = np.asarray(first.value - second.value)[:, known]
+    predicted = np.asarray(first.deviation**2 + second.deviation**2)[:, known]
+    n = len(a)
+    left = [(np.sum(each**2, axis=0) - each**2) / (n - 1) for each in (a, b)]
+    chance = [variance_ratio(a[i] - b[j], left[0][i] + left[1][j], 2 * n - 2) for i in range(n) for j in range(n)]
+    low, high = np.quantile(chance, [0.05, 0.95], axis=0)
+    ratio = variance_ratio(apart, predicted, first.freedom + second.freedom)
+    return {"variance_ratio": ratio, "by_chance_from": low, "by_chance_to": high}
+
+
 def study(volumes: list[hj.io.TensorVolume], z: int) -> tuple[dict, dict]:
     """Return the numbers of one slice, and what the picture shows."""
     labels = tissues(volumes[0])[:, :, z]
@@ -82,23 +120,18 @@ def study(volumes: list[hj.io.TensorVolume], z: int) -> tuple[dict, dict]:
         return hj.hks(hj.eigenpairs(field, **SETTINGS), times, "flat")
 
     width = hj.TensorNoise.from_scans(planes[1].tensors, planes[2].tensors, grid).correlation
-    bars = []
-    for plane in planes:
-        noise = hj.TensorNoise(plane.covariance, grid, width)
-        bars.append(hj.uncertainty(signature, plane.tensors, noise, draws=DRAWS, method="resample", progress=print))
-        print(bars[-1].summary())
+    found = [maps(signature, plane.tensors, plane.noise(grid)) for plane in planes]
+    bars = [each for each, _ in found]
     whole, first, second = bars
     known = np.isfinite(np.asarray(whole.value[0])) & grid.inside
-    apart = np.asarray(first.value - second.value)
-    predicted = np.asarray(first.deviation**2 + second.deviation**2)
+    near = [maps(signature, p.tensors, hj.TensorNoise(p.covariance, grid, width), 8) for p in planes[1:]]
+    judged, shared_nearby = ratios(found[1:], known), ratios(near, known)
     others = [scalars(plane, volume, z, grid) for plane, volume in zip(planes[1:], volumes[1:], strict=True)]
     rows = []
     for i, (t, length) in enumerate(zip(times, LENGTHS, strict=True)):
         row = {"t_s": float(t), "voxels": float(length), "signal_to_noise": float(whole.signal_to_noise[i])}
-        share = (apart[i] - np.mean(apart[i][known])) ** 2 / predicted[i]
-        # A normal variable's square has the median 0.455; the mean over nodes is that of the few noisiest.
-        row["variance_ratio"] = float(np.median(share[known]) / 0.455)
-        row["variance_ratio_of_means"] = float(np.var(apart[i][known]) / np.mean(predicted[i][known]))
+        row |= {name: float(each[i]) for name, each in judged.items()}
+        row |= {f"{name}_shared_by_neighbours": float(each[i]) for name, each in shared_nearby.items()}
         row["claimed"] = bool(whole.trusted[i])
         for region, numbers in REGIONS.items():
             there = known & np.isin(labels, numbers)

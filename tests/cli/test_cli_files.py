@@ -78,7 +78,7 @@ def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
     ]
     report = json.loads((out / "report.json").read_text())
     assert report["input"]["order"] == "fit"
-    assert report["input"]["notes"][0] == "weighted least squares on 13 of 13 images (b ≤ 1000 s/mm²)"
+    assert report["input"]["notes"][0] == "tensors fitted by weighted least squares to 13 of 13 images (b ≤ 1000)"
     repair = report["input"]["repair"]
     assert (repair["method"], repair["voxels"], repair["first"]) == ("nearest", 1, [[7, 6]])
     assert (
@@ -94,9 +94,11 @@ def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
 
 def test_options_of_scans_and_tensors_do_not_mix(scan, tensors, tmp_path, capsys):
     out = ["-o", str(tmp_path / "out"), "--metric", "inverse"]
-    assert "diffusion-weighted images need both" in error_of(capsys, ["hks", *scan[:3], *out])
-    assert "--order: it is for files of tensors" in error_of(capsys, ["hks", *scan, *out, "--order", "fsl"])
-    assert "--b-max: it is for diffusion-weighted" in error_of(capsys, ["hks", str(tensors), *out, "--b-max", "9"])
+    assert "expected both for diffusion-weighted images" in error_of(capsys, ["hks", *scan[:3], *out])
+    assert "--order: this option is for files of tensors" in error_of(capsys, ["hks", *scan, *out, "--order", "fsl"])
+    assert "--b-max: this option is for diffusion-weighted" in error_of(
+        capsys, ["hks", str(tensors), *out, "--b-max", "9"]
+    )
     assert "--bval and --bvec" in error_of(capsys, ["hks", scan[0], *out])
 
 
@@ -114,7 +116,7 @@ def test_info_of_tensors(tensors, tmp_path, capsys):
     )
     assert found["inside"] == disc().sum()
     assert (found["components"], found["not_positive_definite"]) == (1, 0)
-    assert any("whose tensor is zero count as outside" in note for note in found["notes"])
+    assert any("with a zero tensor count as outside" in note for note in found["notes"])
     assert found["suits"]["inverse"]["k"] == 100  # what 'hks' takes for a volume
     values = np.linalg.eigvalsh(D)
     assert found["eigenvalues"]["least"] == pytest.approx(1.1 * values[0], rel=1e-5)
@@ -230,13 +232,26 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     assert report["input"]["boundary_vertices"] == 92
     assert (tmp_path / "out" / "hks.png").stat().st_size > 5000
 
+    of_tensors = ["--array", "D", "--metric", "inverse"]
+    assert main([*command, *of_tensors, "--noise", "0.01"]) == 0
+    bars = hj.uncertainty(
+        lambda D: hj.hks(hj.eigenpairs(hj.TetMesh.from_tensors(x, ball.cells, D, "inverse"), 30), [0.3, 0.6]),
+        tensors,
+        hj.TensorNoise.relative(tensors, 0.01),
+        method="resample",
+    )
+    with np.load(tmp_path / "out" / "hks.npz") as found:
+        np.testing.assert_allclose(found["deviation"], bars.deviation, rtol=1e-6)
+
     def refused(message, *more):
         assert main([*command, *more]) == 2
         assert message in capsys.readouterr().err
 
+    refused("--noise: it is of tensors, which", "--noise", "0.1")
+    refused("--noise: got 'roughness'; for tensors at the vertices", *of_tensors, "--noise", "roughness")
     refused("--metric: a mesh has the metric of space unless --array names tensors", "--metric", "tensor")
     refused("--interpolation: a mesh has the metric of space", "--interpolation", "log-euclidean")
-    refused("--metric: choose what the tensors at the vertices stand for", "--array", "D")
+    refused("--metric: choose the metric of the tensors at the vertices", "--array", "D")
     refused("--array: got 'E'; the arrays at the vertices are D", "--array", "E", "--metric", "tensor")
     refused("--slice: it is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
     refused("--boundary: got 'mirror'; a mesh takes one of neumann, dirichlet, mean", "--boundary", "mirror")
@@ -288,7 +303,7 @@ def test_convert_orders_masks_and_repairs(tmp_path, capsys):
     arguments += ["--order", "fsl", "--mask", str(tmp_path / "m.npy")]
     assert main(arguments) == 0
     captured = capsys.readouterr()
-    assert "warning: 1 tensors are not positive definite and are written as they are; see --repair" in captured.err
+    assert "warning: 1 tensors are not positive definite and are written unchanged; see --repair" in captured.err
     assert captured.out == f"{tmp_path / 't.nii.gz'}\n"
     assert main([*arguments, "--repair", "nearest", "-q", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
@@ -315,7 +330,7 @@ def test_convert_fits_scans_and_refuses_what_cannot_be(scan, tmp_path, capsys):
         read_tensors(target).tensors[disc()], np.broadcast_to(D, (disc().sum(), 3, 3)), rtol=1e-4, atol=1e-12
     )
     assert "expected a name that ends in .nii.gz" in error_of(capsys, ["convert", str(target), str(tmp_path / "t.mif")])
-    assert "is FILE itself" in error_of(capsys, ["convert", str(target), str(target)])
+    assert "the same file as FILE" in error_of(capsys, ["convert", str(target), str(target)])
     before = sorted(tmp_path.iterdir())
     arguments = ["convert", str(target), str(tmp_path / "s.nii.gz"), "--slice", "z=9"]
     assert "--slice: index: got z = 9; expected 0 … 4" in error_of(capsys, arguments)
@@ -333,17 +348,17 @@ def test_numpy_files_and_unsymmetric_matrices(tmp_path, capsys):
     assert "spacing         1 × 2 × 3" in text
     assert "1 tensors are not symmetric" in text
     error = error_of(capsys, ["convert", str(tmp_path / "t.npy"), str(tmp_path / "t.nii.gz")])
-    assert "1 tensors are unsymmetric, and this format keeps one half of them only" in error
+    assert "1 unsymmetric tensors, but this format stores only one half" in error
 
 
 def test_volumes_without_an_element_and_of_eight_values(tmp_path, capsys):
     np.save(tmp_path / "t.npy", np.broadcast_to(D, (1, 1, 1, 3, 3)))
     assert main(["info", str(tmp_path / "t.npy"), "--spacing", "1", "1", "1"]) == 0
     text = capsys.readouterr().out
-    assert "components      0: nothing to compute on" in text
+    assert "components      0: the domain is empty" in text
     assert "t ≥" not in text
     nib.save(nib.Nifti1Image(np.ones((3, 4, 5, 8)), np.eye(4)), tmp_path / "camino.nii.gz")
-    assert "Camino has an exit code and log S₀ before" in error_of(capsys, ["info", str(tmp_path / "camino.nii.gz")])
+    assert "Camino writes an exit code and log S₀ before" in error_of(capsys, ["info", str(tmp_path / "camino.nii.gz")])
 
 
 @pytest.mark.parametrize(("library", "suffix"), [("nrrd", ".nrrd"), ("vtkmodules", ".vti"), ("nibabel", ".nii.gz")])

@@ -72,7 +72,7 @@ def test_spectrum_end_to_end(sphere, tmp_path, capsys):
 def test_spectrum_errors(sphere, tmp_path, capsys, monkeypatch):
     out = ["-o", str(tmp_path / "out"), "-q"]
     assert error_of(capsys, main(["spectrum", str(sphere), *out, "-k", "0"]), "k: got 0") == 2
-    assert error_of(capsys, main(["spectrum", "tensor.nii.gz", *out]), "--metric: choose one") == 2
+    assert error_of(capsys, main(["spectrum", "tensor.nii.gz", *out]), "--metric: choose the metric") == 2
 
     def fail(*args, **kwargs):
         raise OSError("disk full")

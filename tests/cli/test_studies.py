@@ -20,7 +20,6 @@ import pytest
 from annotations import unchecked
 
 import hks_jax as hj
-from hks_jax.atomic import claim
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.job import Settings
 from hks_jax.cli.progress import StudyProgress
@@ -32,6 +31,7 @@ from hks_jax.io.components import component_of
 from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.pairs import pairs_of
 from hks_jax.io.tables import read_table, write_table
+from hks_jax.storage import claim
 
 ROOT = Path(__file__).resolve().parents[2]
 BRAINS = ROOT.parent / "shared" / "data"
@@ -174,7 +174,7 @@ def test_what_are_not_six_images_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"tzz.*got shape"):
         read_tensors(paths)
     paths[5].unlink()
-    with pytest.raises(FileNotFoundError, match=r"not beside it: sub-01_model-tensor_param-tzz_dwimap.nii.gz"):
+    with pytest.raises(FileNotFoundError, match=r"are missing: sub-01_model-tensor_param-tzz_dwimap.nii.gz"):
         read_tensors(paths[0])
 
 
@@ -244,7 +244,7 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
     capsys.readouterr()
     assert main(command(study, "stopped", *LAMBDA1)) == 0
     printed = capsys.readouterr().err
-    assert "1 of 3 subjects are done already" in printed
+    assert "1 of 3 subjects are already done" in printed
     assert printed.index("0 of 2: sub-03") < printed.index("1 of 2, ") < printed.index(": sub-02")
     assert contents(study / "stopped") == contents(study / "whole")
 
@@ -266,7 +266,7 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
     # Again, nothing is computed; with other labels, only the tables.
     monkeypatch.setattr("hks_jax.cli.study.tasks._compute", None)
     assert main(command(study, "whole", *LAMBDA1)) == 0
-    assert "3 of 3 subjects are done already" in capsys.readouterr().err
+    assert "3 of 3 subjects are already done" in capsys.readouterr().err
     nib.save(nib.Nifti1Image(np.full(SHAPE, 3, np.int16), AFFINE), study / "atlas_dseg.nii.gz")
     assert main(command(study, "whole", *LAMBDA1)) == 0
     assert {row["index"] for row in table(study / "whole" / "group_regions.tsv")} == {"3"}
@@ -311,7 +311,7 @@ def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
     assert "3 of 4 subjects failed (sub-04, sub-05, sub-06)" in printed
     rows = table(study / "out" / "group_summary.tsv")
     assert [row["status"] for row in rows] == ["failed", "failed", "failed", "done"]
-    for row, words in zip(rows, ("no such file", "0 … 2", "other voxels than the image's"), strict=False):
+    for row, words in zip(rows, ("no such file", "0 … 2", "labels and the image on different voxels"), strict=False):
         assert words in row["problem"]
     assert {row["participant_id"] for row in table(study / "out" / "group_regions.tsv")} == {"sub-03"}
 
@@ -335,10 +335,10 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
     assert "1 of 4 subjects failed (sub-04)" in printed
     assert "sub-04 failed: " in printed
     mean = np.median(np.trace(tensors(), axis1=-2, axis2=-1)) / 3
-    assert f"It is {mean:.3g} if the numbers are in um2/s: try --unit um2/s. If the numbers are right pass" in printed
+    assert f"If the numbers are in um2/s, the median is {mean:.3g}: try --unit um2/s. The subjects" in printed
     # The determinant of the last is positive, and so few voxels do not tell.
-    assert [line for line in printed.splitlines() if line.startswith("warning: sub-06: NIfTI does not declare")]
-    assert "sub-01: NIfTI does not declare" not in printed
+    assert [line for line in printed.splitlines() if line.startswith("warning: sub-06: The NIfTI file does not")]
+    assert "sub-01: The NIfTI file does not declare" not in printed
     values = [np.load(next((study / "out" / f"sub-0{i}" / "dwi").glob("*.npz")))["hks"] for i in (1, 5)]
     np.testing.assert_allclose(values[1], values[0], rtol=1e-6)
 
@@ -357,7 +357,7 @@ def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch
     assert "1 of 3 subjects failed (sub-02)" in capsys.readouterr().err
     summary = table(study / "out" / "group_summary.tsv")
     assert [row["status"] for row in summary] == ["done", "done", "failed"]
-    assert "expected the same unit of all subjects" in summary[2]["problem"]
+    assert "expected the same unit for all subjects" in summary[2]["problem"]
     told = rows.replace("npz", "npz\tum2/ms").replace("n2.npz\tum2/ms", "n2.npz\tum2/s")
     (study / "subjects.tsv").write_text("participant_id\tfile\tunit\n" + told)
     assert main([*arguments[:-1], "1e4", "-q", "--replace"]) == 0
@@ -376,9 +376,9 @@ def test_a_subject_is_done_again_when_its_sidecar_changes(study):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("id\tfile\n1\tt.nii\n", "row 2 has no participant_id"),
-        ("participant_id\tfile\nsub-1\ta\n1\tb\n", "sub-1 is there twice"),
-        ("participant_id\tfile\nsub-a_b\ta\n", "letters and digits alone"),
+        ("id\tfile\n1\tt.nii\n", "no participant_id in row 2"),
+        ("participant_id\tfile\nsub-1\ta\n1\tb\n", "two rows for sub-1"),
+        ("participant_id\tfile\nsub-a_b\ta\n", "only letters and digits"),
         ("participant_id,file\n", "separated by tabs"),
     ],
 )
@@ -404,7 +404,7 @@ def test_rows_join_the_options_of_the_command(tmp_path):
     assert (first.arguments.file, first.arguments.spacing) == (tmp_path / "a.npz", [1.0, 2.0])
     assert (first.arguments.b_max, second.arguments.b_max, second.arguments.erode) == (900, 1000, 2)
     assert (second.arguments.file, second.arguments.mask) == (Path("/b.npz"), tmp_path / "m.npy")
-    assert (first.arguments.mask, bad.arguments, empty.problem) == (None, None, "the row has no file")
+    assert (first.arguments.mask, bad.arguments, empty.problem) == (None, None, "got no file; expected one per row")
     assert "--spacing: invalid float value: 'x'" in bad.problem
 
 
@@ -413,7 +413,7 @@ def test_common_times_suit_all_subjects():
     assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
     scaled = common_times(ranges, 2, "lambda1")
     np.testing.assert_allclose(scaled, 2 * np.log(10) * np.array([2 / 50, 1]), rtol=5e-3)
-    with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and sub-01 is flat from t = 3 on"):
+    with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and sub-01 is nearly constant for t ≥ 3"):
         common_times({"sub-01": Range(2.0, 3.0), "sub-02": Range(4.0, 9.0)}, 3, "scanner")
 
 
@@ -504,7 +504,7 @@ def test_a_process_waits_for_what_another_computes(study, monkeypatch, capsys):
         monkeypatch.setattr("hks_jax.cli.study.tasks.time.sleep", end_of_the_other)
         assert main(command(study, "out", *LAMBDA1)) == 0
     printed = capsys.readouterr().err
-    assert printed.index(": sub-03") < printed.index("waiting for other processes, which compute 1 of the subjects")
+    assert printed.index(": sub-03") < printed.index("waiting for other processes that compute 1 of the subjects")
     assert printed.index("waiting for") < printed.index(": sub-02")
     assert not other.exists()
 
@@ -523,14 +523,14 @@ def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypat
     monkeypatch.setattr(Study, "write_signature", write_and_lose)
     assert main(command(study, "out", *LAMBDA1)) == 2
     printed = capsys.readouterr().err
-    assert "another process has given the study" in printed
+    assert "another process has meanwhile changed" in printed
     assert "sub-02" not in printed
 
 
 @pytest.mark.slow
 def test_a_claim_is_free_again_when_its_process_dies(tmp_path):
     file = tmp_path / "deep" / "claim"
-    code = f"from hks_jax.atomic import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
+    code = f"from hks_jax.storage import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
         assert process.stdout.readline() == "mine\n"
@@ -597,7 +597,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
     monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     assert boundary("new") == "mean"
-    assert "boundary mean (of all subjects alike" in capsys.readouterr().err
+    assert "boundary mean for all subjects" in capsys.readouterr().err
     assert boundary("old", "--boundary", "neumann:dirichlet,neumann") == [["neumann", "dirichlet"], "neumann"]
     assert boundary("old") == [["neumann", "dirichlet"], "neumann"]
     assert main(command(study, "old", "--times", "3e3", "--boundary", "mean")) == 2
@@ -635,7 +635,7 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
         save_tensors(study / "second.nii.gz", TensorVolume(other, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE))
 
     scan_again()
-    words = command(study, "out", "--times", "3e3", "6e3", "--noise", "0.01", "--draws", "4", "--save-pairs")
+    words = command(study, "out", "--times", "3e3", "6e3", "--noise", "0.01", "--draws", "8", "--save-pairs")
     assert main(words) == 0
     rows = table(study / "out" / "group_regions.tsv")
     stem = study / "out" / "sub-01" / "dwi" / "sub-01_model-tensor_param-hks"
@@ -649,15 +649,15 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     ]
     assert [noise["source"] for noise in noises] == ["second.nii.gz", "0.01"]
     before = contents(study / "out")
-    assert main([*words, "--draws", "6"]) == 2
-    assert "differs in --draws: 4, now 6" in capsys.readouterr().err
+    assert main([*words, "--draws", "12"]) == 2
+    assert "differs in --draws: 8, now 12" in capsys.readouterr().err
     scan_again()  # nothing is solved again but the noisy maps, of the one subject
     monkeypatch.setattr("hks_jax.cli.study.tasks.compute_pairs", None)
     assert main(words) == 0
-    assert "1 of 2 subjects are done already" in capsys.readouterr().err
+    assert "1 of 2 subjects are already done" in capsys.readouterr().err
     changed = {name for name, content in contents(study / "out").items() if before[name] != content}
     assert {name.split("/")[0] for name in changed} == {"sub-01", "group_regions.tsv"}
-    for more, text in ((["--noise", "second.nii.gz"], "a column noise"), (["--method", "auto"], "no error bars")):
+    for more, text in ((["--noise", "second.nii.gz"], "a column noise"), (["--method", "auto"], "expected spectral")):
         assert main([*words, *more]) == 2
         assert text in capsys.readouterr().err
 
@@ -705,7 +705,7 @@ def test_pairs_of_another_pencil_are_refused(tmp_path):
     with pytest.raises(ValueError, match="do not solve"):
         hj.io.load_pairs(path, pencil(1.1 * plane))
     fewer = {**np.load(path), "vectors": np.ones((6, 41))}
-    with pytest.raises(ValueError, match=r"got .* \(6, 41\); expected \(6, 42\), those of this pencil"):
+    with pytest.raises(ValueError, match=r"got .* \(6, 41\); expected \(6, 42\) for this pencil"):
         pairs_of("p.npz", fewer, pencil(plane))
     with pytest.raises(ValueError, match="lacks kept"):
         pairs_of("p.npz", {name: a for name, a in fewer.items() if name != "kept"}, pencil(plane))

@@ -121,9 +121,9 @@ def test_triangles_that_are_there_twice(tmp_path):
         with pytest.raises(ValueError, match=r"1 of 33 triangles are there twice \(the first are faces 5 and 32"):
             hj.SurfaceMesh(vertices, np.concatenate([faces, [again]]))
     path = save_off(tmp_path / "m.off", vertices, np.concatenate([faces, faces[:7]]))
-    with pytest.raises(ValueError, match=r"7 of 39 triangles are there twice .* clean=True puts right"):
+    with pytest.raises(ValueError, match=r"7 of 39 triangles are there twice .* clean=True repairs"):
         read_mesh(path)
-    with pytest.warns(UserWarning, match=r"m\.off: 7 triangles removed that are there twice$"):
+    with pytest.warns(UserWarning, match=r"m\.off: 7 duplicate triangles removed$"):
         mesh = read_mesh(path, clean=True)
     np.testing.assert_array_equal(mesh.faces, faces)
     np.testing.assert_allclose(eigenvalues(mesh), eigenvalues(hj.SurfaceMesh(vertices, faces)), atol=1e-12)
@@ -165,7 +165,7 @@ def test_a_thin_triangle_is_named_and_its_edge_flipped_if_asked(height, tmp_path
     what = "so thin that float64 knows no metric of them" if height else "have no area"
     with pytest.raises(ValueError, match=rf"1 of 34 triangles (are )?{what} \(the first is face 31"):
         hj.SurfaceMesh(vertices, faces)
-    with pytest.warns(UserWarning, match="1 edges flipped that passed through a vertex$"):
+    with pytest.warns(UserWarning, match="1 edges through a vertex flipped$"):
         mesh = read_mesh(save_off(tmp_path / "m.off", vertices, faces), clean=True)
     assert len(mesh.faces) == 34  # there is no crack
     assert len(mesh.triangulation.boundary_facets) == 16
@@ -195,7 +195,7 @@ def test_a_soup_of_triangles_is_refused_or_joined(apart, tmp_path, rng):
         ValueError, match=r"479 of 600 .* falls into 200 pieces that touch; there would be 1 .* clean=True"
     ):
         read_mesh(path)
-    with pytest.warns(UserWarning, match="479 vertices merged with another one at the same place"):
+    with pytest.warns(UserWarning, match="479 vertices merged with a coincident vertex"):
         mesh = read_mesh(path, clean=True)
     assert len(mesh.vertices) == 121
     np.testing.assert_allclose(eigenvalues(mesh), eigenvalues(hj.SurfaceMesh(vertices, faces)), atol=1e-6)
@@ -211,7 +211,7 @@ def test_a_seam_is_said(tmp_path):
     a, b, c, d = (part.ravel() for part in (node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     path = save_off(tmp_path / "tube.off", vertices, faces)
-    with pytest.warns(hj.AccuracyWarning, match=r"3 of 39 vertices lie where another one lies: the mesh is torn there"):
+    with pytest.warns(hj.AccuracyWarning, match=r"3 of 39 vertices coincide with another vertex\. The mesh is torn"):
         torn = read_mesh(path)
     with pytest.warns(UserWarning, match="3 vertices merged"):
         tube = read_mesh(path, clean=True)
@@ -227,13 +227,13 @@ def test_cleaning_says_all_that_it_did_on_the_command_line(tmp_path, capsys):
     assert main(["info", str(path)]) == 2
     said = capsys.readouterr().err
     assert "vertices: 1 of 52 belong to no face (the first is vertex 50); remove them" in said
-    assert "--clean puts right what it can" in said
+    assert "--clean repairs some defects" in said
     assert main(["info", str(path), "--clean", "--json"]) == 0
     captured = capsys.readouterr()
     assert captured.err.strip() == (
-        f"warning: {path}: 1 vertices that are NaN or infinite removed; 1 triangles at them removed; 1 vertices merged "
-        "with another one at the same place; 2 triangles without area removed; 1 triangles removed that are there "
-        "twice; 1 vertices without a face removed"
+        f"warning: {path}: 1 vertices with NaN or infinite coordinates removed; 1 triangles at such vertices removed; "
+        "1 vertices merged with a coincident vertex; 2 triangles without area removed; 1 duplicate triangles removed; "
+        "1 vertices without a face removed"
     )
     assert json.loads(captured.out)["vertices"] == 49
     options = ["-k", "6", "--times", "0.1", "-q"]
@@ -245,4 +245,4 @@ def test_cleaning_says_all_that_it_did_on_the_command_line(tmp_path, capsys):
     capsys.readouterr()
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (5, 5, 2, 2)))
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "o"), "--clean"]) == 2
-    assert "--clean: it is for meshes" in capsys.readouterr().err
+    assert "--clean: this option is for meshes" in capsys.readouterr().err

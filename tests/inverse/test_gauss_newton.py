@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 import scipy.linalg
 from fields import random_spd
@@ -94,6 +95,13 @@ def test_only_a_step_with_a_tight_linear_system_may_be_the_last(changes, tight, 
         state = optimiser.accepted(y + scale, eqx.tree_at(lambda s: s.values, state, y))
     np.testing.assert_allclose(state.change, changes[-1], rtol=1e-6)
     assert (bool(state.tight), bool(state.done)) == (tight, done)
+
+
+@pytest.mark.parametrize("start", [2.0, 1.0])
+def test_an_exact_solution_is_an_end(start):
+    """In float32 the root of x² − 4 has no residual, so that the gradient is zero and no step is left."""
+    solution = optx.least_squares(lambda x, _: x**2 - 4, GaussNewton(), jnp.full(1, start, jnp.float32), max_steps=20)
+    assert solution.value == 2
 
 
 @pytest.mark.slow

@@ -503,11 +503,16 @@ def test_bad_arguments_are_named(changes, message):
         fit()
 
 
+def test_an_array_is_no_place_to_start():
+    with unchecked(), pytest.raises(TypeError, match=r"init: got ndarray; expected hks_jax\.Grid or hks_jax\.Tensor"):
+        hj.fit_metric(np.ones((4, N, N)), TIMES, FLAT)
+
+
 def test_solvers_of_optimistix_are_taken_as_they_are():
     solver = optx.BFGS(1e-3, 1e-3)
     target = hj.heat_trace(hj.eigenpairs(CONFORMAL, K), TIMES)
     fit = hj.fit_metric(
-        FLAT,
+        GRID,
         target,
         TIMES,
         "conformal",

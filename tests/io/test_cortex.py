@@ -87,11 +87,16 @@ def test_the_command_line_and_what_is_refused(tmp_path, volume, capsys):
     command = ["hks", str(tmp_path / "lh.white"), "--tensors", str(image), *options]
     assert main([*command, "-o", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "hks.vtu").exists()
+    assert main([*command, "-o", str(tmp_path / "out"), "--noise", "0.05"]) == 0
+    with np.load(tmp_path / "out" / "hks.npz") as found:
+        assert found["noise_maps"].shape == (6, 1, 81)
+        relative = found["deviation"] / found["hks"]
+    assert ((relative > 0) & (relative < 0.05)).all()
     assert main([*command, "-o", str(tmp_path / "no"), "--array", "D"]) != 0
     assert "--tensors, --array: got both" in capsys.readouterr().err
     tensors = hj.io.read_tensors(image, frame="voxel")
-    with pytest.raises(ValueError, match=r"points: 81 of 81 have no voxel inside .* in_space=True"):
+    with pytest.raises(ValueError, match=r"points: got 81 of 81 points without a voxel inside .* in_space=True"):
         hj.io.sample_tensors(tensors, hj.io.read_mesh(tmp_path / "lh.white").vertices + 100)
     nibabel.freesurfer.write_geometry(tmp_path / "rh.white", places, faces, create_stamp="made for a test")
-    with pytest.raises(ValueError, match="does not say where its volume lies"):
+    with pytest.raises(ValueError, match="does not state the position of its volume"):
         hj.io.read_mesh(tmp_path / "rh.white", in_space=True)

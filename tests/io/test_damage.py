@@ -12,7 +12,7 @@ import hks_jax as hj
 from hks_jax.inverse import checkpoint
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.io import dwi
-from hks_jax.npz import load_npy, load_npz
+from hks_jax.storage import load_npy, load_npz
 
 AFFINE = np.diag([2.0, 2.0, 2.5, 1.0])
 

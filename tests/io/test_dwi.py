@@ -57,7 +57,7 @@ def test_voxels_without_a_finite_signal_are_left_out(scan):
     np.testing.assert_array_equal(fit.mask, head() & ~lost)
     np.testing.assert_allclose(fit.tensors[fit.mask], np.broadcast_to(D * FSL, (fit.mask.sum(), 3, 3)), atol=1e-8)
     assert not fit.tensors[~fit.mask].any()
-    assert f"3 of {head().sum()} voxels inside are left out: their signal is NaN or infinite" in fit.notes
+    assert f"3 of {head().sum()} voxels inside are left out: a signal there is NaN or infinite" in fit.notes
 
 
 def test_a_background_of_nan_is_outside(scan):
@@ -71,7 +71,7 @@ def test_a_background_of_nan_is_outside(scan):
 
 def test_an_image_without_signal_is_named(scan):
     scan.signal[..., 7] = np.nan
-    with pytest.raises(ValueError, match=r"d\.nii\.gz: of the images used 7 \(from 0\) have no finite signal inside"):
+    with pytest.raises(ValueError, match=r"d\.nii\.gz: the used images 7 \(from 0\) have no finite signal inside"):
         scan.fit(head())
 
 
@@ -85,7 +85,7 @@ def test_directions_of_unweighted_images_mean_nothing(scan, value):
 @pytest.mark.parametrize(("value", "length"), [(np.nan, "nan"), (0.0, "0"), (0.4, "0.6928")])
 def test_directions_of_another_length_are_refused_by_name(scan, value, length):
     scan.directions[5] = value
-    with pytest.raises(ValueError, match=rf"[/\\]g: 1 directions of .* the first that of image 5 .*length {length};"):
+    with pytest.raises(ValueError, match=rf"[/\\]g: got 1 directions of .* the first for image 5 .*length {length};"):
         scan.fit(head())
     scan.b[5] = 3000.0  # an image that is left out
     assert scan.fit(head(), b_max=1000).mask.sum() == head().sum()
@@ -96,23 +96,25 @@ def test_rounded_directions_are_divided_by_their_lengths(scan):
     scan.directions[2:] *= np.linspace(0.97, 1.03, 12)[:, None]
     fit = scan.fit(head())
     np.testing.assert_allclose(fit.tensors, expected, atol=1e-9)
-    assert "12 directions divided by their lengths, 0.97 to 1.03" in fit.notes
+    assert "12 directions were divided by their lengths, 0.97 to 1.03" in fit.notes
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("m2/s", 1e6), ("um2/ms", 1e-3)])
 def test_b_values_in_another_unit_are_refused_until_it_is_told(scan, capsys, unit, scale):
     expected = scan.fit(head())
     scan.b *= scale
-    with pytest.raises(ValueError, match=rf'[/\\]b: the largest b-value is .* would be 1000 s/mm².*pass unit "{unit}"'):
+    with pytest.raises(
+        ValueError, match=rf'[/\\]b: the largest b-value is .* the largest is 1000 s/mm².*pass unit "{unit}"'
+    ):
         scan.fit(head())
     told = scan.fit(head(), unit=unit, b_max=1200)
     np.testing.assert_allclose(told.tensors, expected.tensors, atol=1e-12)
-    assert told.notes[0] == "weighted least squares on 14 of 14 images (b ≤ 1000 s/mm²)"
+    assert told.notes[0] == "tensors fitted by weighted least squares to 14 of 14 images (b ≤ 1000)"
     assert told.unit == "mm²/s"
     images, b, g = map(str, scan.write())
     arguments = ["info", images, "--bval", b, "--bvec", g]
     assert main(arguments) == 2
-    assert f"pass --unit {unit}, that of the tensors" in capsys.readouterr().err
+    assert f"pass --unit {unit}, the unit of the tensors" in capsys.readouterr().err
     assert main([*arguments, "--unit", unit]) == 0
     assert "(b ≤ 1000 s/mm²)" in capsys.readouterr().out
 
@@ -142,12 +144,36 @@ def test_covariances_are_those_of_repeated_scans(scan, rng, frame):
     nib.save(nib.Nifti1Image(scan.signal, affine), paths[0])
     stated, found = (fit_dwi(*paths, whole, bvec_frame=frame, noise=noise) for noise in (sigma, "residuals"))
     expected = np.cov(lower(stated.tensors[whole]).T)
-    for fit in (stated, found):
-        mean = fit.covariance[whole].mean(axis=0)
+    assert stated.modes is None
+    # Nodes share nothing here, and residuals of images tell the same covariance as those of a voxel.
+    by_image = np.einsum("...na,...nb->...ab", found.modes, found.modes)
+    for covariance in (stated.covariance, found.covariance, by_image):
+        mean = covariance[whole].mean(axis=0)
         np.testing.assert_allclose(mean, expected, atol=0.08 * np.abs(expected).max())
-    assert "covariances of the tensors from the fit's residuals, of 13 degrees of freedom" in " ".join(found.notes)
+    assert "computed from the fit's residuals, with 13 degrees of freedom" in " ".join(found.notes)
     plane = found.slice("y", 10)
     np.testing.assert_array_equal(plane.covariance, found.covariance[:, 10][..., [0, 3, 5], :][..., [0, 3, 5]])
+    noise = plane.noise(plane.grid())
+    expected = by_image[:, 10][..., [0, 3, 5], :][..., [0, 3, 5]]
+    np.testing.assert_allclose(noise.covariance, expected, rtol=1e-4, atol=1e-6 * expected.max())
+    assert noise.freedom == 13
+
+
+def test_what_voxels_share_of_an_images_noise_is_found(scan, rng):
+    noisy_scan(scan, 60, rng)
+    drift = 0.02  # the deviation of the brightness of whole images
+    scan.signal *= 1 + drift * rng.standard_normal(60)
+    found = scan.fit(head(), noise="residuals")
+    apart = [1, 3, 4]  # xy xz yz, which the two images without weighting hardly change
+    variance = np.sum(np.square(found.modes[head()].mean(axis=0)[:, apart]))  # of the mean tensor over the head
+    g, b = scan.directions, scan.b
+    rows, columns = np.tril_indices(3)
+    X = np.column_stack([-b[:, None] * g[:, rows] * g[:, columns] * np.where(rows == columns, 1, 2), np.ones(60)])
+    W = np.exp(-2 * b * np.einsum("na,ab,nb->n", g, D, g))
+    pull = np.linalg.solve(X.T * W @ X, X.T * W)[apart]
+    assert 0.6 < variance / np.sum(drift**2 * pull**2) < 1.6
+    alone = found.covariance[head()].mean(axis=0)[apart, apart].sum() / head().sum()
+    assert variance > 20 * alone  # as many voxels would have it, did they share nothing
 
 
 def test_covariances_agree_with_the_wild_bootstrap(scan, rng):
@@ -199,5 +225,5 @@ def test_noise_needs_residuals(scan):
         scan.fit(head(), noise="residuals")
     scan.b[1] = 3000.0
     scan.b[8:] = 3000.0
-    with pytest.raises(ValueError, match=r'"residuals" with 7 images, and .* 7 unknowns; expected at least 8 images'):
+    with pytest.raises(ValueError, match=r'"residuals" with 7 images, but .* 7 unknowns; expected at least 8 images'):
         scan.fit(head(), b_max=1000, noise="residuals")

@@ -17,7 +17,7 @@ from hks_jax.io.tensor_order import pack
 
 SHAPE = (26, 24, 14)
 SPACING = (2.0, 1.8, 2.5)
-WRONG = "Wrong frame? Principal directions and those of the two neighbours along them differ by "
+WRONG = "Wrong frame? Principal directions differ from those of the two neighbours along them by "
 
 
 def positions():
@@ -124,7 +124,7 @@ def test_a_measurement_frame_with_a_wrong_sign_shows(tmp_path, axis):
     header["measurement frame"][:, axis] *= -1  # a component of each of its vectors
     nrrd.write(str(tmp_path / "u.nrrd"), data, header)
     (question,) = questions(read_tensors(tmp_path / "u.nrrd"))
-    assert f"along the measurement axes, and by 23.2° with the scanner's {'xyz'[axis]} axis reversed" in question
+    assert f"along the measurement axes, but only by 23.2° with the scanner's {'xyz'[axis]} axis reversed" in question
 
 
 def test_what_decides_nothing_is_no_question():
@@ -197,7 +197,7 @@ def test_gradient_directions_along_other_axes(scan, tmp_path, capsys):
     world = fit_dwi(scan / "oblique.nii.gz", names[1], scan / "world", everywhere, bvec_frame="world")
     np.testing.assert_allclose(world.tensors, right.tensors, atol=1e-9)
     assert world.frame == "world"
-    assert "gradient directions along the world axes, as asked; tensors taken to the voxel axes" in world.notes
+    assert "directions read along the world axes, as asked; tensors transformed to the voxel axes" in world.notes
     # On the command line.
     np.save(scan / "m.npy", everywhere)
     arguments = ["--mask", str(scan / "m.npy"), "--bval", str(names[1]), "--bvec"]
@@ -206,9 +206,9 @@ def test_gradient_directions_along_other_axes(scan, tmp_path, capsys):
     assert main(wrong) == 0
     assert "along the fsl axes: try --bvec-frame fsl\n" in capsys.readouterr().err
     assert main([*wrong[:-2], "--frame", "voxel"]) == 2
-    assert "--frame: it is for files of tensors; pass --bvec-frame" in capsys.readouterr().err
+    assert "--frame: this option is for files of tensors; pass --bvec-frame" in capsys.readouterr().err
     assert main(["info", out, "--bvec-frame", "fsl"]) == 2
-    assert "--bvec-frame: it is for diffusion-weighted images; of tensors pass --frame" in capsys.readouterr().err
+    assert "images; for tensors pass --frame" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------------------------------------------- own files
@@ -232,14 +232,12 @@ def test_own_files_say_along_which_axes_they_are(scan, capsys):
     assert main(["info", str(out)]) == 0
     printed = capsys.readouterr().out
     angle = coherence(own).angle
-    assert (
-        f"differ by {angle:.1f}° in the mean, and clearly more along the fsl axes, or with y, z reversed\n" in printed
-    )
+    assert f"by {angle:.1f}° on average, and clearly more along the fsl axes, or with y, z reversed\n" in printed
     assert "--frame" not in printed
     # Whoever mirrors it nevertheless is told.
     assert main(["info", str(out), "--frame", "fsl"]) == 0
     printed = capsys.readouterr().out
-    assert "the voxel axes that the file declares are set aside for the fsl axes, as asked" in printed
+    assert "components read along the fsl axes, as asked; the file declares the voxel axes" in printed
     assert "try --frame voxel" in printed
     for name, frame in (("own.nrrd", "measurement"), ("own.npz", "voxel")):
         written = read_tensors(save_tensors(scan / name, own))

@@ -168,11 +168,11 @@ def test_components_in_npy_and_npz(tmp_path, tensors, d, order):
     read = hj.io.read_tensors(tmp_path / "t.npy", order, spacing=0.5)
     np.testing.assert_array_equal(read.tensors, whole)
     assert (read.order, read.spacing) == (order, (0.5,) * d)
-    with pytest.raises(ValueError, match="does not declare their order, and programs differ"):
+    with pytest.raises(ValueError, match="does not declare their order, which depends"):
         hj.io.read_tensors(tmp_path / "t.npy")
     np.savez(tmp_path / "t.npz", D=components, order=order, spacing=np.ones(d))
     np.testing.assert_array_equal(hj.io.read_tensors(tmp_path / "t.npz", array="D").tensors, whole)
-    with pytest.raises(ValueError, match=r"spacing: .* has its own"):
+    with pytest.raises(ValueError, match=r"spacing: .* declares"):
         hj.io.read_tensors(tmp_path / "t.npz", array="D", spacing=2.0)
 
 
@@ -190,7 +190,7 @@ def test_frames_in_npz(tmp_path, tensors):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"D": np.eye(2)}, "has no array 'tensors' \\(it has D\\)"),
+        ({"D": np.eye(2)}, "got the arrays D; expected 'tensors'"),
         ({"tensors": np.zeros((3, 4, 5))}, "expected \\(nx, ny, 2, 2\\) or \\(nx, ny, nz, 3, 3\\)"),
         ({"tensors": np.zeros((3, 4, 2, 2)), "spacing": [1, 2, 3]}, "spacing: got .* expected 2 finite numbers"),
         ({"tensors": np.zeros((3, 4, 2, 2)), "mask": np.ones((4, 3))}, "mask: got shape \\(4, 3\\)"),
@@ -208,7 +208,7 @@ def test_unreadable_files(tmp_path, tensors):
     with pytest.raises(FileNotFoundError, match="no such file"):
         hj.io.read_tensors(tmp_path / "absent.nii.gz")
     (tmp_path / "t.mha").write_text("")
-    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii, \.nii\.gz, \.mif"):
+    with pytest.raises(ValueError, match=r"kind of file is unknown; expected \.nii, \.nii\.gz, \.mif"):
         hj.io.read_tensors(tmp_path / "t.mha")
     for name in ("t.nii", "t.nii.gz", "t.npz"):
         (tmp_path / name).write_bytes(b"not what the name says")
@@ -216,7 +216,7 @@ def test_unreadable_files(tmp_path, tensors):
             hj.io.read_tensors(tmp_path / name)
     whole = write_components(tmp_path / "w.nii.gz", pack(tensors, "nifti")[..., None, :], np.eye(4), intent=True)
     (tmp_path / "cut.nii").write_bytes(gzip.decompress(whole.read_bytes())[:800])
-    with pytest.raises(ValueError, match=r"cut\.nii: not a readable NIfTI image.* the file at 800"):
+    with pytest.raises(ValueError, match=r"cut\.nii: not a readable NIfTI image.*got 800 bytes"):
         hj.io.read_tensors(tmp_path / "cut.nii")
 
 
@@ -274,9 +274,9 @@ def test_bad_slices(volume):
         volume.slice("z", 6)
     with pytest.raises(ValueError, match="axis: got 'w'"):
         volume.slice("w", 0)
-    with pytest.raises(ValueError, match="empty in slice x = 0; it has voxels inside at x = 1 … 3"):
+    with pytest.raises(ValueError, match="no voxels in slice x = 0; the mask has voxels at x = 1 … 3"):
         volume.slice("x", 0)
-    with pytest.raises(ValueError, match="slice already"):
+    with pytest.raises(ValueError, match="got a slice; expected a volume"):
         volume.slice("z", 0).slice("z", 0)
 
 
@@ -299,10 +299,10 @@ def test_bad_masks(tmp_path, volume):
     elsewhere = volume.affine.copy()
     elsewhere[0, 3] += 2.0
     write_components(tmp_path / "m.nii", volume.mask.astype(np.uint8), elsewhere)
-    with pytest.raises(ValueError, match="places it up to 2 away"):
+    with pytest.raises(ValueError, match="displaces it by up to 2 from"):
         hj.io.read_tensors(tmp_path / "t.nii", mask=tmp_path / "m.nii")
     np.savez(tmp_path / "m.npz", inside=volume.mask)
-    with pytest.raises(ValueError, match="has no array 'mask' \\(it has inside\\)"):
+    with pytest.raises(ValueError, match="got the arrays inside; expected an array 'mask'"):
         read_mask(tmp_path / "m.npz")
 
 
@@ -313,7 +313,7 @@ def test_erosion_peels_the_rim_but_not_the_border_of_the_image():
     assert eroded.sum() == 3 * 3 * 2
     assert eroded[3:6, 3:6].all()
     assert erode(mask, 0) is mask
-    with pytest.raises(ValueError, match="leaves nothing of 98 voxels"):
+    with pytest.raises(ValueError, match="removes all 98 voxels"):
         erode(mask, 4)
     with pytest.raises(ValueError, match="expected 0 or more"):
         erode(mask, -1)
@@ -385,9 +385,9 @@ def test_times_of_an_image_are_beside_it(tmp_path, volume):
 def test_results_that_cannot_be_saved(tmp_path, volume):
     with pytest.raises(ValueError, match=r"values: got shape \(5, 4, 6\); expected \(4, 5, 6\)"):
         hj.io.save(tmp_path / "v.npz", np.zeros((5, 4, 6)), volume)
-    with pytest.raises(ValueError, match=r"unknown kind of file; expected \.nii\.gz, \.nii, \.nrrd, \.vti, \.npz"):
+    with pytest.raises(ValueError, match=r"kind of file is unknown; expected \.nii\.gz, \.nii, \.nrrd, \.vti, \.npz"):
         hj.io.save(tmp_path / "v.txt", np.zeros(SHAPE), volume)
-    with pytest.raises(ValueError, match="NIfTI has no place for more arrays"):
+    with pytest.raises(ValueError, match="NIfTI allows only times"):
         hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"eigenvalues": [1]})
     with pytest.raises(ValueError, match="no 2×2 tensors"):
         hj.io.save_tensors(tmp_path / "v.nii", volume.slice("z", 1))
@@ -476,7 +476,7 @@ def test_fit_recovers_the_tensors_of_a_perfect_scan(scan, volume):
     np.testing.assert_allclose(fit.tensors[volume.mask], volume.tensors[volume.mask], rtol=1e-5, atol=1e-8)
     assert not fit.tensors[~volume.mask].any()
     np.testing.assert_allclose(fit.spacing, volume.spacing, rtol=1e-6)
-    assert fit.notes[0] == "weighted least squares on 15 of 25 images (b ≤ 800 s/mm²)"
+    assert fit.notes[0] == "tensors fitted by weighted least squares to 15 of 25 images (b ≤ 800)"
 
 
 @pytest.mark.parametrize("flip", [1, -1])
@@ -521,7 +521,7 @@ def test_a_scan_without_a_mask_is_masked_by_dipy(tmp_path):
     assert not fit.mask[~brain].any()
     assert fit.mask.sum() > 0.5 * brain.sum()
     assert np.linalg.eigvalsh(fit.tensors[fit.mask]).min() > 3.9e-4
-    assert fit.notes[1] == f"no mask: DIPY's median_otsu of the unweighted images keeps {fit.mask.sum()} voxels"
+    assert fit.notes[1] == f"no mask given: DIPY's median_otsu finds {fit.mask.sum()} voxels in the unweighted images"
 
 
 def test_bad_scans(scan, volume):
@@ -596,5 +596,5 @@ def test_a_result_on_a_mesh_has_no_volume(tmp_path):
     read = hj.io.Result.read(tmp_path)
     np.testing.assert_array_equal(read.place.cells, mesh.cells)
     assert (read.settings, read.unit) == ({}, "")
-    with pytest.raises(ValueError, match=r"hks\.npz: is on a mesh"):
+    with pytest.raises(ValueError, match=r"hks\.npz: got a result on a mesh"):
         read.volume  # noqa: B018

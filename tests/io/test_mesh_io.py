@@ -75,12 +75,10 @@ def test_seams_are_closed_if_asked(tmp_path):
     split = np.concatenate([split, [[0, 0, 1]]])  # a triangle without area, and a vertex without a triangle
     meshio.Mesh(np.concatenate([corners, [[9.0, 9, 9]]]), [("triangle", split)]).write(tmp_path / "m.obj")
     with pytest.raises(
-        ValueError, match=r"belong to no face \(the first is vertex 24\); remove them.* clean=True puts"
+        ValueError, match=r"belong to no face \(the first is vertex 24\); remove them.* clean=True repairs"
     ):
         read_mesh(tmp_path / "m.obj")
-    with pytest.warns(
-        UserWarning, match="18 vertices merged with another one at the same place; 1 triangles without area"
-    ):
+    with pytest.warns(UserWarning, match="18 vertices merged with a coincident vertex; 1 triangles without area"):
         mesh = read_mesh(tmp_path / "m.obj", clean=True)
     assert mesh.vertices.shape == (6, 3)
     np.testing.assert_array_equal(sorted_corners(mesh.vertices, mesh.faces), sorted_corners(vertices, faces))
@@ -130,7 +128,7 @@ def test_tetrahedra_and_arrays_there_and_back(tmp_path, suffix, rng):
     np.testing.assert_array_equal(list(arrays.values()), values)
     with np.load(save(tmp_path / "b.npz", values[0], SOLID)) as read:
         np.testing.assert_array_equal(read["cells"], SOLID.cells)
-    with pytest.raises(ValueError, match=r"tetrahedra are written as \.vtu, \.vtk, \.msh or \.npz"):
+    with pytest.raises(ValueError, match=r"tetrahedra can be written as \.vtu, \.vtk, \.msh or \.npz"):
         save(tmp_path / "b.ply", values[0], SOLID)
 
 
@@ -143,9 +141,12 @@ def test_cleaned_tetrahedra_and_their_arrays(tmp_path, rng):
     tensors = rng.random((641, 9))
     tensors[1:] = corners @ rng.random((3, 9))
     meshio.Mesh(points, [("tetra", cells)], point_data={"D": tensors}).write(tmp_path / "m.vtu")
-    with pytest.raises(ValueError, match=r"belong to no cell \(the first is vertex 0\).* clean=True puts right"):
+    with pytest.raises(ValueError, match=r"belong to no cell \(the first is vertex 0\).* clean=True repairs"):
         read_mesh(tmp_path / "m.vtu")
-    with pytest.warns(UserWarning, match="54 tetrahedra turned round; 1 tetrahedra without volume removed; 1 vertices"):
+    with pytest.warns(
+        UserWarning,
+        match="54 tetrahedra of negative orientation reversed; 1 tetrahedra without volume removed; 1 vertices",
+    ):
         mesh = read_mesh(tmp_path / "m.vtu", clean=True)
     assert mesh.vertices.shape == (55, 3)
     assert float(hj.assemble(mesh).volume) == pytest.approx(float(hj.assemble(SOLID).volume))
@@ -212,17 +213,17 @@ def test_surfaces_of_neuroimaging(tmp_path):
         with pytest.raises(ValueError, match=f"{name}: not a readable"):
             read_mesh(tmp_path / name)
     nibabel.save(nibabel.gifti.GiftiImage(darrays=arrays[:1]), tmp_path / "p.gii")
-    with pytest.raises(ValueError, match="it has 1 and 0 arrays of points and of triangles; expected one of each"):
+    with pytest.raises(ValueError, match="got 1 and 0 arrays of points and of triangles; expected one of each"):
         read_mesh(tmp_path / "p.gii")
     (tmp_path / "lh.inflated").write_bytes(b"something else")
-    with pytest.raises(ValueError, match=r"unknown kind of mesh; expected .*, or a surface of FreeSurfer's"):
+    with pytest.raises(ValueError, match=r"kind of mesh is unknown; expected .*, or a FreeSurfer surface"):
         read_mesh(tmp_path / "lh.inflated")
 
 
 def test_bad_meshes(tmp_path, capsys):
     vertices, faces = octahedron()
     meshio.Mesh(vertices, [("wedge", np.array([[0, 2, 4, 5, 1, 3]]))]).write(tmp_path / "w.vtu")
-    with pytest.raises(ValueError, match="has wedge cells; expected triangles"):
+    with pytest.raises(ValueError, match="got wedge cells; expected triangles"):
         read_mesh(tmp_path / "w.vtu")
     meshio.Mesh(vertices, [("line", faces[:, :2])]).write(tmp_path / "l.vtu")
     with pytest.raises(ValueError, match="has no triangles"):
@@ -234,11 +235,11 @@ def test_bad_meshes(tmp_path, capsys):
     with pytest.raises(FileNotFoundError, match="no such file"):
         read_mesh(tmp_path / "absent.ply")
     (tmp_path / "m.gts").write_text("")
-    with pytest.raises(ValueError, match="unknown kind of mesh"):
+    with pytest.raises(ValueError, match="kind of mesh is unknown"):
         read_mesh(tmp_path / "m.gts")
     mesh = hj.SurfaceMesh(vertices, faces)
-    with pytest.raises(ValueError, match=r"written as \.vtu, \.vtk, \.msh, \.ply or \.npz"):
+    with pytest.raises(ValueError, match=r"can be written as \.vtu, \.vtk, \.msh, \.ply or \.npz"):
         save(tmp_path / "v.stl", np.zeros(6), mesh)
-    with pytest.raises(ValueError, match=r"expected \(6,\), or n_times before it"):
+    with pytest.raises(ValueError, match=r"expected \(6,\), or \(n_times, \*shape\)"):
         save(tmp_path / "v.ply", np.zeros(7), mesh)
     assert capsys.readouterr().out == ""  # meshio's own reader prints, and ends the process

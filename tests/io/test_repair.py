@@ -68,7 +68,9 @@ def test_mask_and_nearest(volume):
     far = TensorVolume(volume.tensors, (3.0, 1.0), (0.0, 0.0), volume.mask)
     np.testing.assert_array_equal(repair_tensors(far, "nearest").tensors[2, 3], volume.tensors[2, 4])
     assert not find_invalid(repair_tensors(far, "nearest")).any()
-    with pytest.raises(ValueError, match='NaN or infinite and have no eigenvalues to clip; choose "mask" or "nearest"'):
+    with pytest.raises(
+        ValueError, match=r'NaN or infinite and have no eigenvalues to clip\. Choose "mask" or "nearest"'
+    ):
         repair_tensors(far, "clip")
 
 
@@ -85,7 +87,7 @@ def test_the_report(volume):
         "first": [[2, 3], [4, 1]],
     }
     assert "2 of 63 tensors have an eigenvalue below 0.0001 (the worst eigenvalue is -0.0004)" in mended.notes[-1]
-    assert "eigenvalues raised to 0.0001" in mended.notes[-1]
+    assert "eigenvalues are raised to 0.0001" in mended.notes[-1]
     sound = repair_tensors(mended, "mask")
     assert (sound.repair["voxels"], sound.notes) == (0, mended.notes)
     np.testing.assert_array_equal(sound.inside, volume.inside)
@@ -112,7 +114,7 @@ def test_bad_repairs(volume):
     with pytest.raises(ValueError, match="floor: got -1; expected a finite number above 0"):
         repair_tensors(volume, "clip", -1)
     hopeless = TensorVolume(-volume.tensors, (1.0, 1.0), (0.0, 0.0), volume.mask & (np.indices(SHAPE)[0] > 4))
-    with pytest.raises(ValueError, match="none of the 27 tensors is positive definite; check order and units"):
+    with pytest.raises(ValueError, match=r"none of the 27 tensors is positive definite\. Check the order"):
         repair_tensors(hopeless, "clip")
 
 

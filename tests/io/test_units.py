@@ -44,7 +44,7 @@ def test_lengths_of_nifti_are_in_mm(tmp_path, capsys, unit, voxel, expected):
     np.testing.assert_allclose(read.spacing, [expected] * 3, rtol=1e-6)
     np.testing.assert_allclose(read.affine, np.diag([-expected, expected, expected, 1]), rtol=1e-6)
     assert read.length_unit == "mm"
-    assert any(note.startswith("lengths in ") for note in read.notes) == (unit in ("micron", "meter"))
+    assert any(", which the file declares, to mm" in note for note in read.notes) == (unit in ("micron", "meter"))
     # What is written of it is in mm, and says so.
     for path in (save(tmp_path / "v.nii.gz", np.ones(SHAPE), read), save_tensors(tmp_path / "w.nii.gz", read)):
         header = nib.load(path).header
@@ -66,11 +66,11 @@ def test_masks_and_labels_that_lost_the_unit_lie_where_the_tensors_do(tmp_path):
         nib.save(image, tmp_path / "m.nii")
         np.testing.assert_array_equal(read_mask(tmp_path / "m.nii", read.affine), values == 1)
         np.testing.assert_array_equal(read_labels(tmp_path / "m.nii", read), values)
-        with pytest.raises(ValueError, match=r"affine is the image's, .* cropped or resampled without its affine"):
+        with pytest.raises(ValueError, match=r"with the image's affine; .* cropped or resampled without its affine"):
             read_labels(tmp_path / "m.nii", twice)
     image.header.set_xyzt_units("meter")
     nib.save(image, tmp_path / "m.nii")
-    with pytest.raises(ValueError, match="the mask's affine places it"):
+    with pytest.raises(ValueError, match="the mask's affine displaces it"):
         read_mask(tmp_path / "m.nii", read.affine)
 
 
@@ -86,7 +86,7 @@ def test_a_unit_that_nifti_does_not_have_is_refused(tmp_path):
     image = nib.load(write(tmp_path / "t.nii", "mm", 2.0))
     image.header["xyzt_units"] = 5
     nib.save(image, tmp_path / "t2.nii")
-    with pytest.raises(ValueError, match=r"t2\.nii: its unit of space has the code 5"):
+    with pytest.raises(ValueError, match=r"t2\.nii: got the code 5 for the unit of space"):
         read_tensors(tmp_path / "t2.nii")
 
 
@@ -108,7 +108,7 @@ def test_lengths_of_nrrd_are_in_mm(tmp_path, unit, factor, placed):
     read = read_tensors(tmp_path / "t.nrrd")
     np.testing.assert_allclose(read.spacing, [3 * factor] * 3)
     assert read.length_unit == "mm"
-    assert (f"lengths in {unit}, as the file declares, are in mm here" in read.notes) == (unit != "mm")
+    assert (f"lengths converted from {unit}, which the file declares, to mm" in read.notes) == (unit != "mm")
     if placed:
         np.testing.assert_allclose(read.affine[:3, 3], factor * np.array([1, 2, 3]))
         nrrd.write(
@@ -126,7 +126,7 @@ def test_lengths_of_nrrd_are_in_mm(tmp_path, unit, factor, placed):
 def test_voxels_that_no_scan_has_are_asked_about(tmp_path):
     assert questions(read_tensors(write(tmp_path / "t.nii", "mm", 2.0))) == ()
     (question,) = questions(read_tensors(write(tmp_path / "t.nii", "meter", 2.0)))
-    assert "Wrong unit of length? Voxels of 2000 × 2000 × 2000 mm" in question
+    assert "Wrong unit of length? The voxel sizes are 2000 × 2000 × 2000 mm" in question
     assert "150 × 150 × 150 mm" in questions(read_tensors(write(tmp_path / "t.nii", "unknown", 150.0)))[0]
 
 
@@ -142,7 +142,7 @@ def test_a_wrong_unit_is_asked_about_and_can_be_told(tmp_path, unit, scale, dtyp
     path = write(tmp_path / "t.nii", "mm", 2.0, scale, dtype)
     (question,) = questions(read_tensors(path))
     assert f"Wrong unit? The median mean diffusivity is {7e-4 * scale:.3g} mm²/s" in question
-    assert f'It is 0.0007 if the numbers are in {unit}: try unit "{unit}"' in question
+    assert f'If the numbers are in {unit}, the median is 0.0007: try unit "{unit}"' in question
     told = read_tensors(path, unit=unit)
     np.testing.assert_allclose(told.tensors, np.broadcast_to(D, (*SHAPE, 3, 3)), rtol=1e-6)
     assert (told.unit, told.tensors.dtype) == ("mm²/s", dtype)
@@ -151,14 +151,14 @@ def test_a_wrong_unit_is_asked_about_and_can_be_told(tmp_path, unit, scale, dtyp
     for name in ("a.nii.gz", "a.npz"):
         kept = read_tensors(save_tensors(tmp_path / name, told))
         assert (kept.unit, kept.length_unit) == ("mm²/s", "mm")
-        with pytest.raises(ValueError, match=r"unit: .* declares mm²/s itself; leave this out"):
+        with pytest.raises(ValueError, match=r"unit: .* declares mm²/s\. Leave this argument out"):
             read_tensors(tmp_path / name, unit=unit)
 
 
 def test_nothing_is_asked_where_nothing_can_be_said(tmp_path):
     assert questions(read_tensors(write(tmp_path / "t.nii", "mm", 2.0))) == ()
     odd = questions(read_tensors(write(tmp_path / "t.nii", "mm", 2.0, 1e4)))
-    assert "no usual unit explains it" in odd[0]
+    assert "No usual unit explains" in odd[0]
     # Lengths without a unit: stress, a metric, anything.
     assert questions(TensorVolume(np.broadcast_to(np.eye(3), (*SHAPE, 3, 3)), (1.0,) * 3, (0.0,) * 3)) == ()
     with unchecked(), pytest.raises(ValueError, match="unit: got 'furlong'; expected one of mm2/s, um2/ms"):
@@ -170,16 +170,16 @@ def test_info_says_units_and_asks(tmp_path, capsys):
     assert main(["info", path]) == 0
     text = capsys.readouterr().out
     assert "spacing         0.15 × 0.15 × 0.15 mm\n" in text
-    assert "lengths in um, as the file declares: voxels of 150 × 150 × 150 are in mm here\n" in text
+    assert "voxel sizes 150 × 150 × 150 converted from um, which the file declares, to mm\n" in text
     assert f"median {np.linalg.eigvalsh(D)[1]:.3g} mm²/s (not declared)\n" in text
     assert "diffusivity     0.0007 mm²/s (not declared), the median" in text
-    assert " s by the size\n" in text.partition("metric inverse")[2]
+    assert " s from the size\n" in text.partition("metric inverse")[2]
 
     path = str(write(tmp_path / "t.nii.gz", "mm", 2.0, 1e6))
     assert main(["info", path]) == 0
     text = capsys.readouterr().out
     assert "question        Wrong unit? The median mean diffusivity is 700 mm²/s" in text
-    assert "if the numbers are in um2/s: try --unit um2/s\n" in text
+    assert ": try --unit um2/s\n" in text
     assert "diffusivity     700 (unit not declared)" in text
     assert main(["info", path, "--unit", "um2/s"]) == 0
     text = capsys.readouterr().out
@@ -200,7 +200,7 @@ def test_commands_warn_of_a_wrong_unit(tmp_path, capsys):
 @pytest.mark.parametrize("option", [["--unit", "um2/s"], ["--bvec-frame", "world"]])
 def test_a_mesh_has_none_of_these_options(tmp_path, capsys, option):
     assert main(["hks", str(tmp_path / "heart.vtu"), "-o", str(tmp_path / "out"), *option]) == 2
-    assert f"{option[0]}: it is for tensors on a grid; leave it out for a mesh" in capsys.readouterr().err
+    assert f"{option[0]}: this option is for tensors on a grid; leave it out for a mesh" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def test_what_is_left_open_is_refused(tmp_path, tensors):
     np.testing.assert_allclose(read_tensors(path, "vtk").tensors, tensors)
     add(data.GetPointData(), "E", 2 * six(tensors), declared=False)
     write(path, data)
-    with pytest.raises(ValueError, match=r"it has \(with components\) 'D' \(6\), 'E' \(6\). Pass array"):
+    with pytest.raises(ValueError, match=r"got the arrays \(components\) 'D' \(6\), 'E' \(6\); .* Pass array"):
         read_tensors(path, "vtk")
     np.testing.assert_allclose(read_tensors(path, "vtk", array="E").tensors, 2 * tensors)
     with pytest.raises(ValueError, match="named 'F'"):
@@ -202,20 +202,20 @@ def test_results_with_their_times(tmp_path, volume):
     np.testing.assert_array_equal(vtk_to_numpy(data.GetFieldData().GetArray("times")), [0.5, 2])
     record = json.loads(data.GetFieldData().GetAbstractArray("provenance").GetValue(0))
     assert (record["k"], record["software"]) == (7, f"hks-jax {hj.__version__}")
-    with pytest.raises(ValueError, match=r"unknown kind of file; expected .*\.vti"):
+    with pytest.raises(ValueError, match=r"kind of file is unknown; expected .*\.vti"):
         save(tmp_path / "v.vtk", values, volume)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (r'"0 3 0 4 0 5"', '"0 3999 0 4999 0 99999"', "VTK died over it"),  # it aborts for want of memory
-        (r'WholeExtent="0 3', 'WholeExtent="0 99999999', "its pieces have 60 cells; expected the"),
-        (r'WholeExtent="0 3', 'WholeExtent="-1 3', "its pieces have 60 cells; expected the 80 of"),
-        (r'Direction="', 'Direction="7', "expected orthogonal columns of length one"),
+        (r'"0 3 0 4 0 5"', '"0 3999 0 4999 0 99999"', "VTK crashed"),  # it aborts for want of memory
+        (r'WholeExtent="0 3', 'WholeExtent="0 99999999', "got pieces with 60 cells; expected the"),
+        (r'WholeExtent="0 3', 'WholeExtent="-1 3', "got pieces with 60 cells; expected the 80 cells of"),
+        (r'Direction="', 'Direction="7', "expected orthonormal columns"),
         (r'NumberOfTuples="1"', 'NumberOfTuples="99999999999"', ""),
-        (r'NumberOfComponents="9"', 'NumberOfComponents="6"', "'tensors' has rows of lengths"),
-        (r'type="Float64"', 'type="Float32"', "'tensors' has rows of lengths"),
+        (r'NumberOfComponents="9"', 'NumberOfComponents="6"', "'tensors' has rows with norms"),
+        (r'type="Float64"', 'type="Float32"', "'tensors' has rows with norms"),
         (r'"vtkZLibDataCompressor"', '"vtkNoDataCompressor"', ""),
         (r"_\w{12}", "_////////AAAA", ""),
     ],

@@ -132,20 +132,20 @@ def test_mrtrixs_own_images(tmp_path, layout):
 def test_damaged_images_of_mrtrix(tmp_path):
     whole = gzip.decompress(base64.b64decode(next(iter(MIF.values()))))
     for content, words in (
-        (whole[:-1], "end at byte 900, the file at 899"),
+        (whole[:-1], "got 899 bytes; expected 900"),
         (whole.replace(b"Float32BE", b"CFloat32BE"), "expected real numbers"),
-        (whole.replace(b"-0,+1,-2,+3", b"-0,+1,-2,+2"), "layout is"),
-        (whole.replace(b"dim: 4,3,2,6", b"dim: 4,3,9,6"), "end at byte"),
-        (whole.replace(b"file: . 324", b"file: x 324"), "not in it"),
+        (whole.replace(b"-0,+1,-2,+3", b"-0,+1,-2,+2"), "layout: got"),
+        (whole.replace(b"dim: 4,3,2,6", b"dim: 4,3,9,6"), "bytes; expected"),
+        (whole.replace(b"file: . 324", b"file: x 324"), "expected voxels in the file itself"),
         (whole[7:], "does not begin with"),
     ):
         (tmp_path / "t.mif").write_bytes(content)
-        with pytest.raises(ValueError, match=rf"t\.mif: not a readable image of MRtrix.*{words}"):
+        with pytest.raises(ValueError, match=rf"t\.mif: not a readable MRtrix image.*{words}"):
             hj.io.read_tensors(tmp_path / "t.mif")
     (tmp_path / "t.mih").write_bytes(whole)
-    with pytest.raises(ValueError, match=r"MRtrix makes one file of it: mrconvert .*t\.mih .*t\.mif"):
+    with pytest.raises(ValueError, match=r"MRtrix converts it into one file: mrconvert .*t\.mih .*t\.mif"):
         hj.io.read_tensors(tmp_path / "t.mih")
-    with pytest.raises(ValueError, match=r"Camino's own files .* dt2nii -inputfile .*dt\.Bdouble -header"):
+    with pytest.raises(ValueError, match=r"Camino's raw files .* dt2nii -inputfile .*dt\.Bdouble -header"):
         hj.io.read_tensors(tmp_path / "dt.Bdouble")
 
 
@@ -183,7 +183,7 @@ def test_the_command_line_asks_whether_the_order_is_wrong(tmp_path, capsys):
     arguments = [str(tmp_path / "t.nii.gz"), "--order", "nifti"]
     assert main(["hks", *arguments, "-o", str(tmp_path / "out"), "--metric", "inverse", "-q"]) == 2
     error = capsys.readouterr().err
-    assert "Wrong order? Of 24 tensors that are not zero, 24 are not positive definite as" in error
+    assert "Wrong order? Of 24 nonzero tensors, 24 are not positive definite in order" in error
     assert "try --order fsl" in error
     assert main(["info", *arguments]) == 0
     assert "try --order fsl" in capsys.readouterr().out

@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from hks_jax import Grid, SurfaceMesh, TensorField, plot
 from hks_jax.domain.examples import bumpy_torus_field, bumpy_torus_mesh, figure3_fields, figure4_fields
-from hks_jax.paper import fields, figure1, figure2, figure6, run, table1, triangles
+from hks_jax.paper import figure6, figures, run, table1, triangles
 from hks_jax.paper.signature import continued_signature, enough_pairs, flat_signature, signature
 
 # What an independent implementation of the same method gives.
@@ -156,21 +156,20 @@ def cheap(monkeypatch):
             values = np.where(domain.grid.inside, 2 + np.sin(domain.grid.nodes).sum(axis=-1), np.nan)
         return np.stack([values / t for t in times])
 
-    for module in (figure1, figure6):
+    for module in (figures, figure6):
         monkeypatch.setattr(module, "signature", cheap_signature)
-    for module in (figure2, fields):
-        monkeypatch.setattr(module, "flat_signature", lambda f, t, b="neumann": cheap_signature(f, [t], 1)[0])
-    monkeypatch.setattr(fields, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
-    monkeypatch.setattr(figure2, "hks_expansion", lambda f, t: cheap_signature(f, t, 1))
+    monkeypatch.setattr(figures, "flat_signature", lambda f, t, b="neumann": cheap_signature(f, [t], 1)[0])
+    monkeypatch.setattr(figures, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
+    monkeypatch.setattr(figures, "hks_expansion", lambda f, t: cheap_signature(f, t, 1))
 
 
-def draw(figure, tmp_path, drawn, monkeypatch, size=None, **settings):
+def draw(name, tmp_path, drawn, monkeypatch, size=None, time=None):
     """Run one figure with small settings, and return it once its file and its layout are right."""
-    name = figure if isinstance(figure, str) else figure.__name__.rsplit(".", 1)[-1]
-    for setting, value in settings.items():
-        monkeypatch.setattr(figure, setting, value)
+    monkeypatch.setattr(figures, "DRAWN", 20)
     if size is not None:
-        monkeypatch.setitem(fields.SIZES, name, (size, size))
+        monkeypatch.setitem(figures.SIZES, name, (size, size))
+    if time is not None:
+        monkeypatch.setitem(figures.TIMES, name, time)
     (path,) = run(tmp_path, only=[name], echo=lambda text: None)
     pixels = imread(path)
     assert path == tmp_path / f"{name}.png"
@@ -192,7 +191,7 @@ def draw(figure, tmp_path, drawn, monkeypatch, size=None, **settings):
 
 @pytest.mark.usefixtures("cheap")
 def test_figure_1_shows_a_surface_and_its_chart(tmp_path, drawn, monkeypatch):
-    fig = draw(figure1, tmp_path, drawn, monkeypatch, QUICK=(60, 10), DRAWN=20)
+    fig = draw("figure1", tmp_path, drawn, monkeypatch, size=(60, 10))
     assert [ax.name for ax in fig.axes[:4]] == ["3d", "3d", "rectilinear", "rectilinear"]
     surface = bumpy_torus_mesh(20)
     for ax in fig.axes[:2]:
@@ -204,7 +203,7 @@ def test_figure_1_shows_a_surface_and_its_chart(tmp_path, drawn, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_2_has_three_boundaries_and_profiles_for_two_metrics(tmp_path, drawn, monkeypatch):
-    fig = draw(figure2, tmp_path, drawn, monkeypatch, QUICK=41)
+    fig = draw("figure2", tmp_path, drawn, monkeypatch, size=41)
     assert [len(ax.images) for ax in fig.axes] == [1, 1, 1, 1, 0] * 2
     assert [line.get_label() for line in fig.axes[4].lines] == ["natural", "strip", "mirror", "expansion"]
     natural, before, strip = (fig.axes[i].images[0].get_array() for i in range(3))
@@ -257,7 +256,7 @@ def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
 @pytest.mark.usefixtures("cheap")
 def test_figure_6_draws_a_phantom_where_there_is_no_brain(tmp_path, drawn, monkeypatch):
     monkeypatch.setattr(figure6, "find_example_brain", lambda: None)
-    fig = draw(figure6, tmp_path, drawn, monkeypatch)
+    fig = draw("figure6", tmp_path, drawn, monkeypatch)
     assert len(fig.axes) == 10
     assert "phantom" in fig.get_suptitle()
     for ax in fig.axes:
@@ -283,7 +282,7 @@ def test_signature_and_enough_pairs(monkeypatch):
 
 @pytest.mark.slow
 def test_figure_1_shows_the_same_hks_on_surface_and_chart(tmp_path, drawn, monkeypatch):
-    fig = draw(figure1, tmp_path, drawn, monkeypatch, QUICK=(100, 60), DRAWN=20, TIME=4.0)
+    fig = draw("figure1", tmp_path, drawn, monkeypatch, size=(100, 60), time=4.0)
     on_chart = fig.axes[3].images[0].get_array()
     (on_surface,) = signature(bumpy_torus_mesh(100), [4.0], 60)
     np.testing.assert_allclose(on_chart.T, on_surface.reshape(100, 100), rtol=0.05)
@@ -291,7 +290,7 @@ def test_figure_1_shows_the_same_hks_on_surface_and_chart(tmp_path, drawn, monke
 
 @pytest.mark.slow
 def test_figure_2_shows_the_boundary_and_its_removal(tmp_path, drawn, monkeypatch):
-    fig = draw(figure2, tmp_path, drawn, monkeypatch, QUICK=31)
+    fig = draw("figure2", tmp_path, drawn, monkeypatch, size=31)
     natural, before, strip, mirror = (fig.axes[i].images[0].get_array() for i in range(4))
     assert before.max() == pytest.approx(4, rel=0.05)
     np.testing.assert_allclose(before[9:-9, 9:-9], strip)

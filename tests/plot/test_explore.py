@@ -180,7 +180,7 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
 
     moved = nib.load(tmp_path / "labels.nii.gz")
     nib.save(nib.Nifti1Image(np.asarray(moved.dataobj), moved.affine + 0.9 * np.eye(4, k=3)), tmp_path / "moved.nii.gz")
-    assert "other voxels than the image's" in error(result, "--labels", tmp_path / "moved.nii.gz")
+    assert "labels and the image on different voxels" in error(result, "--labels", tmp_path / "moved.nii.gz")
     np.save(tmp_path / "labels.npy", np.zeros((3, 3)))
     assert "got labels of shape (3, 3)" in error(result, "--labels", tmp_path / "labels.npy")
     np.save(tmp_path / "labels.npy", np.full(SHAPE, 0.5))
@@ -191,7 +191,7 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
     np.savez(
         tmp_path / "mesh.npz", hks=np.ones((1, 4)), times=[1.0], vertices=np.eye(4, 3), cells=np.array([[1, 0, 2, 3]])
     )
-    assert "is on tetrahedra" in error(tmp_path / "mesh.npz")
+    assert "got a result on tetrahedra" in error(tmp_path / "mesh.npz")
     assert not (result / "explore.html").exists()
 
 

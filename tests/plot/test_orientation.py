@@ -229,16 +229,16 @@ def test_of_two_places_the_sform_wins_and_both_are_named(tmp_path):
     volume = nifti_of(tmp_path / "t.nii.gz", RAS, mirrored)
     np.testing.assert_array_equal(volume.affine, RAS)
     (note,) = (note for note in volume.notes if "qform" in note)
-    assert "sform (code 2) and its qform (code 1), up to 18 apart, and one mirrors the other: the sform is used" in note
+    assert "sform (code 2) and qform (code 1) differ by up to 18, and one mirrors the other; the sform is used" in note
     shifted = RAS.copy()
     shifted[2, 3] += 7
     (note,) = (note for note in nifti_of(tmp_path / "t.nii.gz", RAS, shifted).notes if "qform" in note)
-    assert "up to 7 apart: the sform" in note
+    assert "up to 7; the sform" in note
     for sform, qform in ((RAS, RAS), (RAS, None), (None, RAS)):
         volume = nifti_of(tmp_path / "t.nii.gz", sform, qform)
         np.testing.assert_allclose(volume.affine, RAS, atol=1e-6)
         assert not any("qform" in note for note in volume.notes)
-    assert any("which side is left is a guess" in note for note in nifti_of(tmp_path / "t.nii.gz").notes)
+    assert any("left and right are a guess" in note for note in nifti_of(tmp_path / "t.nii.gz").notes)
 
 
 # ---------------------------------------------------------------------------------------------- what is background

@@ -89,7 +89,7 @@ def test_noise_fades_in_the_slices_that_have_it():
 def test_errors():
     with unchecked(), pytest.raises(ValueError, match=r"grid: got shape .* three dimensions"):
         volume_panels(np.zeros((1, 3, 3)), [1.0], Grid((3, 3)))
-    with unchecked(), pytest.raises(ValueError, match=r"values: got shape .* expected \(n_times, \*grid.shape\)"):
+    with unchecked(), pytest.raises(ValueError, match=r"values: got shape .* expected \(n_times, \*shape\)"):
         volume_panels(ramp(), [1.0], GRID)
     with pytest.raises(ValueError, match="limits: got 2; expected 1"):
         volume_panels(ramp()[None], [1.0], GRID, limits=[(0, 1)] * 2)

@@ -23,10 +23,12 @@ def tables(monkeypatch):
 
 
 def facade(module=""):
-    """Return the names that a package imports as themselves: what it gives to its users."""
-    tree = ast.parse((ROOT / "hks_jax" / module / "__init__.py").read_text(encoding="utf-8"))
+    """Return the names that a package or a module gives to its users: imported as themselves, or its own functions."""
+    path = ROOT / "hks_jax" / module
+    tree = ast.parse((path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8"))
     imports = [alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
-    return [alias.name for alias in imports if alias.asname == alias.name]
+    own = [node.name for node in tree.body if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")]
+    return [alias.name for alias in imports if alias.asname == alias.name] + own
 
 
 def documented():

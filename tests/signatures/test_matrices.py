@@ -368,7 +368,7 @@ def test_pairs_in_an_interval_stay_so_in_files(tmp_path):
     moved = hj.sparse_pencil(path(30) + sp.diags(np.linspace(-1, 1, 30)))
     file = save_pairs(tmp_path / "moved.npz", hj.eigsh(moved, k=3))
     load_pairs(file, moved)
-    with pytest.raises(ValueError, match="these pairs do not solve"):
+    with pytest.raises(ValueError, match="the pairs do not solve"):
         load_pairs(file, hj.sparse_pencil(5 * path(30)))
 
 

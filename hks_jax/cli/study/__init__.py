@@ -1,1 +1,1 @@
-"""Studies: the signatures of many subjects, in a folder that is a BIDS derivative."""
+"""Studies: compute the signatures of many subjects in a folder that is a BIDS derivative."""

@@ -1,27 +1,28 @@
 """Compute the signatures of many subjects, and tables of their regions.
 
-Compute the signatures of many subjects, at the same times for all, and tables of their regions. SUBJECTS is a table
-(.tsv, or .csv) with a row for each subject and the columns
+Compute the signatures of many subjects at the same times, and tables of their regions. SUBJECTS is a table (.tsv or
+.csv) with a row for each subject and the columns
 
   participant_id   sub-01 or 01
   session_id       ses-1 or 1, optional
-  file             tensors, or diffusion-weighted images; of six images of components, one
+  file             tensors, or diffusion-weighted images; or one of six images of components
   {files}
-                   more files of the subject, optional; paths begin where the table is
+                   more files of the subject, optional; paths are relative to the table's folder
   {columns}
-                   options that differ between subjects, optional; a noise that is a file begins where the table is
+                   options that differ between subjects, optional; a file of noise is relative to the table's folder
 
-and any others, such as age and group, which are kept in participants.tsv. What an option says holds for all subjects
-whose row does not say otherwise.
+Other columns, such as age and group, are copied to participants.tsv. The values in a row replace the values of the
+command's options.
 
-DIR becomes a BIDS derivative: for each subject an image with its sidecar, an .npz for hks-jax explore, plot and stats,
-a picture, and with --atlas a table of regions; for all of them group_summary.tsv and group_regions.tsv.
+DIR becomes a BIDS derivative. It contains for each subject an image with its sidecar, an .npz for hks-jax explore, plot
+and stats, a picture, and with --atlas a table of regions. The tables group_summary.tsv and group_regions.tsv contain
+all subjects.
 
-Tensors whose mean diffusivity no living tissue has in mm2/s are refused unless --unit, or the column unit, says in
-which unit they are: subjects in different units cannot be compared.
+If no living tissue has the mean diffusivity of a subject in mm2/s, the subject fails unless --unit, or the column unit,
+gives the unit, because subjects with different units cannot be compared.
 
-A subject that fails does not stop the others. The same command, given again, computes only the signatures and
-tables that are not there yet, or were made of other files.
+If a subject fails, the others are still computed. If the command is repeated, it computes only the signatures and
+tables that are missing, or whose input files have changed.
 
 examples:
   hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
@@ -60,26 +61,26 @@ subjects SUBJECTS  the table of subjects
 -o,--output DIR!  the study's folder
 @metric {READING} {SOLVING} @signature @noise @view
 --time-unit scanner|lambda1 = scanner
-    of --times: scanner, the same t for all subjects, in seconds for D⁻¹ of mm²/s (default); or lambda1, the same λ₁t,
-    each subject's t being divided by its own first positive eigenvalue. Automatic times are log-spaced over what suits
-    all, and remain those of the study
+    unit of --times: scanner, for the same t for all subjects, in seconds for D⁻¹ with D in mm²/s (default); or lambda1,
+    for the same product λ₁t, so that the given numbers are divided by each subject's first positive eigenvalue λ₁.
+    Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
 @atlas @names
 --save-pairs
-    keep each subject's eigenpairs: with other --times, --normalisation or --method nothing is solved again
---replace  compute a study in DIR again that had other settings or times
---only SUBJECT...  compute only these, such as sub-07 or sub-07_ses-2
+    save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse
+--replace  replace a study in DIR that has other settings or times
+--only SUBJECT...  compute only these subjects, such as sub-07 or sub-07_ses-2
 """
 
 
 def run(args: argparse.Namespace, _: Progress) -> None:
-    """Run the command; where some subjects fail, raise ComputationError when the others are done."""
+    """Run the command; if some subjects fail, raise ComputationError after computing the others."""
     from hks_jax.cli.study.tasks import run_all
 
     if second_scan(args) is not None:
-        why = "is a scan of one subject; expected a number, residuals or roughness"
-        raise ValueError(f"--noise: {args.noise} {why}. Second scans belong into a column noise of the table")
+        why = "for all subjects; expected a number, residuals or roughness"
+        raise ValueError(f"--noise: got {args.noise} {why}. Put second scans into a column noise of the table")
     args.strict_unit = True
-    if settle := args.boundary is None:  # subjects are compared, and so have the same boundary, with or without a mask
+    if settle := args.boundary is None:  # comparable subjects need the same condition, with or without a mask
         before = {} if args.replace else read_json(args.output / "study.json")
         args.boundary = recorded_boundary(before.get("settings", {})) or "mean"
     subjects = read_subjects(args.subjects, args)
@@ -90,15 +91,15 @@ def run(args: argparse.Namespace, _: Progress) -> None:
             require_spectral(subject.arguments)
     with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
     if not with_regions:
-        refuse(args, ("names",), "it names labels; pass --atlas too, or a column atlas in the table")
+        refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or add a column atlas")
     progress = StudyProgress(len(chosen), args.quiet)
     if settle:
-        progress.end(f"boundary {args.boundary} (of all subjects alike, as --boundary does not say otherwise)")
+        progress.end(f"boundary {args.boundary} for all subjects, because --boundary is not given")
     with progress.catching_warnings():
         study = _open(args, subjects, progress)
         problems = {subject.name: "" for subject in subjects if subject not in chosen}
         problems |= run_all(study, chosen, progress, args.debug)
-        if args.only:  # what others have done in the meantime
+        if args.only:  # other processes may have finished other subjects
             there = {s.name for s in subjects if problems.get(s.name) == "" and _is_there(study, s)}
             problems = {name: why for name, why in problems.items() if name not in there}
         problems |= _other_units(study, [subject for subject in subjects if subject.name not in problems])
@@ -109,7 +110,8 @@ def run(args: argparse.Namespace, _: Progress) -> None:
     if failed:
         raise ComputationError(
             f"{len(failed)} of {len(chosen)} subjects failed ({', '.join(failed[:5])}{', …' * (len(failed) > 5)}); "
-            f"{args.output / 'group_summary.tsv'} says why. The others are done; the same command tries these again"
+            f"{args.output / 'group_summary.tsv'} contains the reasons. The other subjects are done. Repeat the "
+            "command to compute the failed subjects again"
         )
 
 
@@ -120,28 +122,28 @@ def _is_there(study: Study, subject: Subject) -> bool:
 
 
 def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
-    """Return why subjects are refused whose diffusivities are too far from the others' for the same unit."""
-    if study.settings.metric == "tensor":  # which need not be diffusion
+    """Return error messages for subjects whose diffusivities differ too much from the others' to have the same unit."""
+    if study.settings.metric == "tensor":  # the tensors need not describe diffusion
         return {}
     inputs = {subject.name: read_json(study.path(subject, f"{MAP}.json")).get("Input", {}) for subject in done}
     medians = {name: value for name, about in inputs.items() if (value := about.get("median_mean_diffusivity"))}
     middle = math.exp(np.median(np.log(list(medians.values())))) if medians else 1.0
     span = LIVING_TISSUE[1] / LIVING_TISSUE[0]
     return {
-        name: f"--unit: the median mean diffusivity is {value:.3g}, and {middle:.3g} in the middle of the study; "
-        "expected the same unit of all subjects. Say by --unit, or a column unit, which it is in each"
+        name: f"--unit: got a median mean diffusivity of {value:.3g}, but the median of the study is {middle:.3g}; "
+        "expected the same unit for all subjects. Give the units by --unit or by a column unit"
         for name, value in medians.items()
         if not 1 / span <= value / middle <= span
     }
 
 
 def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
-    """Return the study, described in its folder, with its times settled; refuse a folder of another study."""
+    """Return the study with explicit times and write its description; raise ValueError for another study's folder."""
     study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
     times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = study.record, dict(before)
-    if times.automatic:  # they remain those of before
+    if times.automatic:  # the times of an earlier run are kept
         now["times"], then["times"] = chosen, before.get("chosen")
     for part in ("settings", "reading"):
         now |= now.pop(part)
@@ -150,8 +152,8 @@ def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProg
     changed = "; ".join(f"--{name}: {json.dumps(old)}, now {json.dumps(new)}" for name, old, new in pairs)
     if before and changed and not args.replace:
         raise ValueError(
-            f"--output: {args.output} is a study that differs in {changed}. Choose another folder, or pass --replace "
-            "to compute its subjects again"
+            f"--output: the study in {args.output} differs in {changed}. Choose another folder, or pass --replace to "
+            "compute the subjects of that study again"
         )
     if times.automatic:
         explicit = _suitable(args, times.automatic, subjects, progress) if changed else tuple(before["times"])
@@ -163,41 +165,40 @@ def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProg
 def _suitable(
     args: argparse.Namespace, count: int, subjects: list[Subject], progress: StudyProgress
 ) -> tuple[float, ...]:
-    """Read all subjects, and return times that suit them; those that cannot be read have no say."""
+    """Read all subjects, and return times that suit them; ignore subjects that cannot be read."""
     if args.metric == "adjugate":
-        raise ValueError("--times: choose them; automatic ones of a study are for the metrics inverse and tensor")
+        raise ValueError("--times: automatic times in a study need the metric inverse or tensor. Choose the times")
     ranges: dict[str, Range] = {}
-    silent = StudyProgress(1, True, io.StringIO())  # warnings come when the subject's turn does
+    silent = StudyProgress(1, True, io.StringIO())  # warnings are shown when the subject is computed
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
-        with suppress(Exception):  # said when its turn comes
+        with suppress(Exception):  # errors are reported when the subject is computed
             ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
     if not ranges:
-        raise ValueError("--times: none of the subjects can be read; pass --times to see why of each")
+        raise ValueError("--times: no subject can be read, so no times can be chosen. Pass --times to see all errors")
     times = common_times(ranges, count, args.time_unit)
     progress.end(f"times that suit all subjects ({len(ranges)}): {', '.join(f'{t:g}' for t in times)}")
     return times
 
 
 class Range(NamedTuple):
-    """The times that suit one subject: those that its voxels and its eigenpairs resolve, and its size ends."""
+    """The range of times that suits one subject: voxels and eigenpairs limit it from below, the size from above."""
 
     least: float
     largest: float
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
-    """Return the range of times that suits a subject, from its metric and its size, before anything is computed."""
+    """Estimate the range of times that suits a subject from its metric and its size, without eigenpairs."""
     of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][args.metric or "tensor"]
     by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
     return Range(max(of["least_time"], by_pairs), of["largest_time"])
 
 
 def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
-    """Return n times, log-spaced over what suits all subjects, rounded to three digits.
+    """Return n log-spaced times in the intersection of all subjects' ranges, rounded to three digits.
 
-    They go from the largest of the least times to the least of the largest; of the unit ``"lambda1"`` they are λ₁t,
-    whose largest is `LAST`.
+    For the unit ``"lambda1"``, the function returns products λ₁t, the largest of which is `LAST`.
     """
     if unit == "lambda1":
         ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}
@@ -205,20 +206,19 @@ def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float,
     least, largest = ranges[late].least, ranges[flat].largest
     if least >= largest:
         raise ValueError(
-            f"--times: none suits all subjects: {late} resolves only t ≥ {least:.3g}, and {flat} is flat from "
-            f"t = {largest:.3g} on. Choose times, or more eigenpairs (-k); see what 'hks-jax info' says of {late}: "
-            "tensors with eigenvalues near zero take its pairs (--repair nearest:1e-4)"
+            f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and {flat} is nearly constant "
+            f"for t ≥ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: tensors "
+            "with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
         )
     return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))
 
 
 def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
-    """Return the subjects that are to be computed."""
     if names is None:
         return subjects
     wanted = {name if name.startswith("sub-") else f"sub-{name}" for name in names}
     chosen = [subject for subject in subjects if {subject.name, subject.participant} & wanted]
     missing = wanted - {name for subject in chosen for name in (subject.name, subject.participant)}
     if missing:
-        raise ValueError(f"--only: got {', '.join(sorted(missing))}; expected subjects of the table")
+        raise ValueError(f"--only: got {', '.join(sorted(missing))}; expected subjects in the table")
     return chosen

@@ -1,4 +1,4 @@
-"""The folder of a study, a BIDS derivative: names, sidecars, finished subjects, and the tables of the group."""
+"""The folder of a study, a BIDS derivative: file names, sidecars, state of subjects, and tables of the group."""
 
 import argparse
 import hashlib
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from hks_jax import __version__
-from hks_jax.atomic import atomic_folder, atomic_path
 from hks_jax.cli.job import Settings
 from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS
@@ -25,39 +24,39 @@ from hks_jax.io.nifti import is_nifti, sidecar_of
 from hks_jax.io.result import Result, plain
 from hks_jax.io.tables import read_json, read_table, write_json, write_table
 from hks_jax.io.volume import digest
-from hks_jax.reading import existing
+from hks_jax.storage import atomic_folder, atomic_path, existing
 
 MAP = "_model-tensor_param-hks_dwimap"
 REGIONS = "_model-tensor_param-hks_regions"
 PAIRS = "_model-tensor_param-hks_pairs.npz"
-"""How the names of a subject's files end: the signature, the table of its regions, and its eigenpairs if kept."""
+"""The endings of a subject's files: the signature, the table of its regions, and the saved eigenpairs."""
 _SUFFIXES = {MAP: ".npz", REGIONS: ".tsv"}
 GENERATED_BY = {"Name": "hks-jax", "Version": __version__}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\..+")
-"""What an interrupted write leaves behind (see `hks_jax.atomic_path`)."""
+"""The names of temporary files that an interrupted process may leave (see `hks_jax.atomic_path`)."""
 SUMMARY = {
-    "status": "done, failed, or pending where a run was for others alone",
-    "voxels": "voxels in the domain",
+    "status": "done, failed, or pending if the run did not include the subject",
+    "voxels": "number of voxels in the domain",
     "k": "number of eigenpairs",
-    "lambda1": "first positive eigenvalue, 1/(metric length)²: per s for the metric D⁻¹ of mm²/s",
-    "truncation": "largest share of the signature, over t, that lies beyond the eigenpairs (estimate)",
-    "resolution": "largest relative error, over t, by the size of the voxels (estimate)",
-    "warnings": "number of warnings; the subject's sidecar has them",
-    "problem": "why it is not done",
+    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for the metric D⁻¹ with D in mm²/s",
+    "truncation": "largest share of the signature, over t, from omitted eigenpairs (estimate)",
+    "resolution": "largest relative error, over t, due to the size of the voxels (estimate)",
+    "warnings": "number of warnings, which the subject's sidecar contains",
+    "problem": "reason why the subject failed",
 }
-"""The columns of the group's summary after the identifiers."""
+"""The columns of the group's summary after the identifiers, with descriptions."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """Where the results of a study are, and what all of its subjects have in common.
+    """The folder of a study, and the settings that all subjects share.
 
     Attributes:
-        folder: the study's.
-        settings: of the computation; its times are those of all subjects.
-        time_unit: ``"scanner"``, or ``"lambda1"`` where the times are λ₁t.
-        reading: the options of reading that hold for all subjects whose rows do not say otherwise.
-        save_pairs: whether the eigenpairs are kept.
+        folder: the folder of the study.
+        settings: the settings of the computation, including the times for all subjects.
+        time_unit: ``"scanner"``, or ``"lambda1"`` if the times are products λ₁t.
+        reading: the options for reading, which rows of the table may replace.
+        save_pairs: whether the eigenpairs are saved.
     """
 
     folder: Path
@@ -71,33 +70,33 @@ class Study:
         return self.folder / subject.folder / folder / f"{subject.name}{ending}"
 
     def fingerprint(self, subject: Subject) -> str:
-        """Return a digest of all that a subject's signature depends on; raises FileNotFoundError for a missing file."""
+        """Return a digest of all inputs of a subject's signature; raise FileNotFoundError if a file is missing."""
         reading, inputs = reading_options(subject.args), _inputs(subject.args)
         files = {role: [digest(existing(path)) for path in paths] for role, paths in inputs.items()}
         return _digest({"settings": asdict(self.settings), "unit": self.time_unit, "reading": reading, "files": files})
 
     def pairs_fingerprint(self, subject: Subject) -> str:
-        """Return a digest of all that a subject's eigenpairs depend on: neither times, normalisation nor noise."""
+        """Return a digest of all inputs of a subject's eigenpairs, without times, normalisation, method and noise."""
         alike = replace(self.settings, times=Times((), 0), normalisation="raw", method="spectral")
         args = argparse.Namespace(**{**vars(subject.args), "noise": None})
         return replace(self, settings=alike, time_unit="").fingerprint(replace(subject, arguments=args))
 
     def regions_fingerprint(self, subject: Subject, fingerprint: str) -> str:
-        """Return a digest of all that the table of a subject's regions depends on."""
+        """Return a digest of all inputs of the table of a subject's regions."""
         atlas, names = subject.args.atlas, subject.args.names
         paths = (atlas, names_beside(atlas) if names is None else names)
         files = [None if path is None else digest(existing(path)) for path in paths]
         return _digest({"signature": fingerprint, "files": files})
 
     def has(self, subject: Subject, kind: str, fingerprint: str) -> bool:
-        """Tell whether the signature, or the table of its regions, is there, of the same files and settings."""
+        """Return whether the signature or the table of regions exists and has this fingerprint."""
         made_of = read_json(self.path(subject, f"{kind}.json")).get("Fingerprint")
         return made_of == fingerprint and self.path(subject, kind + _SUFFIXES[kind]).is_file()
 
     def write_signature(
         self, subject: Subject, fingerprint: str, result: Result, warnings: list[str], draw: Callable[[Path], Any]
     ) -> None:
-        """Write a subject's signature, its picture and, last, the sidecar that says it is done; all without dates."""
+        """Write a subject's signature, its picture and, last, the sidecar that marks completion; no file has a date."""
         self.forget(subject)
         args, report, scaled = subject.args, result.report, result.arrays.get("scaled_times")
         target = self.path(subject, MAP)
@@ -124,9 +123,9 @@ class Study:
         write_json(self.path(subject, f"{MAP}.json"), plain(sidecar))
 
     def forget(self, subject: Subject) -> None:
-        """Remove what an earlier run with other settings, or an interrupted one, has left of a subject."""
+        """Remove files of a subject from an interrupted run or from a run with other settings."""
         sidecar, picture = self.path(subject, f"{MAP}.json"), self.path(subject, f"{MAP}.png", "figures")
-        sidecar.unlink(missing_ok=True)  # first: it says that the other files are complete
+        sidecar.unlink(missing_ok=True)  # first, because its existence means that the other files are complete
         ours = [file for kind in _SUFFIXES for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
         for path in [*ours, picture, sidecar.with_name("explore.html")]:
             path.unlink(missing_ok=True)
@@ -137,23 +136,23 @@ class Study:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What all subjects have in common, as study.json has it."""
+        """The settings that all subjects share, as stored in study.json."""
         settings = asdict(self.settings)
         times = {"times": settings.pop("times")[0], "time-unit": self.time_unit}
         record: dict[str, Any] = plain({**times, "settings": settings, "reading": self.reading})
         return record
 
     def require_settings(self) -> None:
-        """Raise ValueError where another process has begun the study anew."""
+        """Raise ValueError if another process has restarted the study with other settings or times."""
         now = read_json(self.folder / "study.json")
         if any(now.get(name) != value for name, value in self.record.items()):
             raise ValueError(
-                f"--output: another process has given the study {self.folder} other settings or times meanwhile; "
-                "choose another folder for one of them"
+                f"--output: another process has meanwhile changed the settings or times of the study {self.folder}. "
+                "Choose another folder for one of the studies"
             )
 
     def write_description(self, subjects: list[Subject], chosen: str) -> None:
-        """Write the description of the study: the files of a BIDS derivative, and the times."""
+        """Write the files that describe the study: those of a BIDS derivative, and study.json with the times."""
         description = {
             "Name": "Heat kernel signatures of diffusion tensor fields",
             "BIDSVersion": "1.10.0",
@@ -166,12 +165,12 @@ class Study:
         about = {**self.record, "chosen": chosen, "description": times_text(self.time_unit)}
         write_json(self.folder / "study.json", about)
         covariates = list(dict.fromkeys(name for subject in subjects for name in subject.covariates))
-        first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # of several sessions
+        first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # first session
         rows = [(who, *map(first[who].get, covariates)) for who in dict.fromkeys(s.participant for s in subjects)]
         write_table(self.folder / "participants.tsv", ("participant_id", *covariates), rows)
 
     def write_group(self, subjects: list[Subject], problems: Mapping[str, str], with_regions: bool) -> list[Path]:
-        """Write the tables of all subjects and of all regions; `problems` says by name why some are not done."""
+        """Write the tables of all subjects and all regions; `problems` maps names to reasons why subjects failed."""
         n = 1 + any(subject.session for subject in subjects)
         head, ids = ("participant_id", "session_id")[:n], {s.name: (s.participant, s.session)[:n] for s in subjects}
         summary = [(*ids[s.name], *_summary(self.path(s, f"{MAP}.json"), problems.get(s.name))) for s in subjects]
@@ -189,17 +188,17 @@ class Study:
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return by name the options of reading and noise; a second scan is "file", as its path may change."""
+    """Return the options for reading and noise by name, with "file" for a second scan, whose path may change."""
     names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
     return reading if second_scan(args) is None else {**reading, "noise": "file"}
 
 
 def times_text(unit: str) -> str:
-    """Describe the times of a study."""
+    """Return a description of the times of a study."""
     if unit == "lambda1":
-        return "times of each subject are the given numbers over its own first positive eigenvalue λ₁"
-    return "the same times for all subjects, in (metric length)²: s for the metric D⁻¹ of mm²/s on mm"
+        return "the times of each subject are the given numbers divided by its first positive eigenvalue λ₁"
+    return "all subjects have the same times, in (metric length)²; in s for the metric D⁻¹ with D in mm²/s"
 
 
 def _without_folder(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -217,7 +216,7 @@ def _summary(sidecar: Path, problem: str | None) -> tuple[Any, ...]:
 
 
 def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
-    """Return the files that a subject's signature is computed from, by their part in it."""
+    """Return the input files of a subject's signature, grouped by role."""
     images = [args.file, *args.others]
     if not args.others and args.bval is None and is_nifti(args.file) and is_one_of_six(args.file):
         images = siblings(args.file)

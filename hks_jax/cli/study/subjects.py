@@ -1,4 +1,4 @@
-"""The table of a study's subjects: one row each, with its files and what differs in reading them."""
+"""Read the table of a study's subjects, whose rows contain files and options for reading them."""
 
 import argparse
 import copy
@@ -19,10 +19,10 @@ class Subject:
 
     Attributes:
         participant: ``sub-`` and a label.
-        session: ``ses-`` and a label, or nothing.
-        arguments: the command's arguments with those of the row; None where these are wrong.
-        problem: why they are wrong; else empty.
-        covariates: the columns that are no arguments.
+        session: ``ses-`` and a label, or the empty text.
+        arguments: the arguments of the command, updated by those of the row; None if the latter are invalid.
+        problem: the error message if the arguments are invalid; otherwise empty.
+        covariates: the columns that are not arguments.
     """
 
     participant: str
@@ -33,19 +33,19 @@ class Subject:
 
     @property
     def args(self) -> argparse.Namespace:
-        """The arguments; raises ValueError where they are wrong."""
+        """The arguments; raises ValueError if they are invalid."""
         if self.arguments is None:
             raise ValueError(self.problem)
         return self.arguments
 
     @property
     def name(self) -> str:
-        """The beginning of the names of its files: ``sub-01`` or ``sub-01_ses-2``."""
+        """The prefix of the subject's file names: ``sub-01`` or ``sub-01_ses-2``."""
         return "_".join(filter(None, (self.participant, self.session)))
 
     @property
     def folder(self) -> Path:
-        """Its folder within the study's."""
+        """The subject's folder, relative to the folder of the study."""
         return Path(self.participant, self.session)
 
 
@@ -55,23 +55,23 @@ class _RowParser(argparse.ArgumentParser):
 
 
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
-    """Read the table, and join each row with the arguments that hold for all subjects.
+    """Read the table, and update the arguments for all subjects by those of each row.
 
-    A row with wrong options becomes a subject with a problem. ValueError is for the table itself: no columns
-    `participant_id` and `file`, labels that BIDS does not allow, or a subject (and session) twice.
+    A row with invalid options becomes a subject with a problem. The function raises ValueError only for errors of the
+    table: a missing `participant_id`, a label that BIDS does not allow, or a duplicate subject and session.
     """
     rows, parser = read_table(path), _RowParser(add_help=False)
     add_options(parser, f"@file {READING} @noise @atlas @names")
     subjects: dict[str, Subject] = {}
     for number, row in enumerate(rows, 2):
         if "participant_id" not in row:
-            raise ValueError(f"{path}: row {number} has no participant_id; expected one in every row")
+            raise ValueError(f"{path}: got no participant_id in row {number}; expected one in every row")
         participant = _label(path, "sub", row.pop("participant_id"))
         session = _label(path, "ses", row.pop("session_id")) if "session_id" in row else ""
         words, covariates = _words(path.parent, row)
         try:
             if not words or words[0].startswith("--"):
-                raise ValueError("the row has no file")
+                raise ValueError("got no file; expected one per row")
             arguments, problem = parser.parse_args(words, copy.copy(common)), ""
             if second_scan(arguments) is not None:
                 arguments.noise = str(path.parent / arguments.noise)
@@ -79,7 +79,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
             arguments, problem = None, str(error)
         subject = Subject(participant, session, arguments, problem, covariates)
         if subject.name in subjects:
-            raise ValueError(f"{path}: {subject.name} is there twice; tell the rows apart by a column session_id")
+            raise ValueError(f"{path}: got two rows for {subject.name}. Distinguish them by a column session_id")
         subjects[subject.name] = subject
     return list(subjects.values())
 
@@ -87,12 +87,12 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
 def _label(path: Path, entity: str, text: str) -> str:
     label = text.removeprefix(f"{entity}-")
     if not re.fullmatch("[A-Za-z0-9]+", label):
-        raise ValueError(f"{path}: got {text!r}; expected {entity}-LABEL or LABEL of letters and digits alone (BIDS)")
+        raise ValueError(f"{path}: got {text!r}; expected {entity}-LABEL or LABEL with only letters and digits (BIDS)")
     return f"{entity}-{label}"
 
 
 def _words(folder: Path, row: dict[str, str]) -> tuple[list[str], dict[str, str]]:
-    """Return a row's options as the words of a command line, and its other columns."""
+    """Return the options in a row as words of a command line, and the other columns."""
     words, covariates = [], {}
     if "file" in row:
         words.append(str(folder / row.pop("file")))

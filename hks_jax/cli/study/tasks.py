@@ -1,4 +1,4 @@
-"""The computations of a study: finding and running those that each subject lacks."""
+"""Run the computations of a study that are not done yet."""
 
 import io
 import sys
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hks_jax.atomic import claim
 from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.job import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import signature_of
@@ -26,19 +25,20 @@ from hks_jax.cli.values import Times
 from hks_jax.io.tables import write_table
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
+from hks_jax.storage import claim
 
 FORGETFUL = 8
-"""Subjects after which compiled programs are forgotten: domains differ, and each leaves 70 MiB that no other uses."""
+"""The number of subjects after which compiled programs are deleted; each domain needs its own 70 MiB of programs."""
 
 PATIENCE = 0.5
-"""Seconds between two looks at what other processes compute."""
+"""The seconds between two checks of subjects that other processes compute."""
 
 
 def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> dict[str, str]:
-    """Compute all subjects that are not done; return why some of them failed, by their names.
+    """Compute all subjects that are not done; return the error messages of failed subjects by name.
 
-    Other processes with the same study share the work: each subject is computed by the one that comes to it first. One
-    that begins the study anew, with other settings, makes this one raise ValueError.
+    Several processes may work on the same study; the first process that starts a subject computes it. If another
+    process restarts the study with other settings, this function raises ValueError.
     """
     problems, begun = dict[str, str](), time.perf_counter()
 
@@ -56,10 +56,10 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
         except Exception as error:
             failed(subject, error)
     pending = [task for task in plan if task.signature or task.regions]
-    # What ended a process before, for want of memory perhaps, may do so again: the others come first.
+    # A subject that ended an earlier process, perhaps by lack of memory, may do so again, so it comes last.
     pending.sort(key=lambda task: task.attempt.exists())
     if len(pending) < len(plan):
-        progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are done already")
+        progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are already done")
     progress.total, number, waiting = len(pending), 0, False
     while pending:
         elsewhere = []
@@ -81,7 +81,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
                 failed(task.subject, error)
         if len(elsewhere) == len(pending):
             if not waiting:
-                progress.end(f"waiting for other processes, which compute {len(elsewhere)} of the subjects")
+                progress.end(f"waiting for other processes that compute {len(elsewhere)} of the subjects")
             waiting = True
             time.sleep(PATIENCE)
         pending = elsewhere
@@ -91,7 +91,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
 
 
 class _Task(NamedTuple):
-    """The work on a subject: its signature, and the table of its regions unless that one's fingerprint is empty."""
+    """The work on a subject: its signature, and the table of its regions unless the fingerprint `regions` is empty."""
 
     study: Study
     subject: Subject
@@ -101,7 +101,7 @@ class _Task(NamedTuple):
 
     @classmethod
     def of(cls, study: Study, subject: Subject) -> "_Task":
-        """Return the parts that are missing, or were made of other files or settings."""
+        """Return a task with the parts that are missing or have another fingerprint."""
         fingerprint = study.fingerprint(subject)
         regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
         task = cls(study, subject, fingerprint, True, regions)
@@ -109,24 +109,23 @@ class _Task(NamedTuple):
 
     @property
     def attempt(self) -> Path:
-        """The file that a process holds while it computes a subject, and leaves if it dies."""
+        """The file that a process locks while it computes a subject; it remains if the process is killed."""
         return self.study.folder / self.subject.folder / ".attempt"
 
     def left(self) -> "_Task | None":
-        """Return the parts that are still missing: another process may have done some meanwhile."""
+        """Return the parts that are still missing, because another process may have done some, or None."""
         missing = self.signature and not self.study.has(self.subject, MAP, self.fingerprint)
         known = not missing and self.study.has(self.subject, REGIONS, self.regions)
         left = self._replace(signature=missing, regions="" if known else self.regions)
         return left if left.signature or left.regions else None
 
     def run(self, progress: StudyProgress) -> None:
-        """Do it."""
         study, subject = self.study, self.subject
         if self.signature:
             _compute(study, subject, self.fingerprint, progress)
         if self.regions:
             table = study.path(subject, f"{REGIONS}.tsv")
-            for old in (table.with_suffix(".json"), table):  # the sidecar first
+            for old in (table.with_suffix(".json"), table):  # sidecar first
                 old.unlink(missing_ok=True)
             with progress.stage("regions"):
                 source, args = study.path(subject, f"{MAP}.npz"), subject.args
@@ -135,7 +134,6 @@ class _Task(NamedTuple):
 
 
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
-    """Compute and write the signature of a subject."""
     study.forget(subject)
     args, solved = subject.args, _pairs(study, subject, progress)
     scaled: dict[str, np.ndarray] = {}
@@ -143,7 +141,7 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
         scaled["scaled_times"] = np.array(study.settings.times.explicit)
         own = scaled["scaled_times"] / float(positive_range(solved.pairs)[0])
         solved = solved._replace(settings=replace(solved.settings, times=Times(tuple(own.tolist()), 0)))
-    if args.noise == "residuals" and solved.volume.covariance is None:  # pairs that were kept do not have it
+    if args.noise == "residuals" and solved.volume.covariance is None:  # not saved with eigenpairs
         volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
         solved = solved._replace(volume=volume)
     result = signature_of(args, solved, progress)
@@ -154,7 +152,7 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
 
 
 def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
-    """Return the eigenpairs: those that were kept, or computed, and kept if asked to."""
+    """Return saved eigenpairs, or compute eigenpairs and save them if the study saves eigenpairs."""
     kept, fingerprint = study.path(subject, PAIRS), study.pairs_fingerprint(subject)
     if are_of(kept, fingerprint):
         return read_pairs(kept, study.settings, progress)[0]

@@ -1,4 +1,4 @@
-"""What the page shows beside the signature: scalars and directions of the tensors, and regions."""
+"""The page's further maps: scalars and directions of the tensors, and regions."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

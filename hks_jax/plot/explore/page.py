@@ -16,13 +16,14 @@ from jaxtyping import Bool, Real
 from matplotlib import colormaps
 
 from hks_jax import __version__
-from hks_jax.atomic import atomic_path
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh
 from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
 from hks_jax.plot.orientation import LETTERS
+from hks_jax.plot.panels import checked_times
 from hks_jax.plot.signature import bounding_box
 from hks_jax.signatures.hks import Normalisation
+from hks_jax.storage import atomic_path
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
 """The page's scripts, in the order in which they need one another."""
@@ -92,9 +93,12 @@ def explore(
             more numbers than a browser can open.
     """
     shape, d = ((len(grid.vertices),), 2) if isinstance(grid, SurfaceMesh) else (grid.shape, grid.dimension)
-    t, array = _checked(values, times, shape)
+    t = checked_times(times, shape, values=values, deviation=deviation)
+    if not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
+        raise ValueError(f"times: got {times}; expected positive numbers that increase")
     if normalisation not in get_args(Normalisation):
         raise ValueError(f"normalisation: got {normalisation!r}; expected one of {', '.join(get_args(Normalisation))}")
+    array: np.ndarray = np.asarray(values, dtype=np.float64)
     inside, surface, place = np.isfinite(array).all(axis=0), {}, {}
     if isinstance(grid, SurfaceMesh):
         if not (inside.all() and tensors is None and world is None):
@@ -110,7 +114,7 @@ def explore(
         raise ValueError(f"lengths: got shape {spread.shape}; expected {t.shape}, one finite number per time")
     layers = [] if tensors is None else tensor_layers(tensors, inside)
     layers += scalar_layers(maps or {}, inside)
-    noise = None if deviation is None else _checked(deviation, times, shape, "deviation")[1]
+    noise = None if deviation is None else np.asarray(deviation, dtype=np.float64)
     parts = None if labels is None else regions(labels, label_names, inside)
     size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(each.values.size for each in layers))
     if size > LIMIT:
@@ -149,18 +153,6 @@ def explore(
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(path)
-
-
-def _checked(values: Any, times: Any, shape: tuple[int, ...], name: str = "values") -> tuple[np.ndarray, np.ndarray]:
-    t, array = np.atleast_1d(np.asarray(times, dtype=np.float64)), np.asarray(values, dtype=np.float64)
-    if t.ndim != 1 or t.size == 0 or not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
-        raise ValueError(f"times: got {times}; expected positive numbers that increase, at least one")
-    if array.shape != (t.size, *shape):
-        raise ValueError(
-            f"{name}: got shape {array.shape}; expected (n_times, *shape) = {(t.size, *shape)}, as "
-            "hks_jax.hks returns them"
-        )
-    return t, array
 
 
 def _deep_node(inside: Bool[np.ndarray, "*shape"]) -> list[int]:
