@@ -38,7 +38,7 @@ _SMALL = 1500
 #
 # Compilation takes about five seconds for any size. So up to n·k = 5 million no solver is the fastest both in the first
 # and in later calls. The choice minimises the larger of the two factors lost, except for small volumes in float32.
-# Block Lanczos in float32 also factorises in float32. It therefore searches repeatedly, and some pairs do not converge.
+# Block Lanczos in float32 also factorises in float32. So slices are searched repeatedly, and some pairs fail.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 """The least n·k for which a solver in JAX is chosen. The second value is for 2D grids in single precision."""
 
@@ -46,8 +46,8 @@ _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
     """Return the solver with the given name.
 
-    ``"auto"`` chooses by the pencil's size, k and dtype. If values are traced (`jax.jit`, `jax.vmap`), or on an
-    accelerator, it never chooses shift-invert, which runs on the host.
+    ``"auto"`` chooses by the pencil's size, k and dtype. Shift-invert runs on the host. So ``"auto"`` never chooses it
+    on an accelerator, or for traced values (`jax.jit`, `jax.vmap`).
 
     Raises:
         ValueError: the name is unknown.
@@ -66,8 +66,8 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit.
 
-    A fit takes many products with one Jacobian. Block Lanczos reuses its factorisations in them; the filter has none.
-    Fits are traced, so that the solver must not run on the host.
+    A fit takes many products with one Jacobian. Block Lanczos reuses its factorisations in these products; the filter
+    has no factorisations. Fits are traced, so that the solver must not run on the host.
     """
     n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()

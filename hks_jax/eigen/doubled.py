@@ -25,7 +25,7 @@ def solve_doubled(
     """Solve all parts and return the k lowest pairs of the merged spectrum; ``extra`` = 1 adds the next eigenvalue.
 
     The number of pairs from each part is not known beforehand. If values are concrete, the first guess is Weyl's law
-    plus a margin, doubled for every part that may still miss a pair; if values are traced, it is the upper bound.
+    plus a margin, doubled for every part that may still miss a pair; otherwise the upper bound is used.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
@@ -62,7 +62,7 @@ def _limits(pencil: MirrorPencil, total: int) -> list[int]:
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
-    """Return a report that names the current problem. Its time estimate assumes that later problems take as long."""
+    """Return a report that names the current problem, and estimates the time as if later problems took as long."""
     begin = time.perf_counter()
 
     def tell(text: str) -> None:
@@ -137,7 +137,7 @@ def _complete_below(
     """Return the bound below which the pairs of all parts are complete.
 
     A part's certificate may end at its last computed eigenvalue. But if a part already has the largest possible number
-    of pairs up to ``reach``, it has no further eigenvalue below ``reach``.
+    of pairs up to ``reach``, the part has no further eigenvalue below ``reach``.
     """
     bounds = []
     for pairs, limit in zip(solved, _limits(pencil, total), strict=True):

@@ -45,8 +45,8 @@ def eigenpairs(
     Args:
         domain: a tensor field; a mesh; a pencil from `assemble` or `sparse_pencil`; a symmetric matrix K; or a pair
             (K, M). `sparse_pencil` describes the accepted matrices.
-        k: the number of pairs, from 1 to the number of degrees of freedom. Leave it out if you give an interval. But if
-            values are traced, it must be the number of eigenvalues in the interval (`count_eigenvalues`).
+        k: the number of pairs, from 1 to the number of degrees of freedom. With an interval, leave k out; but if values
+            are traced, k must be the number of eigenvalues in the interval (`count_eigenvalues`).
         boundary: see `assemble`; a given pencil already has it.
         solver: ``"auto"`` (chosen by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
             ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces), ``"chebyshev-filter"``
@@ -117,18 +117,18 @@ def eigsh(
 ) -> Eigenpairs:
     """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval, and prove that none is missed.
 
-    ``eigsh(K, M, k)`` is ``eigenpairs(sparse_pencil(K, M), k)``. It corresponds to `scipy.sparse.linalg.eigsh` with
-    ``which="LM"`` and ``sigma`` below the spectrum, but needs no shift. K may be singular, with any null space, or
-    indefinite. Eigenvectors are the *rows* of ``.vectors``. Multiple eigenvalues are found with their full
-    multiplicity. If values are traced, an eigenvalue of multiplicity above about forty may lack pairs; then ``.result``
-    is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the interval. K and M
-    cannot be a ``LinearOperator``, because they are factorised (by nested dissection).
+    ``eigsh(K, M, k)`` is ``eigenpairs(sparse_pencil(K, M), k)``. The function corresponds to
+    `scipy.sparse.linalg.eigsh` with ``which="LM"`` and ``sigma`` below the spectrum, but needs no shift. K may be
+    singular, with any null space, or indefinite. Eigenvectors are the *rows* of ``.vectors``. Multiple eigenvalues are
+    found with their full multiplicity. If values are traced, an eigenvalue of multiplicity above about forty may lack
+    pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the
+    interval. A ``LinearOperator`` is not accepted, because K and M are factorised (by nested dissection).
 
     First derivatives with respect to the entries of K and M are available in forward and reverse mode. At any
-    multiplicity they are exact for signatures and for sums over all equal eigenvalues. The derivative of an eigenvector
-    is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ f(λᵢ) φᵢ(x)². The function works
-    under `jit`, and under `vmap` over the entries of one pattern (map over a pencil from `sparse_pencil`). Derivatives
-    in an interval keep its ends fixed.
+    multiplicity, derivatives of signatures and of sums over all equal eigenvalues are exact. The derivative of an
+    eigenvector is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ f(λᵢ) φᵢ(x)². The
+    function works under `jit`, and under `vmap` over the entries of one pattern (map over a pencil from
+    `sparse_pencil`). Derivatives in an interval keep its ends fixed.
 
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of

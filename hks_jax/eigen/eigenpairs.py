@@ -47,8 +47,8 @@ class Eigenpairs(eqx.Module):
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
         vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. Under "mirror" and "mean" this holds
             on the doubled domain; so each doubling divides the norm here by √2.
-        frame: (k, n_dof) the same values as `vectors`, but another derivative. It excludes the rotations of the
-            eigenfunctions among themselves. They are singular at multiple eigenvalues, and irrelevant to signatures.
+        frame: (k, n_dof) the same values as `vectors`, but another derivative. The derivative excludes rotations of the
+            eigenfunctions among themselves, which are singular at multiple eigenvalues and irrelevant to signatures.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the distance of λ from `spectral_origin`, but at least
             by the mean gap of the eigenvalues.
@@ -60,8 +60,8 @@ class Eigenpairs(eqx.Module):
         next_eigenvalue: the first eigenvalue not kept; infinite if there is none or if it was not computed, as for an
             interval. Derivatives treat it as a constant.
         complete_below: the solver's certificate that it missed no eigenvalue below this bound (in an interval, none
-            between the lower end and the bound). It follows from Sylvester's law of inertia, or all eigenvalues were
-            computed. NaN if there is no certificate. Derivatives treat it as a constant.
+            between the lower end and the bound). The certificate follows from Sylvester's law of inertia, or all
+            eigenvalues were computed. NaN if there is no certificate. Derivatives treat it as a constant.
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
@@ -114,7 +114,7 @@ class Eigenpairs(eqx.Module):
         return self.eigenvalues.shape[-1]
 
     def of_part(self, number: int) -> "Eigenpairs":
-        """Return the pairs with only those of one part of a doubled domain kept; signatures then ignore the others."""
+        """Keep only the pairs of one part of a doubled domain; signatures then ignore the other pairs."""
         return self if self.part is None else eqx.tree_at(lambda p: p.kept, self, self.kept & (self.part == number))
 
     def on(self, pencil: AnyPencil) -> "Eigenpairs":

@@ -49,10 +49,10 @@ def count_eigenvalues(
 ) -> Number:
     """Count the eigenvalues below a number, with their multiplicities.
 
-    By Sylvester's law of inertia, this is the number of negative eigenvalues of K − σM. A factorisation LDLᵀ shows it,
-    so that one factorisation certifies that a list of eigenvalues is complete. Random right-hand sides test whether the
-    error of the factorisation could change its inertia. If it could, because σ is an eigenvalue of the domain or of a
-    part of it, the function counts on both sides of σ. Works under `jit`.
+    By Sylvester's law of inertia, this is the number of negative eigenvalues of K − σM. A factorisation LDLᵀ shows this
+    number. So one factorisation certifies that a list of eigenvalues is complete. Random right-hand sides test whether
+    the error of the factorisation could change its inertia. If σ is an eigenvalue of the domain or of a part of the
+    domain, the error may be too large; then the function counts on both sides of σ. Works under `jit`.
 
     Args:
         domain: a tensor field, a mesh, a pencil, K, or (K, M), as in `eigenpairs`.
@@ -61,7 +61,7 @@ def count_eigenvalues(
         mass: see `assemble`; a given pencil already has it.
 
     Returns:
-        The number of eigenvalues less than σ; −1 if values are traced and it is uncertain.
+        The number of eigenvalues less than σ; −1 if values are traced and the number is uncertain.
 
     Raises:
         ValueError: σ is not finite, or too close to an eigenvalue (the message has the counts on both sides);
@@ -72,7 +72,7 @@ def count_eigenvalues(
 
 
 def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a user's domain. If M is the user's own and concrete, check that it is positive definite."""
+    """Return the pencil of a user's domain. If the user gave a concrete M, check that M is positive definite."""
     pencil = pencil_of(domain, boundary, mass, quadrature)
     for part in jax.lax.stop_gradient(pencil).parts:
         own = isinstance(part.space, MatrixSpace) or part.volume is None
@@ -96,7 +96,7 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
         return jnp.where(sound, count, -1)
     if sound:
         return count
-    # For σ near zero, distances are relative to the expected order of the lowest positive eigenvalue.
+    # If σ is near zero, the scale of distances is the expected size of the lowest positive eigenvalue.
     volume, dimension = pencil.volume, pencil.space.dimension
     least = 1e-6 * largest(pencil.parts[0]) if volume is None or dimension is None else volume ** (-2 / dimension)
     size = max(abs(float(shift)), float(least))
@@ -123,7 +123,7 @@ def _total(pencil: AnyPencil, shift: Scalar) -> Count:
 
 
 def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
-    """Return the number of eigenvalues of one pencil below σ, and whether it is certain."""
+    """Return the number of eigenvalues of one pencil below σ, and whether this number is certain."""
     return _certain_count(pencil, dissect(pencil.pattern), shift)
 
 

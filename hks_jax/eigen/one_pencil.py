@@ -63,7 +63,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         if not is_traced(below) and below > 2 * half:
-            # If the lowest eigenvalue has a multiplicity above k, compute all its pairs: the count includes them.
+            # If the lowest eigenvalue has a multiplicity above k, compute all its pairs, as `locate` counted all.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
 
@@ -164,7 +164,7 @@ def _pairs(
     held = jax.lax.stop_gradient((tabulated(solved_pencil), values, vectors))
     known = solved_pencil is pencil and pencil.null_space is not None
     residuals, converged, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
-    # While JAX differentiates, it may turn a constant array into a Python number.
+    # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jnp.asarray(following), jnp.asarray(bound)
     if not known:
         # Eigenvalues that are zero within rounding become exactly zero, and keep their derivatives.

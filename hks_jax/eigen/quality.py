@@ -24,7 +24,7 @@ def measure_pairs(
     """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether a vector is nearly parallel to one of the few before it (found twice).
 
     If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared. In double
-    precision they are never compared, because all solvers keep them orthogonal.
+    precision, vectors are never compared, because all solvers keep vectors orthogonal.
     """
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     m, size, width = len(vectors), min(_ROWS, len(vectors)), min(2 * _ROWS, len(vectors))
@@ -52,7 +52,7 @@ def measure_pairs(
 def measured_on_host(
     pencil: SymmetricPencil, vectors: Float[np.ndarray, "m n_dof"], values: Float[np.ndarray, " m"]
 ) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Return by SciPy ‖Kφ − λMφ‖ / ‖Mφ‖, whether a vector nearly repeats an earlier one, and `largest`."""
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖, whether a vector nearly repeats an earlier vector, and `largest`; by SciPy."""
     stiffness, mass = (matrix.to_scipy().tocsr() for matrix in (pencil.stiffness, pencil.mass))
     columns = np.ascontiguousarray(vectors.T)
     image = mass @ columns

@@ -45,8 +45,8 @@ class Eigensolver(eqx.Module, Generic[P]):
         name: the name of the method in reports.
         indefinite: whether it supports an indefinite stiffness, or one with an unknown null space.
         adjoint: the linear solver for derivatives. The default supports every pencil that can be factorised.
-        tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged. Where
-            rounding is larger, the level of rounding replaces it.
+        tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged. If the
+            level of rounding is larger, it replaces the tolerance.
     """
 
     name: ClassVar[str]

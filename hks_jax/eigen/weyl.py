@@ -78,7 +78,7 @@ def weyl_count(
 
 
 def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
-    """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part."""
+    """Return the metric length (area in 3D) of the natural part of the rim minus that of the Dirichlet part."""
     if isinstance(domain, SimplicialMesh):
         return _mesh_rim(domain, space)
     assert isinstance(space, GridSpace)

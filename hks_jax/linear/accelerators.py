@@ -1,6 +1,6 @@
 """Decisions that depend on whether computations run on an accelerator.
 
-On an accelerator, each kernel launch takes at least about 4 µs. If the host reads a number, it waits for all earlier
+On an accelerator, each kernel launch takes at least about 4 µs. A host that reads a number waits for all earlier
 kernels. So programs for accelerators have few kernels and static loop lengths, at the cost of some additional
 arithmetic.
 """
@@ -87,6 +87,6 @@ def padded_size(n: int, least: int) -> int:
 def row_by_row(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the array; on accelerators, force row-major memory layout.
 
-    Without it, XLA transposes a whole large array there if a part of it is needed transposed.
+    Otherwise, XLA transposes a whole large array there if a part is needed transposed.
     """
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim)))) if at_hand() else x

@@ -90,7 +90,7 @@ def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
     """Return distances from landmarks in each component; an additional coordinate places components in sequence."""
     n = graph.shape[0]
     count, label = connected_components(graph, directed=False)
-    # The first landmark is the first vertex in the order, because it is far from the last; all distances are below n.
+    # The first landmark is the first vertex in the order, which is far from the last; all distances are below n.
     nearest, roots = np.arange(2 * n, n, -1), np.empty(count, int)
     distances: list[Int[np.ndarray, " n"]] = []
     for _ in range(_LANDMARKS):
@@ -154,7 +154,7 @@ def within_groups(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " n"]:
 
 # Kőnig's theorem: for a maximum matching, let Z be the set of vertices that alternating paths (an unmatched edge, a
 # matched edge, …) reach from the unmatched vertices on the left. The left vertices outside Z and the right vertices in
-# Z cover all edges. Their number equals that of the matched edges, so that no cover is smaller.
+# Z cover all edges. The cover has as many vertices as the matching has edges, so that no cover is smaller.
 def minimum_cover(left: Int[np.ndarray, " m"], right: Int[np.ndarray, " m"]) -> Int[np.ndarray, " s"]:
     """Return a minimum vertex cover of a bipartite graph, given the left and right ends of its edges."""
     lefts, row = np.unique(left, return_inverse=True)

@@ -1,8 +1,8 @@
 """Kernels for CUDA devices that fuse the operations of block Lanczos on blocks of a few long columns.
 
 By XLA operations, inner products and the combinations that use them take four launches: for partial sums, their sum, a
-small matrix computed from the sum, and combinations of columns. Here, the second kernel gets the partial sums. Each of
-its programs adds them, computes the small matrix, and combines its own rows.
+small matrix computed from the sum, and combinations of columns. In this module, the partial sums are the input of a
+second kernel. Each of its programs adds the partial sums, computes the small matrix, and combines its own rows.
 """
 
 from collections.abc import Callable

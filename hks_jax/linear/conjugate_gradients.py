@@ -62,9 +62,9 @@ def conjugate_gradients(
 
     Args:
         inner: the function that returns the inner products (b,) of two blocks of columns. All Aᵢ and the preconditioner
-            must be symmetric and positive definite with respect to it.
+            must be symmetric and positive definite with respect to ``inner``.
         clean: the projection x ↦ Px on the subspace in which the Aᵢ are positive definite. If rounding has led x out of
-            it, an energy is not positive; then the iteration restarts from Px.
+            the subspace, an energy is not positive; then the iteration restarts from Px.
         orthogonal: whether to reorthogonalise residuals, for one ill-conditioned matrix with expensive products (b = 1,
             JAX only). Then ``product(x, first)`` returns the right-hand side if ``first`` is true, so that their common
             parts are compiled once; only the shape of ``rhs`` matters.
@@ -121,8 +121,8 @@ def conjugate_gradients(
         else:
             before = direct(before)
             state, regular = advance(before)
-            # The preconditioned residual gives the error before this step. Assuming that the step reduces it by the
-            # same factor as the previous step saves one (expensive) application of the preconditioner.
+            # The preconditioned residual gives the error before this step. The step is assumed to reduce the error by
+            # the same factor as the previous step; this saves one expensive application of the preconditioner.
             reduction = xp.where(before.fresh, 1, xp.sqrt(xp.minimum(xp.abs(before.change), 1)))
             error = relative(before.energy, before.first) * reduction
         errors = xp.where(before.going, xp.where(regular, error, xp.inf), before.errors)

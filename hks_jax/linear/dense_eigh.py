@@ -32,23 +32,23 @@ class DenseEigenpairs(NamedTuple):
 def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> DenseEigenpairs:
     """Compute all eigenpairs of Av = λv, or of Av = λBv, of dense symmetric matrices, differentiably.
 
-    First derivatives, forward and reverse, are never NaN. At multiple eigenvalues, they are exact for sums of f(λ) over
-    all equal eigenvalues, such as tr f(A), and for projectors on eigenspaces. At a simple eigenvalue, they are exact
-    for the eigenvalue and the eigenvector.
+    First derivatives, forward and reverse, are never NaN. At multiple eigenvalues, derivatives of sums of f(λ) over all
+    equal eigenvalues, such as tr f(A), and of projectors on eigenspaces are exact. At a simple eigenvalue, derivatives
+    of the eigenvalue and the eigenvector are exact.
 
-    A single eigenvector of a multiple eigenvalue has no derivative. The rule here returns the one without rotation
-    within the eigenspace, and for each of the equal eigenvalues a diagonal entry of VᵀȦV. **At a multiple eigenvalue,
-    the derivative of V f(Λ) Vᵀ through V and Λ is therefore wrong: use `matrix_function`**, which is exact everywhere.
-    No rule for V and Λ could be exact: at A = I the derivative along Ȧ is f'(1) Ȧ, but Λ̇ and a rotation of V give only
-    the diagonal of VᵀȦV.
+    A single eigenvector of a multiple eigenvalue has no derivative. The rule returns an eigenvector derivative without
+    rotation within the eigenspace, and a diagonal entry of VᵀȦV for each of the equal eigenvalues. **At a multiple
+    eigenvalue, the derivative of V f(Λ) Vᵀ through V and Λ is therefore wrong: use `matrix_function`**, which is exact
+    everywhere. No rule for V and Λ could be exact: at A = I the derivative along Ȧ is f'(1) Ȧ, but Λ̇ and a rotation of
+    V give only the diagonal of VᵀȦV.
 
-    Eigenvectors of nearly equal eigenvalues, and their derivatives, have errors of about ε|λ|/gap. So have derivatives
-    of functions of a whole cluster, unless its gaps are below `multiplet_tolerance`.
+    Eigenvectors of nearly equal eigenvalues, and their derivatives, have errors of about ε|λ|/gap. Derivatives of
+    functions of a whole cluster have the same errors, unless the gaps are below `multiplet_tolerance`.
 
     Second derivatives are exact if all eigenvalues are simple, and NaN otherwise.
 
     Args:
-        A: (n, n), symmetric, float32 or float64. Derivatives are with respect to its symmetric part.
+        A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
         B: (n, n), symmetric positive definite; None: the identity.
         multiplet_tolerance: eigenvalues count as equal in derivatives if they differ by less than this, relative to the
             largest |λ|. None is 4nε, about the effect of rounding.
@@ -73,7 +73,7 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
 def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Matrix]:
     """Return the eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors in columns.
 
-    With a tolerance, derivatives are those of `eigh`. Without a tolerance, they are NaN at equal eigenvalues.
+    With a tolerance, derivatives are those of `eigh`. Without a tolerance, derivatives are NaN at equal eigenvalues.
     """
     return lapack.eigh(a)
 
@@ -83,9 +83,9 @@ def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Mat
 #     λ̇ᵢ = Gᵢᵢ,    V̇ = VΩ,    Ωᵢⱼ = Gᵢⱼ/(λⱼ − λᵢ) for i ≠ j.
 #
 # Ω is antisymmetric. In the derivative of VₑVₑᵀ, the projector on an eigenspace, the entries of Ω within the eigenspace
-# cancel, so that the rule may set them to zero. The derivative of tr f(A) = Σ f(λᵢ) does not contain them either.
-# Second derivatives contain the derivative of 1/gap, which is NaN at equal eigenvalues, because a sum such as
-# Σᵢ f'(λᵢ) Gᵢᵢ depends on the omitted entries.
+# cancel, so that the rule may set them to zero. The derivative of tr f(A) = Σ f(λᵢ) does not contain Ω. Second
+# derivatives contain the derivative of 1/gap, which is NaN at equal eigenvalues, because a sum such as Σᵢ f'(λᵢ) Gᵢᵢ
+# depends on the omitted entries.
 @differentiable_eigh.defjvp
 def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
     values, vectors = differentiable_eigh(tolerance, primals[0])

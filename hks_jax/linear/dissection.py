@@ -116,7 +116,7 @@ def _listed(entries: Ints, places: Ints, number: int, end: int) -> tuple[Ints | 
         return entries.astype(np.int32), places.astype(np.int32)
     of_all, without = np.empty(number, np.int32), np.ones(number, bool)
     of_all[entries], without[entries] = places, False
-    of_all[without] = np.arange(end, end + others)  # all distinct, because the scatter declares unique indices
+    of_all[without] = np.arange(end, end + others)  # distinct places, because the scatter declares its indices unique
     return None, of_all
 
 
@@ -136,8 +136,8 @@ def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], 
 def _boundaries(level: Ints, front: Ints, depth: int, rows: Ints, cols: Ints) -> list[Ints]:
     """Return each level's boundary nodes as sorted keys front·n + node.
 
-    A front's boundary nodes are eliminated later. They are coupled to the front's own nodes by an entry (row, column),
-    or inherited from the boundaries of its children.
+    A front's boundary nodes are eliminated later. Such a node is coupled to the front's own nodes by an entry (row,
+    column), or inherited from the boundary of a child.
     """
     n, keys, boundaries = level.size, np.empty(0, int), []
     eliminated, keys_of = level[rows], front[rows] * n + cols

@@ -1,8 +1,8 @@
 """The levels of an elimination tree, and their merging for solves on accelerators.
 
-A front and its descendants on the following levels merge into one front with an explicit inverse. This increases memory
-traffic but reduces kernel launches; the groups of levels are chosen for the least total cost. Merging affects only the
-matrices of solves. The factorisation, and hence the inertia, proceeds level by level.
+A front and its descendants on the following levels merge into one front with an explicit inverse. Merging increases
+memory traffic but reduces kernel launches; the groups of levels are chosen for the least total cost. Merging affects
+only the matrices of solves. The factorisation, and hence the inertia, proceeds level by level.
 
 The method replaces many substitutions by few explicit inverses: F. L. Alvarado, A. Pothen and R. Schreiber, Highly
 parallel sparse triangular solution, in Graph Theory and Sparse Matrix Computation (Springer 1993).

@@ -51,12 +51,12 @@ class FactorisedMatrix(eqx.Module):
 
     Attributes:
         matrix: A. Derivatives of any order with respect to its entries exist, forward and reverse.
-        factor: LDLᵀ. Derivatives treat it as a constant.
+        factor: LDLᵀ. Derivatives treat the factorisation as a constant.
         sound: whether a test with random right-hand sides shows that the factorisation is accurate enough. Then its
             inertia is that of A, and iterative refinement converges. Otherwise results are NaN.
-        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. It estimates the error of
-            log|det A| and the relative error of A⁻¹. It is infinite if pivots were replaced; then log|det A| and A⁻¹
-            are NaN. Solutions are refined, and more accurate.
+        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. This is about the error of
+            log|det A| and the relative error of A⁻¹. The estimate is infinite if pivots were replaced; then log|det A|
+            and A⁻¹ are NaN. Solutions are refined, and more accurate.
     """
 
     matrix: PatternedOperator
@@ -215,8 +215,8 @@ def _norm(matrix: PatternedOperator) -> Float[Array, ""]:
     return jnp.max(matrix.with_flat(jnp.abs(matrix.flat())).of_columns()(ones))
 
 
-# A dx = db − dA x. JAX derives all derivatives of a linear solve from the product with A. The solution method is a
-# constant for them.
+# A dx = db − dA x. JAX derives all derivatives of a linear solve from the product with A. The solution method does not
+# enter these derivatives.
 @jax.jit
 def _solve(matrix: PatternedOperator, factor: Factorisation, b: Float[Array, "n m"]) -> Float[Array, "n m"]:
     product, norm = matrix.of_columns(), jax.lax.stop_gradient(_norm(matrix))
@@ -257,8 +257,8 @@ def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated
     return [(both[:, :s], both[:, s:]) for s, both in zip(sizes, factor.downward, strict=True)]
 
 
-# d(A⁻¹) = −A⁻¹ dA A⁻¹ is needed at some places. It is computed by differentiating the elimination and the recurrence
-# from the first separator to the cells. The transpose takes a few times as many operations. Values use the factors.
+# d(A⁻¹) = −A⁻¹ dA A⁻¹ is needed at some places. The rule differentiates the elimination and the recurrence from the
+# first separator to the cells. The transpose takes a few times as many operations. Values use the factors.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
     return selected(factor.dissection, _eliminated(matrix, factor), diagonal)

@@ -1,4 +1,4 @@
-"""Decompositions of single small dense matrices. On CPUs `vmap` loops over them, because batched LAPACK calls can hang.
+"""Decompositions of single small dense matrices. On CPUs `vmap` becomes a loop, because batched LAPACK calls can hang.
 
 jaxlib 0.10.0 to 0.11.0 distribute a batch of LAPACK calls over the CPU's thread pool, and the calling thread waits for
 them (`ParallelBatchMap`). If the calling threads belong to the pool and occupy all of it, no thread does the work. A

@@ -27,21 +27,22 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
     f(λ) = 1/λ gives A⁻¹, and f(λ) = e^(−tλ) gives the heat kernel.
 
     First and second derivatives exist with respect to A, B and the arrays in the closure of f, forward and reverse in
-    any order. They are exact at equal eigenvalues, and accurate at nearly equal ones, because no division by a small
-    gap occurs. `jax.vmap` over parameters of f computes eigenpairs once. Third derivatives raise an error.
+    any order. These derivatives are exact at equal eigenvalues, and accurate at nearly equal ones, because no division
+    by a small gap occurs. `jax.vmap` over parameters of f computes eigenpairs once. Third derivatives raise an error.
 
     The function takes O(n³) time, mainly for the eigenpairs, and O(n²) memory; a gradient takes about as much again.
-    Second derivatives are for small matrices: they evaluate f'' 89 times for each of n³ triples of eigenvalues.
+    Second derivatives evaluate f'' 89 times for each of n³ triples of eigenvalues, and are thus only for small
+    matrices.
 
     Args:
-        A: (n, n), symmetric, float32 or float64. Derivatives are with respect to its symmetric part.
+        A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
         f: a function of JAX operations that maps one eigenvalue, a scalar, to a real scalar. It is also evaluated
-            between eigenvalues. First derivatives use f', second derivatives f''. Away from the eigenvalues, f need not
-            be smooth; so ``lambda x: x < c`` gives the projector on the eigenvectors with λ < c.
+            between eigenvalues. First derivatives use f', second derivatives f''. Between eigenvalues, f need not be
+            smooth; so ``lambda x: x < c`` gives the projector on the eigenvectors with λ < c.
         B: (n, n), symmetric positive definite; None: the identity.
 
     Returns:
-        The symmetric matrix (n, n). It is NaN if f is NaN, as for the logarithm of a negative eigenvalue.
+        The symmetric matrix f(A), (n, n). The matrix is NaN if f is NaN, as for the logarithm of a negative eigenvalue.
 
     Raises:
         ValueError: f does not return a real scalar; `eigh` refuses A or B.
@@ -95,7 +96,8 @@ def _function(f: Function, parameters: Any, others: Any, a: Matrix) -> tuple[Mat
 #
 # with divided differences of f, which are smooth at equal eigenvalues. Both formulas are independent of the chosen
 # basis of an eigenspace. But differentiating the first formula term by term would not give the second at a multiple
-# eigenvalue, because Λ and V have no derivatives there. So each has its own rule, which treats eigenpairs as constants.
+# eigenvalue, because Λ and V have no derivatives there. So each formula has its own rule, which treats eigenpairs as
+# constants.
 #
 # If parameters of f also change, let ∂f and ∂'f be the derivatives of f along their two changes. The derivatives are
 #
@@ -138,7 +140,7 @@ def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
 
 
 def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:
-    """Return [∂f]. It is linear in the change, because the choice between a mean and a quotient depends only on f."""
+    """Return [∂f], linear in the change, because the choice between a mean and a quotient depends only on f."""
     return jax.jvp(lambda p: _table(partial(f, p, others), values), (parameters,), (change,))[1]
 
 

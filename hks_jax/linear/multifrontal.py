@@ -64,8 +64,8 @@ class Trial(NamedTuple):
     sound: Bool[Array, ""]  # whether its inertia equals that of K − σM
     # ‖b − (K − σM)x‖/‖b‖ of solutions x for random b, which estimates the convergence rate of iterative refinement
     rate: Float[Array, ""]
-    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x. It bounds the attainable residuals of eigenpairs
-    # near σ from below; measured residuals are 1 to 15 times as large, rarely up to 40 times
+    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x. Residuals of eigenpairs near σ cannot be smaller;
+    # measured residuals are 1 to 15 times as large, rarely up to 40 times
     error: Float[Array, ""]
 
 

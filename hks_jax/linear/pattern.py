@@ -1,4 +1,4 @@
-"""Sparsity patterns of symmetric matrices. They determine the structure of factorisations and products."""
+"""Sparsity patterns of symmetric matrices. A pattern determines the structure of factorisations and products."""
 
 from abc import abstractmethod
 from functools import cached_property
@@ -83,7 +83,7 @@ class SparsePattern(Pattern):
 
     @cached_property
     def table(self) -> Ellpack:
-        """The pattern as a table. Its width minimises the cost of products, so that a few long rows do not widen it."""
+        """The pattern as a table. The width minimises the cost of products: a few long rows do not increase it."""
         counts = np.bincount(self.rows, minlength=self.size)
         start = np.cumsum(counts) - counts
         longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # the number of rows with more than 0, 1, … entries

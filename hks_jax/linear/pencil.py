@@ -15,8 +15,8 @@ class NullSpace(eqx.Module):
 
     Attributes:
         vectors: a basis (m, n_dof); m may be 0.
-        fixed: whether every perturbation of K annihilates it too, as for stiffness matrices of finite elements.
-            Derivatives then omit the corresponding terms, which are only rounding errors.
+        fixed: whether every perturbation of K annihilates the null space too, as for stiffness matrices of finite
+            elements. Derivatives then omit the corresponding terms, which are only rounding errors.
     """
 
     vectors: Float[Array, "m n_dof"]

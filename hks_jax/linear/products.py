@@ -50,8 +50,8 @@ def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, 
     """
     if accelerators.at_hand() or len(matrices) < _MANY or matrices.shape[2] > _TERMS:
         return matmul(matrices, columns)
-    # If XLA fused the computation of the columns into the loop, it would repeat it for each row. A condition prevents
-    # fusion; both branches give the same result.
+    # XLA might fuse the computation of the columns into the loop, and repeat this computation for each row. A condition
+    # prevents fusion; both branches give the same result.
     return jax.lax.cond(jnp.isfinite(columns[0, 0, 0]), _written_out, matmul, matrices, columns)
 
 

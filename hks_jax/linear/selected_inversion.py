@@ -6,9 +6,9 @@ elimination, the coupling B to its boundary, and C = BA⁻¹. Then the inverse G
     G_own = A⁻¹ + Cᵀ G_b C,    G_b,own = −G_b C,
 
 where G_b is its block at the boundary. A front's boundary nodes are own or boundary nodes of the front above. So the
-recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. It takes
-about as many operations as the factorisation, O(N^1.5) in 2D and O(N²) in 3D: L. Lin and others, SelInv, ACM Trans.
-Math. Softw. 37 (2011).
+recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. The
+recursion takes about as many operations as the factorisation, O(N^1.5) in 2D and O(N²) in 3D: L. Lin and others,
+SelInv, ACM Trans. Math. Softw. 37 (2011).
 """
 
 from typing import NamedTuple
@@ -36,9 +36,9 @@ class Cost(NamedTuple):
 def diagonal_of_inverse(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Inexact[Array, " n_dof"]:
     """Return the diagonal of the inverse of a symmetric matrix, real or complex (not Hermitian).
 
-    The elimination does not pivot between fronts. It is safe for matrices with a definite real or imaginary part, whose
-    Schur complements are regular. The function is differentiable in both modes; reverse mode stores several copies of
-    the factors.
+    The elimination does not pivot between fronts. This is safe if the real or imaginary part of the matrix is definite,
+    because then all Schur complements are regular. The function is differentiable in both modes; reverse mode stores
+    several copies of the factors.
     """
     return selected(dissection, eliminated_differentiably(dissection, matrix), diagonal=True)
 

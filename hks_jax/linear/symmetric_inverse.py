@@ -127,7 +127,7 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
         return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
-    # All but one of these pivots are positive: they are 1 from the padding, or eigenvalues that are not smaller.
+    # All but one of these pivots are positive: 1 from the padding, or eigenvalues that are not smaller.
     last = jnp.prod(pivots[:, n - 1 :], axis=1, keepdims=True)
     return -a[:, :n, :n], jnp.concatenate([pivots[:, : n - 1], last], axis=1)
 
@@ -150,8 +150,8 @@ def _away_from_zero(pivots: Float[Array, "..."], least: Float[Array, "..."]) -> 
     return jnp.where(jnp.abs(pivots) < least, jnp.where(pivots < 0, -least, least), pivots)
 
 
-# With XLA operations, each of the n pivots takes about six launches of at least 4 µs. Here, one program inverts a
-# matrix, and keeps it in registers for all pivots.
+# With XLA operations, each of the n pivots takes about six launches of at least 4 µs. In this kernel, one program
+# inverts one matrix, which stays in registers for all pivots.
 def invert_in_registers(
     matrices: Matrices, least: Pivots, at: Int[Array, ""] | None = None, rows: int | None = None
 ) -> tuple[Float[Array, "m s s"], Float[Array, "m s"]]:

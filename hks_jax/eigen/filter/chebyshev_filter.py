@@ -45,12 +45,12 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     The solver is for grids, mainly in 3D, where factorisations have much fill-in, and for accelerators. Filters run in
     single precision without loss of accuracy, because they act on residuals that are computed in the precision of the
     matrices. All pairs are computed simultaneously, so that multiple eigenvalues are complete; but no certificate shows
-    that none was missed. The solver works under `jit`. Outside `jit`, it can be interrupted and reports progress
+    that none was missed. All works under `jit`. Outside `jit`, the solver can be interrupted and reports progress
     between two rounds.
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
-        block: the number of vectors filtered together. The workspace is proportional to it.
+        block: the number of vectors filtered together. The workspace is proportional to this number.
         spare: the number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds.
         max_rounds: the maximal number of rounds on the finest grid.
         single_precision: whether filters run in float32.
@@ -86,7 +86,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
     def guards(self, k: int, n_dof: int) -> int:
-        """Return half of the spare vectors. Nearly converged, they keep the linear solves well conditioned."""
+        """Return half of the number of spare vectors: as guards, they keep linear solves well conditioned."""
         return max(8, int(self.spare * k) // 2)
 
     def max_pairs(self, n_dof: int) -> int:
@@ -156,8 +156,8 @@ def _converge(
 class Pace:
     """An estimate of the remaining time of a subspace iteration, from the convergence and cost of earlier rounds.
 
-    It assumes that each round reduces the largest residual by the same factor, and that the time of a round is
-    proportional to its number of matrix–vector products. The first estimate follows the first round.
+    The estimate assumes that each round reduces the largest residual by the same factor. The time of a round is assumed
+    to be proportional to its number of matrix–vector products. The first estimate follows the first round.
     """
 
     def __init__(self, excess: float) -> None:
@@ -167,7 +167,7 @@ class Pace:
         self._begin = time.perf_counter()
 
     def round_done(self, excess: float, work: int) -> None:
-        """Record the number of products in a round, and the residual after it."""
+        """Record the number of products in a round, and the residual after this round."""
         now = time.perf_counter()
         self._factor, self._excess = self._excess / excess if excess > 0 else math.inf, excess
         self._work, self._seconds, self._begin = work, now - self._begin, now

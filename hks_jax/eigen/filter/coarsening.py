@@ -41,8 +41,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
         return tuple(to_rows(*restrict(image)) for image in fine.products()(raised))
 
     def coupled(images: Float[Array, "blocks b coarse"]) -> Stencil:
-        # Basis functions of one colour have disjoint neighbourhoods. So the image of their sum at a node is the entry
-        # that couples the node to the nearest of them.
+        # Basis functions of one colour have disjoint neighbourhoods. So the image of the sum of these functions at a
+        # node is the entry that couples the node to the nearest function.
         entries = jnp.take_along_axis(images.reshape(padded, *shape), jnp.maximum(of_neighbour, 0), axis=0)
         return Stencil(jnp.where(of_neighbour >= 0, entries, 0), fine.periodic)
 

@@ -142,8 +142,8 @@ class GridFilter(eqx.Module):
     ) -> FilterState:
         """Filter the blocks that have not converged (all, if ``rounding`` is None), then apply Rayleigh–Ritz.
 
-        Outside `jit` and on one device, it can be interrupted between two blocks, and after each block calls ``done``
-        with the numbers of finished and of all products. `improve` is the compiled version.
+        Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done`` is
+        called with the numbers of finished and of all products. `improve` is the compiled version.
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 

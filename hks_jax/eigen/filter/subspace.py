@@ -77,7 +77,7 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
 
     def among_rows(number: Array) -> tuple[Array, ...]:
         images = products(block_of(x, number, block, pencil.shape))
-        # Images stay columns. If they became rows, XLA would compute the stencils in that layout, seven times slower.
+        # Images stay columns. If images became rows, XLA would compute stencils in that layout, seven times slower.
         return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
     both = _total(slabs, jax.lax.map(among_rows, jnp.arange(m // block)))

@@ -34,12 +34,12 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     """Spectrum slicing: shift-invert block Lanczos with nested-dissection factorisations, all in JAX.
 
     The solver is for grids and meshes, mainly in 2D (in 3D, factors have much fill-in). The same code runs on CPUs and
-    accelerators, and works under `jit`. Outside `jit`, it can be interrupted and reports progress between two slices.
-    Only there, it finds eigenvalues of any multiplicity, if necessary (up to 3000 unknowns) by the dense solver.
+    accelerators, and works under `jit`. Outside `jit`, the solver can be interrupted, reports progress between two
+    slices, and finds eigenvalues of any multiplicity, if necessary (up to 3000 unknowns) by the dense solver.
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
-        block: the number of vectors per Lanczos block. Multiplicities may exceed it.
+        block: the number of vectors per Lanczos block. Multiplicities may exceed this number.
         slice_size: the number of eigenvalues per slice; None is automatic.
     """
 
@@ -95,7 +95,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
-    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia locates them."""
+    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia is used."""
     return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
 
 

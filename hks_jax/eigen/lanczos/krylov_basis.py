@@ -38,7 +38,7 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
 
     The number of known vectors and the size are multiples of ``block``, the number of rows written at once. On
     accelerators, the basis is a single array, because skipping empty pieces would take longer than computing with them.
-    Its vectors are columns there, like those of blocks, so that no kernel has to transpose them.
+    There, basis vectors are columns, as in blocks, so that no kernel has to transpose.
     """
     if accelerators.at_hand():
         return jnp.pad(known.T, ((0, 0), (0, size - len(known))))
@@ -67,8 +67,8 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
 
 # One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So two
 # steps amplify rounding errors to c = VᵀMx of 1e-14 to 1e-9. The sums in c need double precision, because rounding
-# would otherwise be as large as c. To subtract Vc, single precision suffices: it leaves an error of 6e-8 c. If c is
-# large, because the shift is close to an eigenvalue, V is used in double precision.
+# would otherwise be as large as c. Single precision suffices to subtract Vc, with an error of 6e-8 c. If c is large,
+# because the shift is close to an eigenvalue, V is used in double precision.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
     """Return the projection VVᵀMx of columns x, given Mx, on the first ``filled`` vectors V of the basis."""
     if not isinstance(basis, tuple):
@@ -124,7 +124,7 @@ def _starts(basis: Basis) -> list[int]:
 def _put(
     rows: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], place: Int[Array, ""], inside: Bool[Array, ""]
 ) -> Float[Array, "rows n_dof"]:
-    """Write the block into the rows if it belongs to them; otherwise return the rows unchanged."""
+    """Write the block into the rows if ``inside``; otherwise return the rows unchanged."""
     block = block.astype(rows.dtype)
     # A loop of at most one iteration touches only the piece that contains the block; a mask would touch every piece.
     return jax.lax.fori_loop(

@@ -63,7 +63,7 @@ def block_lanczos(
     """Run block Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     The recurrence keeps consecutive blocks orthogonal. In double precision, every second step projects two blocks on
-    the whole basis. This reads the basis half as often, and keeps it M-orthonormal to rounding.
+    the whole basis. Thus the basis is read half as often, and stays M-orthonormal to rounding.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
     # Under `jit`, the loop takes `room` steps, because a length that varies within a batch would copy the whole state
@@ -103,8 +103,8 @@ def _advance(
     last: int | Array,
 ) -> _Recurrence:
     """Take the steps first, …, last − 1, or two steps if ``alone``. The basis has the blocks from row ``offset`` on."""
-    # The θ of an eigenvalue close to the shift may be 1000 times as large as the others. A step amplifies the rounding
-    # error along its eigenvector by as much. So in single precision, every step projects on the whole basis.
+    # If an eigenvalue is close to the shift, its θ may be 1000 times as large as other θ. A step amplifies the rounding
+    # error along this eigenvector by as much. So in single precision, every step projects on the whole basis.
     every = 2 if state.blocks.block.dtype == jnp.float64 else 1
     two = accelerators.at_hand()
 

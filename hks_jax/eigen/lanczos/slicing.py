@@ -57,14 +57,14 @@ def cut(
 def _consider(
     problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, state: SlicingState
 ) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
-    """Return whether to search at the state's shift, whether to make room first, and the new state."""
+    """Decide whether to search at the current shift, and whether to free storage first; also return the new state."""
     known, below = jnp.sum(state.values < state.shift), negative - problem.negative
     missing = below - known
     complete = trial.sound & (missing == 0)
     last = jnp.sort(state.values)[plan.wanted - 1]
     all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
     finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no more exist
-    # If as many are missing at a nearer shift, they are equal eigenvalues. Then search there, repeatedly if necessary.
+    # If as many eigenvalues are missing at a nearer shift, these are equal. Then search there, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
     # If a multiplicity exceeds the wanted number, a part suffices; the certificate is then below the multiplet.
@@ -125,9 +125,9 @@ def search(problem: Problem, factor: Factorisation, plan: Plan, state: SlicingSt
     return following._replace(vectors=_stored(state.vectors, vectors, order, state.known))
 
 
-# Block Lanczos finds a multiple eigenvalue at most as often as a block has columns. It fails if it takes more steps
-# than distinct eigenvalues exist. Inverse iteration finds as many eigenvalues near the shift as it has vectors. If a
-# multiplicity is larger, any vectors of the eigenspace will do.
+# Block Lanczos finds a multiple eigenvalue at most as often as a block has columns. Block Lanczos fails if the number
+# of steps exceeds that of distinct eigenvalues. Inverse iteration finds as many eigenvalues near the shift as it has
+# vectors. If a multiplicity is larger, any vectors of the eigenspace will do.
 def _nearest(
     problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
@@ -170,8 +170,8 @@ def _window(
 ) -> tuple[Float[Array, "rows n_dof"], Interval, Int[Array, ""]]:
     """Return the data of a search around the state's shift.
 
-    These are the known eigenvectors nearest to the shift, padded with zeros, to which the search stays orthogonal; the
-    interval that contains no other known eigenvalue; and the number of Lanczos blocks.
+    The data are the known eigenvectors nearest to the shift, padded with zeros, to which the search stays orthogonal;
+    the interval that contains no other known eigenvalue; and the number of Lanczos blocks.
     """
     assert state.vectors is not None
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))[:rows]
@@ -220,7 +220,7 @@ def _accept(
     complete = state.below == jnp.sum(state.values < shift) + jnp.sum(accepted & (values < shift))
     # Later searches stay orthogonal to the known vectors. If these had components along missing eigenvectors, which may
     # have much smaller eigenvalues, the missing pairs could not converge. So if pairs are missing, accept only vectors
-    # that are accurate enough for them.
+    # whose accuracy suffices for the missing pairs.
     needed = _needed(problem, plan, jnp.maximum(state.reached, first_nonzero), excuse)
     accepted &= complete | (residuals <= needed)
 
@@ -233,8 +233,8 @@ def _accept(
     gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
 
     # If eigenvalues below the shift are missing, move to the lowest Ritz value that did not converge. If all converged,
-    # a multiplet was found in part, and its place is unknown. If nothing converges from the lower end on, move below
-    # it, because the matrix is definite there and its factorisation is most accurate.
+    # a multiplet was found in part, and its place is unknown. If nothing converges from the lower end of the spectrum
+    # on, move below this end, where the matrix is definite and its factorisation most accurate.
     lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
     seen, stuck = lowest < shift, ~complete & (count == 0)
     again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)
