@@ -1,6 +1,6 @@
 """hks_jax: differentiable spectral geometry of symmetric positive definite tensor fields.
 
-From tensors to matrices to eigenpairs to signatures to pictures:
+The steps from tensors to a signature are:
 
     grid = Grid(shape=(nx, ny), spacing=(hx, hy))
     field = TensorField(grid, tensors)
@@ -94,8 +94,8 @@ _LATER = dict.fromkeys(("fit_metric", "identifiability"), "hks_jax.inverse") | d
 
 
 def __getattr__(name: str) -> Any:
-    # Several devices, fits, what needs lineax, and the outside world (files, pictures) are imported when first asked
-    # for: slow to import, often not needed.
+    # These modules (several devices, fits with lineax, files, figures) are imported on first use, because their import
+    # is slow.
     if name in ("devices", "inverse", "io", "plot"):
         return importlib.import_module(f"hks_jax.{name}")
     if name in _LATER:

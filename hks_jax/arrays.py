@@ -1,4 +1,4 @@
-"""Arrays that are structure, arrays in descriptions, and arrays that are not known everywhere."""
+"""Static arrays, descriptions of arrays, and arrays with undefined entries."""
 
 import hashlib
 from collections.abc import Callable
@@ -15,7 +15,7 @@ R = TypeVar("R")
 
 
 class ByKey:
-    """What is compared and hashed by a key, so that it can be static under `jax.jit`."""
+    """A base class of objects that are compared and hashed by a key, so they can be static under `jax.jit`."""
 
     _key: Any
 
@@ -27,7 +27,7 @@ class ByKey:
 
 
 class StaticArray(ByKey):
-    """A read-only NumPy array, known at trace time."""
+    """A read-only NumPy array that is constant at trace time."""
 
     def __init__(self, value: Any, dtype: Any = None) -> None:
         array = np.array(value, dtype=dtype, order="C")
@@ -44,7 +44,7 @@ class StaticArray(ByKey):
 
 
 def describe_array(value: Any) -> str:
-    """Return dtype and shape of an array, traced or not, as in ``float64 (40, 40, 2, 2)``; of other leaves the repr."""
+    """Return dtype and shape of an array, such as ``float64 (40, 40, 2, 2)``, or the repr of any other leaf."""
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     return repr(value) if dtype is None or shape is None else f"{dtype} {tuple(shape)}"
 
@@ -52,7 +52,7 @@ def describe_array(value: Any) -> str:
 def nan_outside(
     values: Float[Array, "*leading_and_shape"], known: Bool[np.ndarray | Array, "*_shape"]
 ) -> Float[Array, "*leading_and_shape"]:
-    """Put NaN where a value is not known, such as outside a mask; `jax.debug_nans` does not take it for a mistake."""
+    """Insert NaN where a value is not defined, such as outside a mask; `jax.debug_nans` ignores these NaNs."""
     if isinstance(known, np.ndarray) and known.all():
         return values
     with jax.debug_nans(False):
@@ -60,7 +60,7 @@ def nan_outside(
 
 
 def nan_is_meant(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function that computes with values of `nan_outside`."""
+    """Decorate a function that computes with values from `nan_outside`."""
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:

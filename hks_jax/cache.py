@@ -1,4 +1,4 @@
-"""Keeping what was compiled from one process to the next."""
+"""A persistent cache of compiled programs."""
 
 import os
 from pathlib import Path
@@ -8,17 +8,17 @@ import platformdirs
 
 
 def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Let JAX keep what it compiles in a folder, from which later processes read it in place of compiling again.
+    """Let JAX store compiled programs in a folder, from which later processes read them instead of compiling again.
 
-    Call it once, before anything is computed. JAX has one such cache in a process: programs of your own are kept there,
-    too. It is a setting of yours, so importing the package does not touch it. A folder that JAX has already, by
-    ``jax_compilation_cache_dir`` or the environment, stays the one.
+    Call this function once, before any computation. JAX has one such cache per process, so your own programs are stored
+    there as well. Importing the package does not change this setting. A folder that is already set by
+    ``jax_compilation_cache_dir`` or the environment is kept.
 
     Args:
-        folder: where; None is a folder ``hks-jax`` where the platform has the user's caches.
+        folder: the folder, by default ``hks-jax`` in the platform's folder of user caches.
 
     Returns:
-        The folder; None where it cannot be written, and nothing is kept.
+        The folder, or None if it cannot be written, in which case no program is stored.
     """
     given = jax.config.values["jax_compilation_cache_dir"]
     if given is not None:
@@ -31,6 +31,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if not os.access(path, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # JAX keeps what took a second or more. To read a small program takes a tenth of the time to compile it.
+    # By default JAX stores programs whose compilation takes a second or more. Reading is ten times as fast as
+    # compiling.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return path

@@ -1,4 +1,4 @@
-"""Checks of arguments that many functions share."""
+"""Checks of arguments that many functions have."""
 
 import math
 import operator
@@ -15,11 +15,11 @@ from hks_jax.traced import is_traced
 def require_number(
     name: str, value: Any, below: float = math.inf, *, above: float = 0.0, inclusive: bool = False
 ) -> None:
-    """Raise ValueError unless a setting is one real number between two limits, exclusive; traced ones pass.
+    """Raise ValueError unless a setting is a real number between two exclusive limits; traced numbers pass.
 
     Args:
-        name: of the argument.
-        value: a number, or an array of no axes.
+        name: the name of the argument.
+        value: a number, or an array without axes.
         below: the upper limit.
         above: the lower limit.
         inclusive: whether the lower limit itself is allowed.
@@ -37,31 +37,31 @@ def require_number(
 
 
 def require_real(name: str, values: Any) -> None:
-    """Raise ValueError for complex numbers, which would lose their imaginary part, and for those that JAX has not."""
+    """Raise ValueError for complex numbers, which would lose their imaginary part, and for dtypes that JAX lacks."""
     leaves = jax.tree.leaves(values)
     if any(np.iscomplexobj(leaf) for leaf in leaves):
         raise ValueError(
-            f"{name}: got complex numbers; expected real ones. Pass the real part, if the imaginary part is rounding"
+            f"{name}: got complex numbers; expected real numbers. Pass the real part if the rest is rounding"
         )
     if any(isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f" and leaf.dtype.itemsize > 8 for leaf in leaves):
-        raise ValueError(f"{name}: got {np.dtype(np.longdouble)}, which JAX has not; pass it as .astype(np.float64)")
+        raise ValueError(f"{name}: got {np.dtype(np.longdouble)}, which JAX does not support; use .astype(np.float64)")
 
 
 def real_array(name: str, values: Any) -> Array:
-    """Return an array as it is if it is floating point, integers in the default precision; see `require_real`."""
+    """Return a floating-point array unchanged, or integers as floats of default precision, after `require_real`."""
     require_real(name, values)
     array = jnp.asarray(values)
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
 
 
 def require_count(name: str, value: Any, least: int = 1) -> None:
-    """Raise ValueError unless a setting is an integer, and not below the least that makes sense."""
+    """Raise ValueError unless a setting is an integer that is at least the given minimum."""
     try:
         if operator.index(value) >= least:
             return
     except TypeError:
         pass
-    raise ValueError(f"{name}: got {value!r}; expected an integer from {least}")
+    raise ValueError(f"{name}: got {value!r}; expected an integer of at least {least}")
 
 
 def checked_times(times: Any, dtype: Any) -> Float[Array, " n"]:
@@ -72,7 +72,7 @@ def checked_times(times: Any, dtype: Any) -> Float[Array, " n"]:
     except (TypeError, ValueError):
         raise ValueError(f"times: got {times!r}; expected a 1-D array of positive numbers") from None
     if array.ndim != 1 or array.size == 0:
-        raise ValueError(f"times: got shape {array.shape}; expected a non-empty 1-D array; wrap one time as [t]")
+        raise ValueError(f"times: got shape {array.shape}; expected a non-empty 1-D array; pass a single time as [t]")
     if not is_traced(array):
         values = np.asarray(array)
         bad = ~(np.isfinite(values) & (values > 0))

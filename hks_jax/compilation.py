@@ -1,15 +1,19 @@
 """Compiling for CPUs in half the time, or not at all."""
 
+import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial, wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
-from hks_jax.traced import is_traced
+from hks_jax.traced import is_staged, is_traced
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -18,22 +22,65 @@ _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "
 """XLA's older code generator for fused loops takes half as long, for code as fast as far as measured here."""
 
 
-def jit_quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
+OnHost = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
+"""What NumPy computes of all arguments, of changes x of some, and of cotangents y of the leaves of the result.
+
+With neither it is what the function returns, with x the change of that, and with y the cotangents of x, which then has
+shapes alone. Of a function that is linear in x, x is no longer among the arguments. None: it is to be compiled.
+"""
+
+
+def jit_quickly(
+    jit: Callable = jax.jit,
+    linear: tuple[str, ...] = (),
+    like: Callable[..., Any] = lambda *args: None,
+    on_host: OnHost | None = None,
+    **settings: Any,
+) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Return a decorator like `jax.jit`, or `equinox.filter_jit`, for functions that take long to compile.
 
     XLA compiles a computation as a whole: within another one these functions are as that is. Where the environment
     variable XLA_FLAGS sets one of the options, they are left as it says.
+
+    Args:
+        jit: what compiles.
+        linear: names of arguments in which the function is linear, jointly.
+        like: what has the shapes of the result, given all arguments, where it is linear.
+        on_host: what computes instead where values are known, and few, on a CPU.
+        settings: for ``jit``.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         usual = jit(function, **settings)
         quick = jit(function, compiler_options=_OPTIONS, **settings)
+        whole = jit is not jax.jit or any("donate" in name for name in settings)
+        names = settings.get("static_argnames", ())
+        signature, static = inspect.signature(function), (names,) if isinstance(names, str) else tuple(names)
+
+        def is_moved(name: str, leaf: Any) -> bool:
+            return name in linear and _is_inexact(leaf) if linear else is_traced(leaf)
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
-            # Nothing comes of an operation but a tracer where all operations are part of a computation to come.
-            within = is_traced((args, kwargs, jnp.zeros(())))
-            return usual(*args, **kwargs) if within or not _understood() else quick(*args, **kwargs)
+            if is_staged() or not _understood():
+                return usual(*args, **kwargs)
+            bound = signature.bind(*args, **kwargs)
+            if not linear and not is_traced((args, kwargs)):
+                found = _on_host(on_host, bound.args, None, None)
+                return quick(*args, **kwargs) if found is None else found
+            given = {name: None if name in static else x for name, x in bound.arguments.items()}
+            moved = [jax.tree.map(partial(is_moved, name), x) for name, x in given.items()]
+            parts = eqx.partition(list(given.values()), moved)[::-1]
+            known, x = map(jax.tree.leaves, parts)
+            if whole or is_traced(known) or not all(map(_is_inexact, x)):
+                return usual(*args, **kwargs)
+            fixed = tuple(bound.arguments[name] if name in static else None for name in given)
+            program = _Program(usual, fixed, jax.tree.structure(parts), on_host)
+            if not linear:
+                return _differentiable(program, known, x)
+            results, structure = jax.tree.flatten(like(*bound.args))
+            of = _Map(program, False, _shapes(x), _shapes(results))
+            return jax.tree.unflatten(structure, _linear.bind(*known, *x, of=of))
 
         return call
 
@@ -81,7 +128,7 @@ def known_and_few(args: Any) -> bool:
 
 def known_here(args: Any) -> bool:
     """Return whether values are concrete, and on one CPU of this process alone."""
-    if is_traced((args, jnp.zeros(()))) or jax.default_backend() != "cpu" or jax.process_count() > 1:
+    if is_staged() or is_traced(args) or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return False
     return all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(args) if isinstance(leaf, jax.Array))
 
@@ -96,3 +143,167 @@ def _understood() -> bool:
     except jax.errors.JaxRuntimeError:
         return False
     return True
+
+
+class _Program(NamedTuple):
+    """A function of a flat list of arrays, with its static arguments; equal ones share what is compiled."""
+
+    function: Callable[..., Any]
+    fixed: tuple[Any, ...]
+    structure: jax.tree_util.PyTreeDef
+    host: OnHost | None
+
+    def __call__(self, *leaves: Any) -> Any:
+        """Return what the function returns."""
+        return self.function(*self.args(*leaves))
+
+    def args(self, *leaves: Any) -> list[Any]:
+        """Return the arguments."""
+        return [known if x is None else eqx.combine(known, x) for known, x in zip(*self.split(*leaves), strict=True)]
+
+    def split(self, *leaves: Any) -> tuple[list[Any], list[Any]]:
+        """Return the arguments that are known, and the others."""
+        known, x = jax.tree.unflatten(self.structure, leaves)
+        return [own if fixed is None else fixed for own, fixed in zip(known, self.fixed, strict=True)], x
+
+    def on_host(self, *leaves: Any) -> Any:
+        """Return by NumPy what the function returns, or None."""
+        return _on_host(self.host, self.args(*leaves), None, None)
+
+
+class _Map(NamedTuple):
+    """A linear map, or its transpose: of arrays that are known, and then of those that it is linear in.
+
+    Attributes:
+        program: what is linear in its last arguments.
+        at: or, if true, its derivative by these, which then come twice: as they are, and their changes.
+        x: the shapes of what it is linear in.
+        y: those of what it returns.
+        transposed: whether it is the transpose.
+    """
+
+    program: _Program
+    at: bool
+    x: tuple[jax.ShapeDtypeStruct, ...]
+    y: tuple[jax.ShapeDtypeStruct, ...]
+    transposed: bool = False
+
+    def split(self, leaves: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+        """Return what is known, and the rest."""
+        n = len(leaves) - len(self.y if self.transposed else self.x)
+        return list(leaves[:n]), list(leaves[n:])
+
+    def __call__(self, *leaves: Any) -> list[Any]:
+        """Return what the map makes of arrays."""
+        known, rest = self.split(leaves)
+
+        def forward(*x: Any) -> list[Any]:
+            if not self.at:
+                return jax.tree.leaves(self.program(*known, *x))
+            n = len(known) - len(x)
+            return jax.tree.leaves(jax.jvp(lambda *x: self.program(*known[:n], *x), known[n:], x)[1])
+
+        return list(jax.linear_transpose(forward, *self.x)(rest)) if self.transposed else forward(*rest)
+
+    def on_host(self, *leaves: Any) -> Any:
+        """Return by NumPy what the map makes of arrays, or None."""
+        known, rest = self.split(leaves)
+        x, y = (self.x, [np.asarray(each) for each in rest]) if self.transposed else (rest, None)
+        args, change = self.program.split(*known[: len(known) - self.at * len(x)], *x)
+        return _on_host(self.program.host, self.program.args(*known) if self.at else args, change, y)
+
+
+def _is_inexact(leaf: Any) -> bool:
+    return jax.dtypes.issubdtype(leaf.dtype, np.inexact)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=_OPTIONS)
+def _quick(function: Callable[..., Any], *leaves: Any) -> Any:
+    return function(*leaves)
+
+
+def _on_host(host: OnHost | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
+    if host is None or not known_here((known, others)):
+        return None
+    with np.errstate(all="ignore"):
+        return jax.device_put(host(list(known), *others))
+
+
+def _computed(function: _Program | _Map, *leaves: Any) -> Any:
+    with jax.core.eval_context():
+        found = function.on_host(*leaves)
+        return _quick(function, *leaves) if found is None else found
+
+
+def _shapes(leaves: Sequence[Any]) -> tuple[jax.ShapeDtypeStruct, ...]:
+    return tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+
+
+# JAX takes no compiler options for the programs that it makes itself where it differentiates, and makes several of one.
+# A derivative that is taken outside of `jax.jit`, where its values are known, is one program here, and its transpose
+# another. Wherever else it comes to be computed it consists of JAX's operations, as it would without.
+def _differentiable(program: _Program, known: list[Any], x: list[Any]) -> Any:
+    """Return what a program does, to be differentiated by x."""
+
+    @jax.custom_jvp
+    def call(*x: Any) -> Any:
+        return program(*known, *x)
+
+    @call.defjvp
+    def rule(x: tuple[Any, ...], change: tuple[Any, ...]) -> tuple[Any, Any]:
+        result = None if is_traced(x) else _computed(program, *known, *x)
+        leaves, structure = jax.tree.flatten(result)
+        if not (leaves and all(map(_is_inexact, leaves))):
+            return jax.jvp(lambda *x: program(*known, *x), x, change)
+        of = _Map(program, True, _shapes(x), _shapes(leaves))
+        return result, jax.tree.unflatten(structure, _linear.bind(*known, *x, *change, of=of))
+
+    return call(*x)
+
+
+_linear = Primitive("linear_program")
+_linear.multiple_results = True
+_linear.def_impl(lambda *leaves, of: jax.tree.leaves(_computed(of, *leaves)))
+
+
+@_linear.def_abstract_eval
+def _abstract(*leaves: Any, of: Any) -> list[Any]:
+    return [jax.core.ShapedArray(shape.shape, shape.dtype) for shape in (of.x if of.transposed else of.y)]
+
+
+def _full(changes: Sequence[Any]) -> list[Any]:
+    def full(change: Any) -> Any:
+        shape: Any = change.aval if isinstance(change, ad.Zero) else None
+        return change if shape is None else np.zeros(shape.shape, shape.dtype)
+
+    return list(map(full, changes))
+
+
+def _transpose(cotangents: list[Any], *leaves: Any, of: _Map) -> list[Any]:
+    known, x = of.split(leaves)
+    results = _linear.bind(*known, *_full(cotangents), of=of._replace(transposed=not of.transposed))
+    wanted = map(ad.is_undefined_primal, x)
+    return [None] * len(known) + [result if each else None for result, each in zip(results, wanted, strict=True)]
+
+
+def _jvp(leaves: tuple[Any, ...], change: tuple[Any, ...], of: _Map) -> tuple[list[Any], list[Any]]:
+    (known, _), (d_known, d_rest) = of.split(leaves), of.split(change)
+    if all(isinstance(d, ad.Zero) for d in d_known):
+        return _linear.bind(*leaves, of=of), _linear.bind(*known, *_full(d_rest), of=of)
+    moved = {i: d for i, d in enumerate(change) if not isinstance(d, ad.Zero)}
+
+    def of_moved(*some: Any) -> list[Any]:
+        return of(*(dict(enumerate(leaves)) | dict(zip(moved, some, strict=True))).values())
+
+    return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moved.values()))
+
+
+def _batch(leaves: tuple[Any, ...], axes: tuple[Any, ...], of: _Map) -> tuple[list[Any], list[int]]:
+    results = jax.vmap(lambda *leaves: of(*leaves), in_axes=tuple(axes))(*leaves)
+    return results, [0] * len(results)
+
+
+ad.primitive_transposes[_linear] = _transpose
+ad.primitive_jvps[_linear] = _jvp
+batching.primitive_batchers[_linear] = _batch
+mlir.register_lowering(_linear, mlir.lower_fun(lambda *leaves, of: of(*leaves), multiple_results=True))

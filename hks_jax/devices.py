@@ -1,4 +1,4 @@
-"""Several devices: batches shared out, and space cut into slabs. docs/devices.md says what is exchanged."""
+"""Several devices: distributed batches, and grids cut into slabs. docs/devices.md describes the communication."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,23 +18,23 @@ from hks_jax.traced import is_traced
 
 
 def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
-    """Apply a function to each entry of a batch, every device to its share, one entry after another.
+    """Apply a function to each entry of a batch, where every device processes its share sequentially.
 
-    Nothing is exchanged. Differentiable where the function is. Called again with the same function object, it is not
-    compiled again.
+    The devices do not communicate. The result is differentiable if the function is. The same function object is
+    compiled once.
 
     Args:
-        function: of one entry, such as ``lambda T: hj.hks(hj.eigenpairs(hj.TensorField(grid, T), k, solver="dense"),
-            times)``; traceable.
-        batch: arrays (n, …), a pytree of them.
-        mesh: devices along one axis.
+        function: a traceable function of one entry, such as ``lambda T: hj.hks(hj.eigenpairs(hj.TensorField(grid, T),
+            k, solver="dense"), times)``.
+        batch: a pytree of arrays (n, …).
+        mesh: a mesh of devices along one axis.
 
     Returns:
-        What ``jax.lax.map(function, batch)`` would: arrays (n, …). They stay where they were computed if n is a
-        multiple of the number of devices; otherwise every device has them whole.
+        The result of ``jax.lax.map(function, batch)``, arrays (n, …). They stay distributed if n is a multiple of the
+        number of devices; otherwise every device has all entries.
 
     Raises:
-        ValueError: arrays of different lengths, or none; a mesh with several axes.
+        ValueError: if arrays have different lengths, if there are none, or if the mesh has several axes.
     """
     mesh = checked_mesh(mesh)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
@@ -46,7 +46,7 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
 @partial(jax.jit, static_argnames=("function", "mesh"))
 def _map(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
     n, spec = jax.tree.leaves(batch)[0].shape[0], PartitionSpec(mesh.axis_names[0])
-    # Copies of the last entry fill the shares up: of zeros, a function might make NaN, or an endless loop.
+    # Shares are padded with the last entry, because a function of zeros might return NaN or not terminate.
     filled = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(-(-n // mesh.size) * mesh.size), n - 1)], batch)
     share = jax.shard_map(
         lambda own: jax.lax.map(function, own), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
@@ -65,23 +65,25 @@ def heat_columns(
 ) -> Float[Array, "n_times *padded b"]:
     """Return exp(−tD⁻¹K) applied to columns, for each time. Sources D⁻¹eᵢ give columns of the heat kernel.
 
-    For fields that outgrow a device. The Chebyshev expansion needs one stencil product a degree, and with it the
-    exchange of one plane of nodes with each neighbour; all times come from the same products.
+    This function serves fields that exceed the memory of a device. Each degree of the Chebyshev expansion takes one
+    stencil product and the exchange of one plane of nodes with each neighbour. All times use the same products.
 
     Args:
-        slabs: how the grid is cut.
-        stiffness: K, ``slabs.split(pencil.stiffness.coefficients, 1)``.
-        lumped: D, the row sums of the mass, ``slabs.split(...)``; 0 at nodes that are not free.
-        columns: nodal, the column innermost, ``slabs.split(...)``.
-        times: (n_times,), not negative.
-        tolerance: bounds the truncation error of the expansion, relative to the columns, in the norm of D.
-        degree: of the polynomial; None: what the tolerance needs. To be given where the matrices or times are traced.
+        slabs: the partition of the grid.
+        stiffness: the stiffness matrix K, ``slabs.split(pencil.stiffness.coefficients, 1)``.
+        lumped: the row sums D of the mass matrix, ``slabs.split(...)``; 0 at nodes that are not free.
+        columns: nodal values with the column as the last axis, ``slabs.split(...)``.
+        times: (n_times,), nonnegative.
+        tolerance: a bound on the truncation error of the expansion, relative to the columns, in the norm of D.
+        degree: the degree of the polynomial, by default the one that the tolerance needs. It is required for traced
+            arrays.
 
     Returns:
-        Laid out as the columns; ``slabs.join(result, 1)`` cuts the padding off.
+        Values in the layout of the columns. ``slabs.join(result, 1)`` removes the padding.
 
     Raises:
-        ValueError: arrays that are not from `Slabs.split`, bad times or tolerance, traced arrays without a degree.
+        ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if traced arrays lack a
+            degree.
     """
     slabs.check("stiffness", stiffness, 1)
     slabs.check("lumped", lumped, 0)
@@ -97,9 +99,9 @@ def heat_columns(
     top = gershgorin(stiffness, _inverse(lumped))
     if degree is None:
         if is_traced((top, times)):
-            raise ValueError("degree: not given, and the matrices or times are traced; expected a number")
+            raise ValueError("degree: got None with traced matrices or times; expected a number")
         if times.size and not float(jnp.min(times)) >= 0:
-            raise ValueError(f"times: got {times}; expected no negative ones")
+            raise ValueError(f"times: got {times}; expected nonnegative numbers")
         degree = least_degree(float(jnp.max(times, initial=0)) * float(top) / 2, tolerance)
     return chebyshev_series(slabs, stiffness, lumped, columns, top, chebyshev_heat_coefficients(times, top, degree))
 
@@ -113,9 +115,9 @@ def chebyshev_series(
     top: Float[Array, ""],
     series: Float[Array, "m terms"],
 ) -> Float[Array, "m *padded b"]:
-    """Return Σₙ seriesₘₙ Tₙ(2D⁻¹K/top − 1) columns, ``top`` a bound on the spectrum of D⁻¹K, degree at least 1.
+    """Return Σₙ seriesₘₙ Tₙ(2D⁻¹K/top − 1) columns for a bound ``top`` on the spectrum of D⁻¹K and a degree ≥ 1.
 
-    The arrays are as in `heat_columns`. Linear in series and columns; differentiable.
+    The arrays have the layout of `heat_columns`. The result is linear in series and columns, and differentiable.
     """
 
     def share(stiffness: Array, lumped: Array, x: Array, top: Array, series: Array) -> Array:
@@ -135,5 +137,5 @@ def chebyshev_series(
 
 
 def _inverse(lumped: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return D⁻¹, 0 at nodes that are not free."""
+    """Return D⁻¹ with 0 at nodes that are not free."""
     return jnp.where(lumped > 0, 1 / jnp.where(lumped > 0, lumped, 1), 0)

@@ -1,4 +1,4 @@
-"""Libraries that are optional: imported when something needs them, or an error that says what to install."""
+"""Optional libraries, which are imported on first use. If one is not installed, the error states the remedy."""
 
 import importlib
 from types import ModuleType
@@ -11,14 +11,14 @@ _LIBRARIES = {
     "meshio": ("reading and writing meshes", "meshio", "mesh"),
     "pyvista": ("rendering volumes", "PyVista", "pyvista"),
 }
-"""By the package that is imported: what needs it, its name, and the extra that installs it."""
+"""The purpose of each optional package, the library's name, and the extra that installs it."""
 
 
 def optional(module: str) -> ModuleType:
     """Import a module of an optional library, such as ``"nibabel"`` or ``"dipy.reconst.dti"``.
 
     Raises:
-        ImportError: it is not installed; says what to install.
+        ImportError: if the library is not installed, with the command that installs it.
     """
     try:
         return importlib.import_module(module)

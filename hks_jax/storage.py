@@ -1,4 +1,4 @@
-"""Files written whole or not at all, one process at a time; files that came to harm, read; and NumPy's own files."""
+"""Atomic writing of files, exclusive work by one process, errors for damaged files, and NumPy's file formats."""
 
 import io
 import math
@@ -24,13 +24,13 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary name beside `path`; move what was written there to `path` at the end, in one step.
+    """Yield a temporary name beside `path`, and atomically move the file with this name to `path` at the end.
 
-    If the body raises, whatever it wrote is removed and `path` stays as it was. Missing parent folders are made.
+    If the body raises, the temporary file is removed and `path` does not change. Missing parent folders are created.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    # The suffix stays last: libraries choose the format by it.
+    # The suffix must be last, because libraries choose the format by it.
     temporary = target.with_name(f".{uuid.uuid4().hex[:12]}.{target.name}")
     try:
         yield temporary
@@ -43,20 +43,20 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Path]] = tuple) -> Iterator[Path]:
     """Yield a temporary folder beside `path`; move the files written there into `path` at the end.
 
-    Files of the same names in `path` are replaced, each in one step; others stay. If the body raises, everything it
-    wrote is removed and `path` stays as it was, or does not come into being.
+    Files with the same names in `path` are replaced atomically, and others remain. If the body raises, its files are
+    removed, and `path` does not change and is not created.
 
     Args:
         path: the folder.
-        stale: returns the files that belong to the replaced ones. They are removed before the new ones are moved, so
-            that never two results are mixed.
+        stale: a function that returns the files of an earlier result. They are removed before new files are moved, so
+            that two results are never mixed.
 
     Raises:
-        NotADirectoryError: `path` is a file.
+        NotADirectoryError: if `path` is a file.
     """
     target = Path(path)
     if target.exists() and not target.is_dir():
-        raise NotADirectoryError(f"{target}: is a file; expected a folder, or a name that is free")
+        raise NotADirectoryError(f"{target}: got a file; expected a folder or an unused name")
     absent = [folder for folder in (target, *target.parents) if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{uuid.uuid4().hex[:12]}.{target.name}")
@@ -80,11 +80,11 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
 @contextmanager
 def claim(path: str | os.PathLike[str]) -> Iterator[bool]:
-    """Yield whether a piece of work is this process's alone: no other process holds the file at `path` meanwhile.
+    """Yield whether this process has exclusive access to a piece of work, by a lock on the file at `path`.
 
-    At the end the file is removed, and its folder if that is empty. If the process dies, the operating system gives the
-    file free, and the file stays: it tells that the work was begun. Where there are no such locks, as on Windows and on
-    some network drives, all work counts as this process's.
+    At the end the file is removed, and its folder as well if it is empty. If the process dies, the operating system
+    releases the lock and the file remains, which shows that the work was begun. Without such locks, as on Windows and
+    some network drives, every process gets access.
     """
     file = Path(path)
     held = _hold(file)
@@ -96,15 +96,15 @@ def claim(path: str | os.PathLike[str]) -> Iterator[bool]:
             yield True
         finally:
             file.unlink(missing_ok=True)
-            with suppress(OSError):  # it has other files
+            with suppress(OSError):  # the folder has other files
                 file.parent.rmdir()
 
 
 def _hold(file: Path) -> IO[str] | None:
-    """Return the open file, locked, or None where another process has it."""
+    """Return the open and locked file, or None if another process has locked it."""
     while True:
         file.parent.mkdir(parents=True, exist_ok=True)
-        # The file is held beyond this function. Between any two of these steps another process may finish, and remove
+        # The file stays open after this function. Between any two of these steps another process may finish and remove
         # the file and its folder.
         with suppress(FileNotFoundError):
             held = open(file, "a", encoding="utf-8")  # noqa: SIM115
@@ -133,7 +133,7 @@ def existing(path: str | os.PathLike[str]) -> Path:
     """Return the path of a file that exists.
 
     Raises:
-        FileNotFoundError: it does not, or is a folder.
+        FileNotFoundError: if the path does not exist or is a folder.
     """
     file = Path(path)
     if not file.is_file():
@@ -144,15 +144,14 @@ def existing(path: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
-    """Make one ValueError, which names the file, of whatever a library raises over its content.
+    """Convert every error that a library raises for the content of a file to a ValueError that names the file.
 
-    Libraries raise nearly anything over damaged files: errors of the parser, of struct, zlib and zipfile, of
-    indices, of memory for sizes that no file has. Inside should be nothing but the library's call and checks of what
-    it returned.
+    Libraries raise nearly any error for damaged files: errors of the parser, of struct, zlib and zipfile, of indices,
+    or of memory for impossible sizes. The body should contain only the library's call and checks of its result.
 
     Args:
         path: the file.
-        kind: what it should be, with its article, such as ``"a readable npz archive"``.
+        kind: the expected kind of file with its article, such as ``"a readable npz archive"``.
     """
     try:
         yield
@@ -163,51 +162,52 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         if isinstance(error, KeyError):
             reason = f"it lacks {reason}"
         raise ValueError(
-            f"{os.fspath(path)}: not {kind}, or a damaged one ({reason}). Copy the file again from where it was whole"
+            f"{os.fspath(path)}: expected {kind}, but it is damaged or of another kind ({reason}). Copy it again from "
+            "an intact file"
         ) from error
 
 
 def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Return all arrays of an npz archive by name.
 
-    The archive keeps a checksum of each array; all of them are compared.
+    The checksum of each array in the archive is verified.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an npz archive, a damaged one, or one that holds pickled objects.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is no npz archive, is damaged, or contains pickled objects.
     """
     file, arrays = existing(path), {}
     with reading(file, "a readable npz archive of plain arrays"), zipfile.ZipFile(file) as archive:
         _check_number(file, archive)
         for name in archive.namelist():
-            content = archive.read(name)  # to the end, which is where the checksum is compared
+            content = archive.read(name)  # reading to the end verifies the checksum
             arrays[name.removesuffix(".npy")] = _array(io.BytesIO(content), len(content))
     return arrays
 
 
 def write_npz(path: str | os.PathLike[str], content: Mapping[str, Any], compressed: bool = True) -> None:
-    """Write arrays by name, whole or not at all."""
+    """Write arrays by name to an npz archive atomically."""
     save = np.savez_compressed if compressed else np.savez
     with atomic_path(path) as temporary, open(temporary, "wb") as stream:
         save(stream, **content)
 
 
 def _check_number(file: Path, archive: zipfile.ZipFile) -> None:
-    """Raise ValueError unless the archive's end gives the number of its members, of which a damaged list hides some."""
+    """Raise ValueError unless the archive's end states the number of listed members. A damaged list omits members."""
     with open(file, "rb") as stream:
         stream.seek(-(22 + len(archive.comment)), os.SEEK_END)
         end = stream.read()
     declared, listed = int.from_bytes(end[10:12], "little"), len(archive.filelist)
-    if declared not in (listed, 0xFFFF):  # the latter stands for more
-        raise ValueError(f"it ends with {declared} members, and lists {listed}")
+    if declared not in (listed, 0xFFFF):  # 0xFFFF means a larger number
+        raise ValueError(f"its end states {declared} members, but it lists {listed}")
 
 
 def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the array of an npy file, which has no checksum: only its length is compared with what it declares.
+    """Return the array of an npy file. Without a checksum only the file's length is compared with the declared length.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an npy file, a damaged one, or one that holds pickled objects.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is no npy file, is damaged, or contains pickled objects.
     """
     file = existing(path)
     with reading(file, "a readable npy array"), open(file, "rb") as stream:
@@ -215,15 +215,15 @@ def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _array(stream: io.BytesIO | io.BufferedReader, length: int) -> np.ndarray:
-    """Return the array that fills a stream; nothing is allocated before its size is compared with the stream's."""
+    """Return the array in a stream. Its size is compared with the stream's before memory is allocated."""
     version = npy.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"format version {version}; expected one of {', '.join(map(str, _HEADERS))}")
     shape, _, dtype = _HEADERS[version](stream)
     if dtype.hasobject:
-        raise ValueError("it holds pickled objects, which are not read, as they could run programs")
+        raise ValueError("it contains pickled objects, which are not read because they could run programs")
     declared, held = math.prod(shape) * dtype.itemsize, length - stream.tell()
     if min(shape, default=0) < 0 or declared != held:
-        raise ValueError(f"{dtype} of shape {shape} takes {declared} bytes, but there are {held}")
+        raise ValueError(f"{dtype} of shape {shape} takes {declared} bytes, but the file has {held}")
     stream.seek(0)
     return npy.read_array(stream, allow_pickle=False).astype(dtype.newbyteorder("="), copy=False)

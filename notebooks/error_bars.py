@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Error bars, from the scan to the map
 #
-# A scan has noise, and so have tensors, and so have their signatures. Here the covariance of a tensor fit is carried to
-# the heat kernel signature: deviation, bias, and the part of each map that noise alone could have made. The scan is
-# simulated, so that the truth is known, and every step can be checked against it.
+# The noise of a scan causes noise in the tensors and in their signatures. This notebook propagates the covariance of
+# a tensor fit to the heat kernel signature. It computes the standard deviation, the bias, and the part of each map
+# that noise alone can explain. The scan is simulated, so the truth is known, and we check every step.
 
 # %%
 import tempfile
@@ -22,7 +22,8 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## The scan
 #
-# 20 directions with b = 1000 s/mm² and 4 images without; noise of 3 % of the signal without weighting.
+# The scan has 20 directions with b = 1000 s/mm² and 4 images without weighting. The noise is 3 % of the signal
+# without weighting.
 
 # %%
 rng = np.random.default_rng(0)
@@ -47,8 +48,8 @@ plane, again = scan(folder, rng), scan(folder, rng)
 print(*plane.notes, sep="\n")
 
 # %% [markdown]
-# `noise="residuals"` asks for the noise of the tensors, from what the fit leaves of each image. In each voxel its
-# covariance should be half that of the difference of two scans:
+# `noise="residuals"` estimates the noise of the tensors from the residuals of the fit. In each voxel, the covariance
+# should be half of the covariance of the difference of two scans:
 
 # %%
 grid = plane.grid("largest")
@@ -62,7 +63,7 @@ assert 0.75 < stated / seen < 1.33
 # %% [markdown]
 # ## The map
 #
-# The function whose error bars are sought, of the tensors as measured; the times are fixed.
+# The function maps the measured tensors to the signature at fixed times. We compute its error bars.
 
 # %%
 diffusivity = float(np.median(np.trace(plane.tensors, axis1=-2, axis2=-1)[inside])) / 2
@@ -82,8 +83,9 @@ print(bars.summary())
 print("signal to noise:", np.round(bars.signal_to_noise, 1), " claimed:", bars.trusted)
 
 # %% [markdown]
-# The second scan tells whether they are right: the two maps differ by √2 deviations. At large t a map has few
-# independent places, so that one difference tells the ratio to a factor of two or three.
+# The second scan checks the error bars: the difference of the two maps should have √2 times the standard deviation.
+# At large t a map has few independent places. The ratio from one pair of scans is then uncertain by a factor of two
+# or three.
 
 # %%
 difference = np.asarray(signature(again.tensors) - bars.value)
@@ -92,7 +94,7 @@ print("variance of the difference over the predicted one:", np.round(ratio, 2))
 assert np.all((ratio > 1 / 3) & (ratio < 3))
 
 # %% [markdown]
-# What noise alone could have made of flat space fades: below two deviations from 1.
+# The picture fades values that noise can explain in flat space, within two standard deviations of 1.
 
 # %%
 figure = hj.plot.hks_panels(bars.value, times, grid, centre=1.0, z=bars.z(1.0), unit="s", quantiles=(0.01, 0.99))
@@ -101,7 +103,8 @@ hj.plot.save_figure(figure, "error-bars.png")
 # %% [markdown]
 # ## A region's mean
 #
-# One number for each time, by one reverse product each: exact to first order, and much more certain than a node.
+# The mean of a region is one number for each time. One reverse-mode product per number gives its standard deviation,
+# exact to first order. It is much more accurate than the standard deviation at a node.
 
 
 # %%
@@ -116,7 +119,8 @@ assert mean.method == "exact"
 # %% [markdown]
 # ## Smoothing
 #
-# Log-Euclidean smoothing of the tensors lowers noise and bias; `smear` estimates what it takes from the map itself.
+# Log-Euclidean smoothing of the tensors reduces noise and bias. `smear` estimates the change of the map that the
+# smoothing causes.
 
 # %%
 smooth = hj.uncertainty(signature, plane.tensors, noise, draws=16, method="resample", smoothing=0.7 * plane.spacing[0])

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Fit a metric: a hole in a brain slice
 #
-# Diffusion tensors are lost in part of a slice. The heat kernel signature at a few times is known, with noise. Which
-# tensors have it?
+# In a part of a slice the diffusion tensors are missing. The heat kernel signature at a few times is given, with
+# noise. We compute tensors that have this signature.
 
 # %%
 import importlib.util
@@ -16,8 +16,9 @@ from hks_jax.domain.examples import phantom
 jax.config.update("jax_enable_x64", True)
 
 # %% [markdown]
-# The brain is the one in the PyPI wheel `mdt` (`pip install --no-deps mdt==1.2.7`); where it is not installed, a
-# phantom takes its place. A window is enough, around the fibres that join the hemispheres and the ventricles.
+# The brain data come from the PyPI wheel `mdt` (`pip install --no-deps mdt==1.2.7`). If the wheel is not installed,
+# we use a phantom. A window of the slice suffices; it contains the fibres that connect the hemispheres, and the
+# ventricles.
 
 # %%
 brain = hj.io.find_example_brain() if importlib.util.find_spec("dipy") else None
@@ -35,7 +36,7 @@ grid = hj.Grid(mask.shape, spacing, mask=mask, components="largest")
 truth = hj.TensorField.from_diffusion(grid, D, metric="inverse")
 
 # %% [markdown]
-# The hole is a disc on the left. What the rest of the slice suggests for it is an isotropic mean.
+# The hole is a disc on the left. The initial tensor in the hole is the isotropic mean of the rest of the slice.
 
 # %%
 x, y = grid.nodes[..., 0], grid.nodes[..., 1]
@@ -66,7 +67,7 @@ assert fit.converged
 assert error(fit.field) < 0.7 * error(init)
 
 # %% [markdown]
-# Truth, start and fit, around the hole: the fibres come back, if not every one of them.
+# The figure shows the truth, the start and the fit around the hole. Most of the fibres reappear.
 
 # %%
 figure = hj.plot.new_figure(13, 5)

@@ -235,7 +235,7 @@ def main() -> None:
         print({key: value for key, value in row.items() if key != "libraries"}, flush=True)
         old = before.get((row["what"], row["nodes"], row["k"]), {})
         rows.append(row | {f"{key}_before": old[key] for key in COLUMNS if key in old})
-        note = "compiled for an NVIDIA H200 by its description, on this machine; nothing ran"
+        note = "compiled on this machine for an NVIDIA H200 from its description; no program ran"
         write(arguments.output, rows, note=note)
 
     for task in tasks():

@@ -63,8 +63,8 @@ OPTIONS = f"""
 """
 
 _OF_TENSORS = ("metric", "order", "interpolation")
-"""Options that are about the tensors at a mesh's vertices."""
-_NO_NOISE = "it is of tensors, which eigenpairs and meshes with the metric of space do not have; leave it out"
+"""Options that refer to tensors at the vertices of a mesh."""
+_NO_NOISE = "this option needs tensors, which eigenpairs and meshes with the metric of space do not have; leave it out"
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -149,17 +149,17 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
     if args.boundary not in (None, *MESH_BOUNDARIES):
         raise ValueError(f"--boundary: got {args.boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
     if not (args.array or args.tensors):
-        why = "a mesh has the metric of space unless --array names tensors at its vertices, or --tensors a volume"
-        refuse(args, _OF_TENSORS, f"{why} of them; pass both, or neither")
+        why = "this option needs tensors, but without --array and --tensors a mesh has the metric of space"
+        refuse(args, _OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
         refuse(args, ("noise",), _NO_NOISE)
     elif args.metric is None:
         raise ValueError("--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate")
 
 
 def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
-    """Read the mesh in the precision asked for, with the metric of the tensors at its vertices if asked to.
+    """Read the mesh in the chosen precision, with the metric of tensors at its vertices if there are any.
 
-    And where error bars are asked for, the tensors and their noise: those of the volume, if they come from one.
+    For error bars, return the tensors and their noise, too: those of the volume if the tensors come from one.
     """
     use_dtype(args.dtype)
     mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))
@@ -190,11 +190,11 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
     arrays = read_mesh_arrays(args.file, clean=args.clean)
     if args.array not in arrays:
         there = ", ".join(arrays) or "none"
-        raise ValueError(f"--array: got {args.array!r}; the arrays at the vertices are {there}")
+        raise ValueError(f"--array: got {args.array!r}; expected an array at the vertices: {there}")
     values = arrays[args.array].reshape(len(vertices), -1)
     if values.shape[1] != (9 if args.order is None else 6):
         n = values.shape[1]
-        raise ValueError(f"--array: {args.array!r} has {n} components; expected nine, or six with their --order")
+        raise ValueError(f"--array: got {args.array!r} with {n} components; expected 9, or 6 with --order")
     tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
     return domain(tensors), None if args.noise is None else Noisy(tensors, _relative(args.noise, tensors), domain)
 
@@ -204,8 +204,8 @@ def _relative(noise: str, tensors: Float[np.ndarray, "V 3 3"]) -> TensorNoise:
         level = float(noise)
     except ValueError:
         raise ValueError(
-            f"--noise: got {noise!r}; for tensors at the vertices of a mesh state a number, relative to the mean "
-            "diffusivity"
+            f"--noise: got {noise!r}; expected a number, relative to the mean diffusivity, for tensors at the "
+            "vertices of a mesh"
         ) from None
     return TensorNoise.relative(tensors, level)
 

@@ -59,7 +59,7 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
 
 
 def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -> Result:
-    """Compute the signature of a volume or slice whose eigenpairs are known, with error bars if asked to."""
+    """Compute the signature of a volume or slice from its eigenpairs, with error bars if ``--noise`` is given."""
     volume, field, pairs, settings = solved
     of_pairs = partial(result_of, solved.domain, solved.described, pairs)
     if getattr(args, "noise", None) is None:
@@ -108,7 +108,7 @@ def noise_of_volume(
     """Return the noise of a volume's tensors that the arguments name."""
     if args.noise == "residuals":
         if volume.covariance is None:
-            raise ValueError("--noise: residuals are those of a fit to diffusion-weighted images (--bval, --bvec)")
+            raise ValueError("--noise: got residuals, which need a fit to diffusion-weighted images (--bval, --bvec)")
         return volume.noise(grid)
     if args.noise == "roughness":
         return hj.TensorNoise.from_roughness(volume.tensors, grid)
@@ -139,7 +139,7 @@ def _error_bars(
         maps.append(np.asarray(one, np.float32))
 
     with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", hj.AccuracyWarning)  # of times that are not chosen, too
+        warnings.simplefilter("ignore", hj.AccuracyWarning)  # also about unused times
         tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
         more |= {"compiled": noisy.traceable, "progress": progress.update}
         bars = hj.uncertainty(signature, tensors, noisy.noise, method="resample", **more)

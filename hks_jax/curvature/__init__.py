@@ -1,4 +1,4 @@
-"""Curvature of a metric, the Laplace–Beltrami operator of a function, and the short-time expansion they give."""
+"""Curvature of a metric, the Laplace–Beltrami operator, and the short-time expansion of the heat kernel."""
 
 from hks_jax.curvature.expansion import hks_expansion as hks_expansion
 from hks_jax.curvature.geometry import gaussian_curvature as gaussian_curvature

@@ -1,4 +1,4 @@
-"""The short-time expansion of the heat kernel signature in curvature."""
+"""The short-time expansion of the heat kernel signature in terms of curvature."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -30,53 +30,54 @@ from hks_jax.domain.tensor_field import TensorField
 Coefficients: TypeAlias = list[Array]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
 HIGHEST_ORDER = {2: 3, 3: 2}
-"""The last coefficient that is known here, by dimension."""
+"""The highest order that is implemented, by dimension."""
 
 
 @nan_is_meant
 def hks_expansion(
     field: TensorField, times: Any, order: int | None = None, periodic: bool | Sequence[bool] = False
 ) -> Float[Array, "n_times *shape"]:
-    """Return the short-time expansion of the heat kernel signature at the nodes,
+    """Return the short-time expansion of the heat kernel signature at the nodes:
 
-        k_t(x, x) ≈ (1 + u₁t + u₂t² + u₃t³)/(4πt)^(d/2),
+        k_t(x, x) ≈ (1 + u₁t + u₂t² + u₃t³)/(4πt)^(d/2).
 
-    on a surface with the Gaussian curvature K and ∇² = div grad (Polterovich 2000; McKean and Singer 1967 to u₂)
+    On a surface with the Gaussian curvature K, where ∇² = div grad, the coefficients are (Polterovich 2000)
 
-        u₁ = K/3,   u₂ = (K² + ∇²K)/15,   u₃ = 4K³/315 + 2|∇K|²/105 + K∇²K/30 + ∇⁴K/140,
+        u₁ = K/3,   u₂ = (K² + ∇²K)/15,   u₃ = 4K³/315 + 2|∇K|²/105 + K∇²K/30 + ∇⁴K/140.
 
-    in three dimensions to u₂, with the Ricci tensor Ric and the scalar curvature R,
+    In three dimensions, with the Ricci tensor Ric and the scalar curvature R, the coefficients up to u₂ are
 
-        u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120,
+        u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120.
 
-    which is McKean and Singer's (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, where |Riem|² = 4|Ric|² − R². It knows of no
-    boundary: it holds at distances well beyond 3√t from it.
+    These are the coefficients of McKean and Singer (1967), u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, by
+    |Riem|² = 4|Ric|² − R². The expansion ignores the boundary: it holds at distances from it well above 3√t.
 
-    Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order, h the spacing
-    of the nodes in length: beside the sides of a grid and the rim of a mask, where they are one-sided, u₂ is of fourth
-    order and u₃ of second. The relative rounding error of u₃ is some ε(t/h²)³/5, a hundred times more within eight
-    nodes of a side or rim: in float32 keep t below some 30 h², or the order below 3.
+    If the field was made from a function, the coefficients are exact, from JAX derivatives. Otherwise they are from
+    finite differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask. There u₂ is
+    of fourth order and u₃ of second order in the spacing h, measured as a length. For the machine precision ε, the
+    relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim.
+    In float32 keep t below 30 h², or the order below 3.
 
     Args:
         field: the metric, d = 2 or 3.
-        times: (n_times,) positive, in length².
-        order: the last power of t in the bracket, 0 … 3 on a surface, 0 … 2 in three dimensions; None: the last.
-        periodic: whether the axes are periodic, one for all or one per axis.
+        times: (n_times,) positive times, in length².
+        order: the highest power of t in brackets, 0 … 3 on a surface, 0 … 2 in three dimensions; None is the highest.
+        periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Returns:
-        (n_times, *shape), in 1/lengthᵈ; NaN outside the mask, and where no difference stencil fits in it.
+        The expansion (n_times, *shape) in 1/lengthᵈ; NaN outside the mask, and where no stencil fits into the mask.
 
     Raises:
-        ValueError: times that are not a vector of positive numbers; an order that is not known; fewer than 8 nodes on
-            an axis of a nodal field; bad `periodic`.
+        ValueError: times that are not a vector of positive numbers; an order that is not implemented; fewer than 8
+            nodes along an axis of a nodal field; a bad `periodic`.
     """
     dimension = field.grid.dimension
     highest = HIGHEST_ORDER[dimension]
     order = highest if order is None else order
     if order not in range(highest + 1):
         raise ValueError(
-            f"order: got {order!r}; expected {', '.join(map(str, range(highest)))} or {highest}, as far as the "
-            f"expansion is known here in {dimension} dimensions"
+            f"order: got {order!r}; expected {', '.join(map(str, range(highest)))} or {highest}, the orders "
+            f"that are implemented in {dimension} dimensions"
         )
     return _hks_expansion(
         field, checked_times(times, field.tensors.dtype), int(order), wraps_per_axis(periodic, dimension)
@@ -97,7 +98,7 @@ def _hks_expansion(
 
 
 def _of_surface(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0) -> Coefficients:
-    """Return 1, u₁, u₂, u₃; right as far as their ingredients are given."""
+    """Return 1, u₁, u₂ and u₃; a coefficient is right only if all of its invariants are given."""
     return [
         jnp.ones_like(K),
         K / 3,
@@ -107,7 +108,7 @@ def _of_surface(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilap
 
 
 def _of_volume(metric: Jet, curvature: Jet | None) -> Coefficients:
-    """Return 1 and u₁, and with the jet of R also u₂."""
+    """Return 1, u₁ and, if the jet of R is given, u₂."""
     R, ricci_squared = scalar_and_ricci_squared(metric)
     coefficients = [jnp.ones_like(R), R / 6]
     if curvature is not None:
@@ -132,12 +133,12 @@ def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coe
 
 
 def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, order: int) -> tuple[taylor.Series, ...]:
-    """Return K and, as far as the order needs, ∇²K, |∇K|² and ∇⁴K of the metric ((E, F), (F, G)) as Taylor series."""
+    """Return Taylor series of K and, if the order needs them, ∇²K, |∇K|² and ∇⁴K of the metric ((E, F), (F, G))."""
     add, times, d = taylor.add, taylor.product, taylor.derivative
     determinant = add(times(E, G), -times(F, F))
     over = taylor.reciprocal(determinant)
 
-    def raised(p: Pair) -> Pair:  # by the adjugate: |g| times the vector
+    def raised(p: Pair) -> Pair:  # the vector times |g|, by the adjugate
         return add(times(G, p[0]), -times(F, p[1])), add(times(E, p[1]), -times(F, p[0]))
 
     def inner(p: Pair, q: Pair) -> taylor.Series:
@@ -148,7 +149,7 @@ def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, orde
         return d(f, 0), d(f, 1)
 
     def laplacian(f: taylor.Series) -> taylor.Series:
-        # (1/√|g|) ∂ₐ(vᵃ/√|g|), with the square roots differentiated away.
+        # (1/√|g|) ∂ₐ(vᵃ/√|g|), expanded so that no square roots remain.
         v, slope = raised(gradient(f)), gradient(determinant)
         along = times(over, add(times(v[0], slope[0]), times(v[1], slope[1])))
         return times(over, add(d(v[0], 0), d(v[1], 1), -along / 2))
@@ -164,7 +165,7 @@ def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, orde
 
 
 def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
-    """Return the same by differences of differences, and the nodes where all are known."""
+    """Return the coefficients by nested differences, and the nodes where all of them are known."""
     g, known = metric_jet(field, wraps)
     if field.grid.dimension == 3:
         R = None

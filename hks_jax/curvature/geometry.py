@@ -27,20 +27,20 @@ from hks_jax.domain.tensor_field import TensorField
 
 @nan_is_meant
 def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
-    """Return the scalar curvature R of a metric at the nodes; on a surface it is 2K, K the Gaussian curvature.
+    """Return the scalar curvature R of a metric at the nodes; on a surface R = 2K for the Gaussian curvature K.
 
-    Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order of the
-    nodal tensors (see `gaussian_curvature`).
+    If the field was made from a function, R is exact, from JAX derivatives. Otherwise it is from finite differences of
+    sixth order of the nodal tensors (see `gaussian_curvature`).
 
     Args:
         field: the metric, d = 2 or 3.
-        periodic: whether the axes are periodic (a node n that is node 0), one for all or one per axis.
+        periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.
 
     Returns:
-        (*shape), in 1/length²; NaN outside the mask, and where no difference stencil fits in it.
+        The curvature (*shape) in 1/length²; NaN outside the mask, and where no stencil fits into the mask.
 
     Raises:
-        ValueError: fewer than 8 nodes on an axis of a nodal field; bad `periodic`.
+        ValueError: fewer than 8 nodes along an axis of a nodal field; a bad `periodic`.
     """
     return _at_nodes(scalar, field, wraps_per_axis(periodic, field.grid.dimension))
 
@@ -49,25 +49,25 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
 def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
 
-    Exact, by JAX derivatives, when the field came from a function. Else by differences of sixth order of the
-    nodal tensors, centred where the grid and the mask allow it and one-sided at their edges.
+    If the field was made from a function, K is exact, from JAX derivatives. Otherwise it is from finite differences of
+    sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask.
 
     Args:
         field: the metric, d = 2.
-        periodic: whether the axes are periodic (a node n that is node 0), one for all or one per axis.
+        periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.
 
     Returns:
-        (*shape), in 1/length²; NaN outside the mask, and where no stencil of 7 nodes (8 for a second derivative
-        next to an edge) along a grid line fits in it.
+        The curvature (*shape) in 1/length². It is NaN outside the mask, and where no stencil of 7 nodes along a grid
+        line fits into the mask (8 nodes for a second derivative near an edge).
 
     Raises:
-        ValueError: a field that is not two-dimensional; fewer than 8 nodes on an axis of a nodal field; bad
+        ValueError: a field that is not two-dimensional; fewer than 8 nodes along an axis of a nodal field; a bad
             `periodic`.
     """
     if field.grid.dimension != 2:
         raise ValueError(
-            f"field: got a grid of shape {field.grid.shape}; Gaussian curvature belongs to metrics in two "
-            "dimensions. Take a slice: the metric's components in a coordinate plane, on its two-dimensional grid"
+            f"field: got a grid of shape {field.grid.shape}; expected a metric in two dimensions. Take a "
+            "slice: the components of the metric in a coordinate plane, on a two-dimensional grid"
         )
     return _at_nodes(gaussian, field, wraps_per_axis(periodic, 2))
 
@@ -78,18 +78,18 @@ def _at_nodes(curvature: Callable[[Jet], Array], field: TensorField, wraps: tupl
     return nan_outside(curvature(metric), known)
 
 
-# The coordinate planes; in three dimensions each at the place of the axis that is not in it.
+# The coordinate planes. In three dimensions, entry i is the plane perpendicular to axis i.
 _PLANES = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
 
 
 def riemann(metric: Jet) -> Float[Array, "... p p"]:
-    """Return the curvature tensor R_abcd of a metric in 2 or 3 dimensions, ab and cd running over the p planes,
+    """Return the curvature tensor R_abcd of a metric in 2 or 3 dimensions, where ab and cd run over p planes:
 
         R_abcd = ½(∂_b∂_c g_ad + ∂_a∂_d g_bc − ∂_a∂_c g_bd − ∂_b∂_d g_ac) + ⟨Γ_bc, Γ_ad⟩ − ⟨Γ_bd, Γ_ac⟩
 
-    in Christoffel symbols of the first kind (Landau and Lifshitz, The Classical Theory of Fields, §92). The planes are
-    12 on a surface, which is Brioschi's formula with its determinants expanded (Gray, Modern Differential Geometry of
-    Curves and Surfaces, §17.1), and 23, 31, 12 in three dimensions.
+    The Γ are Christoffel symbols of the first kind (Landau and Lifshitz, The Classical Theory of Fields, §92). On a
+    surface the only plane is 12, and the formula is Brioschi's with its determinants expanded (Gray, Modern
+    Differential Geometry of Curves and Surfaces, §17.1). In three dimensions the planes are 23, 31 and 12.
     """
     planes = _PLANES[metric.value.shape[-1]]
     hessian, symbols, inverse = metric.hessian, christoffel(metric), spd.inverse(metric.value)
@@ -112,8 +112,8 @@ def riemann(metric: Jet) -> Float[Array, "... p p"]:
 def einstein(metric: Jet) -> Float[Array, "... 3 3"]:
     """Return the Einstein tensor (Ric − ½Rg)ⁱʲ of a three-dimensional metric.
 
-    It is the double dual of the curvature tensor, −R_abcd/|g| at the place ij of the planes ab and cd, and so in three
-    dimensions all of the curvature.
+    It is the double dual of the curvature tensor, and so determines it in three dimensions: component ij is
+    −R_abcd/|g|, where the planes ab and cd are perpendicular to the axes i and j.
     """
     return -riemann(metric) / spd.determinant(metric.value)[..., None, None]
 
@@ -146,21 +146,21 @@ def laplace_beltrami(
     f: Float[Array, "*shape"] | Callable[[Array], Array],
     periodic: bool | Sequence[bool] = False,
 ) -> Float[Array, "*shape"]:
-    """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes: the geometers' −Δf, negative where f peaks.
+    """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes, negative at a peak of f (geometers' −Δf).
 
-    Derivatives are exact of whatever is given as a function, the metric or `f`, and differences of sixth order of
-    what is given at the nodes (see `gaussian_curvature`).
+    Derivatives of functions, be it the metric or `f`, are exact. Derivatives of nodal values are finite differences of
+    sixth order (see `gaussian_curvature`).
 
     Args:
         field: the metric, d = 2 or 3.
         f: nodal values (*shape), or a function from coordinates (d,) to a number, differentiable by JAX.
-        periodic: whether the axes are periodic, one for all or one per axis.
+        periodic: whether the axes are periodic, one value for all or one per axis.
 
     Returns:
-        (*shape), in units of f/length²; NaN outside the mask, and where no difference stencil fits in it.
+        The values (*shape) in units of f/length²; NaN outside the mask, and where no stencil fits into the mask.
 
     Raises:
-        ValueError: values of another shape; fewer than 8 nodes on an axis where differences are needed; bad `periodic`.
+        ValueError: values of another shape; fewer than 8 nodes along an axis with differences; a bad `periodic`.
     """
     if callable(f):
         f = f if isinstance(f, jtu.Partial) else jtu.Partial(f)

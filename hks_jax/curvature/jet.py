@@ -1,4 +1,4 @@
-"""A quantity with its first and second derivatives: by JAX where a function is known, else by differences."""
+"""Quantities with their first and second derivatives, by JAX for functions, by differences for nodal values."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -16,15 +16,15 @@ from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 
 MINIMUM_NODES = 8
-"""The widest stencil: a one-sided second derivative of sixth order."""
+"""The width of the widest stencil, that of a one-sided second derivative of sixth order."""
 
 
 @lru_cache
 def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the stencils of sixth order for the derivative of the given order, 1 or 2, in order of preference.
 
-    Offsets (n, 8) and weights (n, 8) for unit spacing; shorter stencils are padded with offset 0 and weight 0. For the
-    second derivative a centred stencil of 7 nodes gains an order from its symmetry; shifted ones need 8.
+    A stencil is a row of the offsets (n, 8) and the weights (n, 8) for unit spacing, padded with zeros. For the second
+    derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.
     """
     width = 6 + order
     centred = np.arange(-3, 4)
@@ -49,14 +49,14 @@ def differentiate(
     spacing: float,
     wraps: bool,
 ) -> tuple[Float[Array, "*shape_and_components"], Bool[np.ndarray, "*shape"]]:
-    """Return the first or second derivative of nodal values along a grid axis, and where it is known.
+    """Return the first or second derivative of nodal values along a grid axis, and the nodes where it is known.
 
-    Only values at nodes inside are read. The derivative is 0 where no stencil fits between them.
+    Only values at nodes inside are used. The derivative is 0 where no stencil consists of such nodes.
     """
     offsets, weights = stencils(order)
     n, d = inside.shape[axis], inside.ndim
     along = [n if a == axis else 1 for a in range(d)]
-    # Without a mask all grid lines are alike, and one line of indices serves them all.
+    # Without a mask all grid lines have the same stencils, and one line of indices suffices.
     choice, valid = _choose(np.ones(along, dtype=bool) if inside.all() else inside, offsets, axis, wraps)
     expand = tuple(range(d, jnp.ndim(values)))
     rows = np.expand_dims(choice, expand)
@@ -67,14 +67,14 @@ def differentiate(
         index = (nodes + shifts[rows, column]) % n
         total += table[rows, column] * jnp.take_along_axis(values, index, axis=axis)
     valid = np.broadcast_to(valid, inside.shape)
-    # Zero and not NaN where nothing is known: NaN here would survive, as 0·NaN, in the gradient of known values.
+    # Unknown derivatives are zero and not NaN, since 0·NaN would spoil the gradient of known ones.
     return jnp.where(np.expand_dims(valid, expand), total, 0), valid
 
 
 def _choose(
     inside: np.ndarray, offsets: np.ndarray, axis: int, wraps: bool
 ) -> tuple[np.ndarray, Bool[np.ndarray, "*shape"]]:
-    """Return the first stencil all of whose nodes are inside (0 where none is), and where there is one."""
+    """Return for each node the first stencil with all nodes inside (0 if there is none), and whether there is one."""
     reach = MINIMUM_NODES - 1
     width = [(reach, reach) if a == axis else (0, 0) for a in range(inside.ndim)]
     padded = np.pad(inside, width, mode="wrap") if wraps else np.pad(inside, width)
@@ -91,7 +91,7 @@ _BATCH = 4096
 
 
 class Jet(NamedTuple):
-    """A quantity and its derivatives at a point or at many; derivative indices come last."""
+    """A quantity and its derivatives at one or many points; the indices of derivatives are last."""
 
     value: Float[Array, "..."]
     gradient: Float[Array, "... d"]
@@ -101,7 +101,7 @@ class Jet(NamedTuple):
 def function_jet(fn: Callable[[Array], Any], x: Float[Array, " d"]) -> Jet:
     """Return the jet of a function at a point."""
 
-    # The lower derivatives ride along as auxiliary outputs: else nested jets trace `fn` 7 times per level.
+    # The lower derivatives are auxiliary outputs; otherwise nested jets would trace `fn` 7 times per level.
     def value(y: Array) -> tuple[Any, Any]:
         f = fn(y)
         return f, f
@@ -123,8 +123,8 @@ def nodal_jet(
     """Return the jets of nodal values by differences, and the nodes where all their derivatives are known."""
     if min(grid.shape) < MINIMUM_NODES:
         raise ValueError(
-            f"grid: got shape {grid.shape}; differences of sixth order need at least {MINIMUM_NODES} nodes on every "
-            "axis. Use a finer grid, or a metric given by TensorField.from_function"
+            f"grid: got shape {grid.shape}; expected at least {MINIMUM_NODES} nodes on every axis, for differences "
+            "of sixth order. Use a finer grid, or a metric from TensorField.from_function"
         )
     d = grid.dimension
 
@@ -150,12 +150,12 @@ def christoffel(metric: Jet) -> Float[Array, "... d d d"]:
 
 def inner(inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[Array, "... d"]) -> Float[Array, "..."]:
     """Return ⟨p, q⟩ = gᵃᵇ pₐ qᵦ of two covectors."""
-    # Sums of products fuse, where XLA would make calls of as many tiny matrix products.
+    # XLA fuses these sums of products, but would call a library for each of many tiny matrix products.
     return jnp.sum(inverse * p[..., :, None] * q[..., None, :], axis=(-2, -1))
 
 
 def metric_function(field: TensorField) -> Callable[[Array], Array]:
-    """Return the field's function, symmetrised, in the precision of its argument; NaN if not positive definite."""
+    """Return the field's function, symmetrised, in the dtype of its argument; NaN if it is not positive definite."""
     function = field.function
     assert function is not None
     return lambda x: spd.positive_or_nan(spd.symmetrise(jnp.asarray(function(x), x.dtype)))
@@ -171,18 +171,18 @@ def metric_jet(field: TensorField, wraps: tuple[bool, ...]) -> tuple[Jet, Bool[n
 
 
 def domain_nodes(grid: Grid, wraps: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes of the elements that exist: everywhere else results are NaN."""
+    """Mark the nodes of the domain's elements; results are NaN at all other nodes."""
     return element_nodes(active_elements(grid.inside, wraps), wraps)
 
 
 def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*shape"]) -> Any:
-    """Evaluate a function of position at every node: (*shape, …) for every array in its result.
+    """Evaluate a function of position at every node; each array of the result is (*shape, …).
 
-    Nodes outside the domain get the value at some node inside: a function need not make sense outside, and a NaN
-    there would spoil gradients even where it is masked afterwards.
+    Nodes outside the domain get the value at a node inside. The function may be undefined outside, and a NaN there
+    would spoil gradients even if it is masked afterwards.
     """
     flat = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension)
-    # High derivatives hold many intermediates per node: batches bound their memory and keep them in the cache.
+    # High derivatives have many intermediates per node. Batches limit their memory and keep them in the cache.
     n_batches = -(-grid.size // _BATCH)
     batches = np.resize(flat, (n_batches, -(-grid.size // n_batches), grid.dimension))
     values = jax.lax.map(jax.vmap(fn), jnp.asarray(batches, jnp.result_type(float)))
@@ -190,8 +190,8 @@ def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*
 
 
 def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[bool, ...]:
-    """Return which axes are periodic; raise ValueError for anything but a bool, or one bool per axis."""
+    """Return which axes are periodic; raise ValueError unless the argument is a bool or one bool per axis."""
     wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(periodic)
     if len(wraps) != dimension or not all(isinstance(wrap, bool | np.bool_) for wrap in wraps):
-        raise ValueError(f"periodic: got {periodic!r}; expected True, False, or {dimension} of them, one per axis")
+        raise ValueError(f"periodic: got {periodic!r}; expected True, False, or a tuple of {dimension}, one per axis")
     return tuple(bool(wrap) for wrap in wraps)

@@ -1,8 +1,8 @@
 """Truncated Taylor series in two variables.
 
-A series is its vector of coefficients, those of low total degree first: 1, x, y, x², xy, y², … So a shorter vector is
-the same series truncated, and an operation on several of them goes as far as the shortest one does. Nested derivatives,
-which have every mixed derivative in all its orders, take several times as long to compile and to run.
+A series is the vector of its coefficients in the order 1, x, y, x², xy, y², …, by total degree. So a shorter vector is
+a truncation of the series, and operations on several series return the length of the shortest one. Nested JAX
+derivatives would compute each mixed derivative in every order, and take several times as long to compile and to run.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ Series = Float[Array, " _n_terms"]
 def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> Float[Array, "*components n_terms"]:
     """Return the Taylor series of a function at a point, exact to rounding.
 
-    Along a line all derivatives are those of one variable, and cheap. Degree + 1 directions determine the
-    mixed ones: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ, a well-conditioned system for equidistant angles.
+    Derivatives along a line are those of a function of one variable, and cheap. Those in degree + 1 directions
+    determine mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ, well-conditioned for equidistant angles.
     """
     angles = np.pi * np.arange(degree + 1) / (degree + 1)
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
@@ -45,7 +45,7 @@ def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> 
 
 
 def _with_next(derivatives: Callable[[Array], tuple[Array, ...]]) -> Callable[[Array], tuple[Array, ...]]:
-    """Append the derivative of the last entry."""
+    """Append the derivative of the last entry to the function's result."""
 
     def last(t: Array) -> tuple[Array, tuple[Array, ...]]:
         known = derivatives(t)
@@ -70,7 +70,7 @@ def product(a: Series, b: Series) -> Series:
 
 
 def reciprocal(a: Series) -> Series:
-    """Return 1/a by Newton's iteration; a step takes the right coefficients from degree m to 2m + 1."""
+    """Return 1/a by Newton's iteration; a step extends the correct coefficients from degree m to 2m + 1."""
     r = jnp.zeros_like(a).at[0].set(1 / a[0])
     for _ in range(int(_exponents(a.size)[-1].sum()).bit_length()):
         r = 2 * r - product(a, product(r, r))
@@ -78,7 +78,7 @@ def reciprocal(a: Series) -> Series:
 
 
 def derivative(a: Series, axis: int) -> Series:
-    """Return the derivative with respect to a variable, one degree shorter."""
+    """Return the derivative with respect to a variable, which is one degree shorter."""
     exponents = _exponents(a.size)[:, axis]
     kept = np.flatnonzero(exponents)
     return a[kept] * jnp.asarray(exponents[kept], a.dtype)
@@ -86,13 +86,13 @@ def derivative(a: Series, axis: int) -> Series:
 
 @lru_cache
 def _exponents(n: int) -> Int[np.ndarray, "n 2"]:
-    """Return the powers of the two variables in n coefficients; xᵏ⁻ʲyʲ is number k(k + 1)/2 + j."""
+    """Return the powers of the two variables for n coefficients; xᵏ⁻ʲyʲ has the number k(k + 1)/2 + j."""
     return np.array([(k - j, j) for k in range(n) for j in range(k + 1)][:n])
 
 
 @lru_cache
 def _products(n: int) -> Bool[np.ndarray, "n n n"]:
-    """Mark [i, j, k] where monomial i times monomial j is monomial k."""
+    """Mark [i, j, k] if monomial i times monomial j is monomial k."""
     powers = _exponents(n)[:, None] + _exponents(n)
     degree = powers.sum(axis=-1)
     return (degree * (degree + 1) // 2 + powers[..., 1])[..., None] == np.arange(n)

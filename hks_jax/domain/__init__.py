@@ -1,1 +1,1 @@
-"""What we compute on: grids, tensor fields, surface meshes."""
+"""Domains: grids, tensor fields and meshes."""

@@ -1,4 +1,4 @@
-"""Which elements of a masked grid exist, and how they hang together."""
+"""The elements of a masked grid, and their connected components."""
 
 from itertools import product
 
@@ -10,23 +10,23 @@ from scipy.sparse.csgraph import connected_components
 
 
 def wrap_nodes(nodes: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Repeat the first node after the last along the periodic axes: one more than the elements everywhere."""
+    """Repeat the first node after the last along periodic axes, so that each axis has one node more than elements."""
     return np.pad(nodes, [(0, int(wraps)) for wraps in periodic], mode="wrap")
 
 
 def _corners(dimension: int) -> list[tuple[slice, ...]]:
-    """Return for each corner of elements the slices of the nodes there, of nodes one more than elements."""
+    """Return for each corner of elements the slices that select the nodes there from `wrap_nodes`."""
     return list(product(*[(slice(None, -1), slice(1, None))] * dimension))
 
 
 def active_elements(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> np.ndarray:
-    """Mark the elements all of whose 2^d nodes are inside the mask, shape n (periodic axes) or n − 1."""
+    """Mark the elements with all 2^d nodes inside the mask; a periodic axis has n elements, others have n − 1."""
     nodes = wrap_nodes(mask, periodic)
     return np.logical_and.reduce([nodes[corner] for corner in _corners(mask.ndim)])
 
 
 def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Mark the nodes of the given elements; of numbers at elements, return the greatest around each node."""
+    """Mark the nodes of marked elements; if elements have numbers, return the greatest number around each node."""
     nodes = np.zeros([n + 1 for n in elements.shape], elements.dtype)
     for corner in _corners(elements.ndim):
         np.maximum(nodes[corner], elements, out=nodes[corner])
@@ -39,12 +39,12 @@ def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarra
 
 
 def rim_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes on the rim of a mask: those that lack an element which the grid itself has."""
+    """Mark the nodes on the rim of a mask: nodes of the domain with an adjacent grid element outside the domain."""
     count = np.zeros([n + (not wraps) for n, wraps in zip(elements.shape, periodic, strict=True)], dtype=int)
     beside = elements
     for axis, wraps in enumerate(periodic):
         before = [(1, int(not wraps)) if a == axis else (0, 0) for a in range(elements.ndim)]
-        beside = np.pad(beside, before, mode="wrap" if wraps else "edge")  # beyond a side all is as before it
+        beside = np.pad(beside, before, mode="wrap" if wraps else "edge")  # beyond a side the elements are repeated
     for start in product((0, 1), repeat=elements.ndim):
         count += beside[tuple(slice(s, s + n) for s, n in zip(start, count.shape, strict=True))]
     return (count > 0) & (count < 2**elements.ndim)
@@ -56,8 +56,8 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
     Returns the labels (0 outside, 1 … n inside) and their number n.
     """
     elements = active_elements(mask, periodic)
-    # Elements that share a node hang together; two nodes may be neighbours without sharing an element. So label
-    # elements, then hand down. Across periodic sides, what meets in a node hangs together, too.
+    # Elements that share a node are connected, whereas two neighbouring nodes need not share an element. So elements
+    # are labelled first, and nodes take their labels. Elements are also connected by a node on a periodic side.
     labels, count = scipy.ndimage.label(elements, structure=np.ones((3,) * mask.ndim, dtype=bool))
     nodes = element_nodes(labels, periodic)
     if any(periodic) and count > 1:

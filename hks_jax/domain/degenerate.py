@@ -17,7 +17,7 @@ class DegeneratePoints(NamedTuple):
 
     Attributes:
         positions: (n, 2) coordinates.
-        indices: (n,) multiples of ½: how often the eigenvectors turn while one goes once around the point.
+        indices: (n,) multiples of ½: the number of turns of the eigenvectors along a closed curve around the point.
     """
 
     positions: Float[np.ndarray, "n 2"]
@@ -27,20 +27,20 @@ class DegeneratePoints(NamedTuple):
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     """Find the points of a 2D field where the eigenvalues are equal, with their index.
 
-    The vector (T₁₁ − T₂₂, 2T₁₂) vanishes there, and it turns twice as fast as the eigenvectors. Interpolated
-    bilinearly from the nodes, it has at most one zero in a cell that it winds around: index ±½, a wedge or a
-    trisector. Zeros that are near are one point, whose index is the sum (Tricoche, Scheuermann and Hagen 2001).
+    At these points the vector (T₁₁ − T₂₂, 2T₁₂) vanishes. It turns twice as fast as the eigenvectors, and is
+    interpolated bilinearly. A cell around which it turns has one zero with the index ±½, a wedge or a trisector. Nearby
+    zeros are merged into one point with the sum of their indices (Tricoche, Scheuermann and Hagen 2001).
 
-    Points of index 0, a pair of opposite index closer than `merge`, and points on the rim of the domain are not found.
-    Of a curve or a patch of equal eigenvalues off the rim the middle is returned, unless its index is 0.
+    Points of index 0, pairs of opposite index that are closer than `merge`, and points on the rim of the domain are not
+    found. If eigenvalues are equal on a curve or in a region off the rim, its centre is returned unless its index is 0.
 
     Args:
-        field: a 2D field. Cells with a node outside the mask are no part of the domain.
-        merge: zeros in cells that are at most so many cells apart, along either axis, count as one point; at least 1
-            (zeros on an edge belong to two cells).
+        field: a 2D field. Cells with a node outside the mask are not part of the domain.
+        merge: zeros in cells that are at most `merge` cells apart along either axis count as one point. It is at least
+            1, because a zero on an edge belongs to two cells.
 
     Returns:
-        The points, by first and then by second coordinate.
+        The points, sorted by the first and then by the second coordinate.
 
     Raises:
         ValueError: a 3D field; merge less than 1.
@@ -48,7 +48,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     grid = field.grid
     if grid.dimension != 2:
         raise ValueError(
-            f"field: got a grid of shape {grid.shape}; expected 2 dimensions. In 3D eigenvalues meet on curves; "
+            f"field: got a grid of shape {grid.shape}; expected 2 dimensions. In 3D equal eigenvalues form curves; "
             "take a slice"
         )
     if merge < 1:
@@ -57,7 +57,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     tensors = nodal.astype(np.float64)
     v = np.stack([tensors[..., 0, 0] - tensors[..., 1, 1], 2 * tensors[..., 0, 1]], axis=-1)
     active = active_elements(grid.inside, (False, False))
-    # What rounding makes of a zero.
+    # Vectors that are at most this long are zero up to rounding.
     tiny = 16 * np.finfo(nodal.dtype).eps * np.trace(tensors, axis1=-2, axis2=-1)
     winding, crossed, on_rim = _windings(v, tiny, active)
     cells = np.argwhere(active & ((winding != 0) | crossed))
@@ -68,7 +68,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # A zero on an edge or a node is seen by several cells, and how they share its turns is arbitrary; their sum is not.
+    # Several cells share a zero on an edge or node. Their shares of its turns are arbitrary, but the sum is not.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]
@@ -85,7 +85,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 def _windings(
     v: Float[np.ndarray, "nx ny 2"], tiny: Float[np.ndarray, "nx ny"], active: Bool[np.ndarray, "mx my"]
 ) -> tuple[Int[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
-    """Return how often v turns around each cell, which cells have a zero on their edges, and which one on the rim."""
+    """Return the turns of v around each cell, the cells with a zero on an edge, and those with a zero on the rim."""
     angle = np.arctan2(v[..., 1], v[..., 0])
     zero = np.hypot(v[..., 0], v[..., 1]) <= tiny
     number = np.zeros(active.shape)
@@ -94,7 +94,7 @@ def _windings(
         first, second = _ends(v, axis)
         a, b = _ends(angle, axis)
         turn = np.mod(b - a + np.pi, 2 * np.pi) - np.pi
-        # Interpolated linearly along the edge, v passes the origin at this distance, if it does between the ends.
+        # The linear interpolant of v along the edge passes the origin at the distance |cross|/apart.
         apart = np.linalg.norm(second - first, axis=-1)
         cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
         opposite = np.sum(first * second, axis=-1) < 0
@@ -119,9 +119,9 @@ def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _zeros_in_cells(v: Float[np.ndarray, "nx ny 2"], cells: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Return the zero of the bilinear interpolant in each cell, in units of its sides; the middle where there is none.
+    """Return the zero of the bilinear interpolant in each cell, in units of its sides; the centre if there is none.
 
-    a₀ + a₁x + a₂y + a₃xy = 0 in both components: without x a quadratic equation in y.
+    Eliminating x from both components of a₀ + a₁x + a₂y + a₃xy = 0 gives a quadratic equation in y.
     """
     i, j = cells.T
     p00, p10, p01, p11 = v[i, j], v[i + 1, j], v[i, j + 1], v[i + 1, j + 1]

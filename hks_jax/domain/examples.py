@@ -1,6 +1,6 @@
 """The paper's fields, and charts of surfaces whose geometry is known in closed form.
 
-All come from functions, so that their curvature is exact. Angles are in radians.
+All fields are made from functions, so that their curvature is exact. Angles are in radians.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ Metric = Callable[[Point], Float[Array, "d d"]]
 
 
 def pullback(parametrisation: Callable[[Point], Float[Array, " m"]]) -> Metric:
-    """Return the metric x ↦ JᵀJ that a map of coordinates (d,) into space (m,) pulls back, J its Jacobian."""
+    """Return the pullback metric x ↦ JᵀJ of a map from coordinates (d,) into space (m,) with the Jacobian J."""
 
     def metric(x: Point) -> Float[Array, "d d"]:
         jacobian = jax.jacfwd(parametrisation)(x)
@@ -33,13 +33,13 @@ def pullback(parametrisation: Callable[[Point], Float[Array, " m"]]) -> Metric:
 
 
 def torus(x: Float[Array, " 2"], major: float | Array, minor: float | Array) -> Float[Array, " 3"]:
-    """Return the point of a torus of revolution; x₁ turns about the axis, x₂ about the tube."""
+    """Return the point of a torus of revolution; x₁ is the angle about the axis, x₂ the angle about the tube."""
     ring = major + minor * jnp.cos(x[1])
     return jnp.stack([ring * jnp.cos(x[0]), ring * jnp.sin(x[0]), minor * jnp.sin(x[1])])
 
 
 def bumpy_torus(x: Float[Array, " 2"]) -> Float[Array, " 3"]:
-    """Return the point of the paper's bumpy torus (Table 1): radii 3 + ½cos 10x₁ and 1 + ⅕cos 8x₂."""
+    """Return the point of the paper's bumpy torus (Table 1) with the radii 3 + ½cos 10x₁ and 1 + ⅕cos 8x₂."""
     return torus(x, 3 + jnp.cos(10 * x[0]) / 2, 1 + jnp.cos(8 * x[1]) / 5)
 
 
@@ -63,22 +63,22 @@ def bumpy_torus_mesh(n: int) -> SurfaceMesh:
 
 
 def sphere_mesh(n: int) -> SurfaceMesh:
-    """Return the unit sphere as 20n² triangles on 10n² + 2 vertices: the icosahedron's, subdivided; n = 71 for 50 412.
+    """Return the unit sphere as a subdivided icosahedron with 20n² triangles and 10n² + 2 vertices.
 
-    The eigenvalues of the sphere are l(l + 1), 2l + 1 times.
+    For n = 71 it has 50 412 vertices. The eigenvalues of the sphere are l(l + 1) with the multiplicity 2l + 1.
     """
     require_count("n", n)
     return SurfaceMesh(*geodesic(n, 2))
 
 
 def ball_mesh(n: int) -> TetMesh:
-    """Return the unit ball as 20n³ tetrahedra in n layers about its centre, which is vertex 0; n = 24 for 49 049.
+    """Return the unit ball as 20n³ tetrahedra in n layers about its centre, which is vertex 0.
 
-    Layer j has the 10j² + 2 vertices of `sphere_mesh` on the sphere of radius j/n. Dihedral angles are between 36° and
-    130°.
+    Layer j has the 10j² + 2 vertices of `sphere_mesh` on the sphere of radius j/n; for n = 24 the ball has 49 049
+    vertices. Dihedral angles are between 36° and 130°.
 
-    With natural boundary the ball's eigenvalues are the squares of the positive zeros of jₗ', l > 0, and 0; with
-    Dirichlet conditions those of the zeros of jₗ, the spherical Bessel functions; each 2l + 1 times.
+    Let jₗ be the spherical Bessel functions. With Dirichlet conditions the eigenvalues of the ball are the squares of
+    the positive zeros of jₗ; with Neumann conditions they are 0 and those of jₗ'. Each has the multiplicity 2l + 1.
     """
     require_count("n", n)
     return TetMesh(*geodesic(n, 3))
@@ -101,7 +101,7 @@ def _stereographic(x: Float[Array, " 2"], sign: float) -> Float[Array, "2 2"]:
 def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
     """Return the unit sphere (K = 1) in its stereographic chart, n × n nodes on (−half_width, half_width)².
 
-    The sides are 2 arctan(half_width) from the centre; what the chart leaves out is around the other pole.
+    The sides are at the distance 2 arctan(half_width) from the centre; a region around the other pole is missing.
     """
     grid = Grid.from_bounds(-half_width, half_width, (n, n))
     return TensorField.from_function(partial(_stereographic, sign=1.0), grid)
@@ -110,7 +110,7 @@ def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
 def hyperbolic_field(n: int, half_width: float = 0.6) -> TensorField:
     """Return the hyperbolic plane (K = −1) in the Poincaré disk, n × n nodes on (−half_width, half_width)²."""
     if not 0 < half_width < 0.5**0.5:
-        raise ValueError(f"half_width: got {half_width}; the square fits into the disk below 1/√2")
+        raise ValueError(f"half_width: got {half_width}; expected more than 0 and less than 1/√2, to fit into the disk")
     grid = Grid.from_bounds(-half_width, half_width, (n, n))
     return TensorField.from_function(partial(_stereographic, sign=-1.0), grid)
 
@@ -120,9 +120,9 @@ def _bump(squared: Array) -> Array:
 
 
 def figure3_fields(n: int) -> dict[str, TensorField]:
-    """Return T¹ … T⁴ of the paper's Fig. 3 on n × n nodes of (−5, 5)²; f(x) = 1 + 10 exp(−x²).
+    """Return the metrics T¹ … T⁴ of the paper's Fig. 3 on n × n nodes of (−5, 5)².
 
-    T¹ = diag(f(u₁), 1), which is flat; T² = diag(f(u₂), 1); T³ = diag(f(u₂), f(u₁)); T⁴ = f(|u|)·I.
+    For f(x) = 1 + 10 exp(−x²): T¹ = diag(f(u₁), 1) (flat), T² = diag(f(u₂), 1), T³ = diag(f(u₂), f(u₁)), T⁴ = f(|u|)·I.
     """
 
     def diagonal(entries: Callable[[Array, Array], Sequence[Array]]) -> Metric:
@@ -139,7 +139,7 @@ def figure3_fields(n: int) -> dict[str, TensorField]:
 
 
 def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metric:
-    """Return the metric with constant eigenvalues whose major eigenvector is at the given angle to axis 0."""
+    """Return the metric with constant eigenvalues whose major eigenvector has the given angle to axis 0."""
 
     def metric(u: Point) -> Float[Array, "2 2"]:
         c, s = jnp.cos(2 * angle(u)), jnp.sin(2 * angle(u))
@@ -152,8 +152,8 @@ def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metr
 def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, TensorField]:
     """Return fields of constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
 
-    All of them have the same trace, determinant and anisotropy everywhere; only the directions differ. Circles and
-    spirals turn about (−0.3, −0.3), outside of the square; like the straight field they are flat, the others are not.
+    All fields have the same constant trace, determinant and anisotropy; only the directions differ. The centre of the
+    circles and spirals is (−0.3, −0.3), outside the square. These and the straight field are flat, the others are not.
     """
 
     def polar(u: Point) -> Array:
@@ -173,10 +173,10 @@ def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, 
 def degenerate_point_field(index: float, n: int) -> TensorField:
     """Return a field with a degenerate point of the given index in the middle of n × n nodes of (−1, 1)² (Fig. 5).
 
-    The eigenvalues are 10 ± 3|u|, and the major eigenvector is at ``index`` (a multiple of ½) times the polar angle θ:
-    T = 10·I + 3|u| [[c, s], [s, −c]], c = cos(2·index·θ), s = sin(2·index·θ). With m = |2·index| and z = u₁ ± iu₂, the
-    sign that of the index, |u| (c + is) = |u| (z/|z|)ᵐ, which needs no angle. At the centre this is smooth for the
-    indices ±½, where it is z. The others have no derivative there, and so NaN for their curvature at that node.
+    The eigenvalues are 10 ± 3|u|, and the major eigenvector has the angle ``index``·θ, where ``index`` is a multiple of
+    ½ and θ is the polar angle: T = 10·I + 3|u| [[c, s], [s, −c]] with c = cos(2·index·θ) and s = sin(2·index·θ). For
+    z = u₁ ± iu₂ with the sign of the index, and m = |2·index|, c + is = (z/|z|)ᵐ, which is computed without angles. For
+    the indices ±½ the field is smooth at the centre. For others it has no derivative there, so its curvature is NaN.
     """
     m = round(abs(2 * index))
     if m == 0 or abs(m - abs(2 * index)) > 1e-12:
@@ -198,25 +198,25 @@ def degenerate_point_field(index: float, n: int) -> TensorField:
 
 
 GREY, WHITE, FLUID = 0.8e-3, (1.7e-3, 0.3e-3), 3.0e-3
-"""Diffusivities in mm²/s: grey matter; white matter along and across the fibres; cerebrospinal fluid."""
+"""Diffusivities in mm²/s of grey matter, of white matter along and across the fibres, and of cerebrospinal fluid."""
 
 FIELD_OF_VIEW = (160.0, 190.0, 130.0)
-"""Millimetres, left–right, back–front, down–up."""
+"""The extents of the phantom in millimetres: left–right, back–front and down–up."""
 
 
 def phantom(
     shape: Sequence[int] = (96, 112),
 ) -> tuple[Float[np.ndarray, "*shape d d"], Bool[np.ndarray, "*shape"], tuple[float, ...]]:
-    """Return diffusion tensors of a phantom that looks like an axial slice through a brain, or a stack of them.
+    """Return diffusion tensors of a phantom that resembles an axial slice of a brain, or a stack of such slices.
 
-    A folded rind of grey matter, white matter with the arch of a corpus callosum, an arc of fibres on either side, a
-    crossing of the two, and two ventricles.
+    It has a folded cortex of grey matter, and two ventricles. Its white matter has a corpus callosum, an arc of fibres
+    on each side, and crossings of both.
 
     Args:
-        shape: number of voxels, 2 (left–right, back–front) or 3 (and down–up) axes.
+        shape: the number of voxels along 2 axes (left–right and back–front) or 3 axes (and down–up).
 
     Returns:
-        tensors (*shape, d, d) in mm²/s, SPD everywhere; mask (*shape); spacing per axis in mm.
+        The tensors (*shape, d, d) in mm²/s, SPD everywhere; the mask (*shape); the spacing per axis in mm.
     """
     d = len(shape)
     if d not in (2, 3):
@@ -224,7 +224,7 @@ def phantom(
     axes = [np.linspace(-1, 1, n) for n in shape]
     x, y, *third = np.meshgrid(*axes, indexing="ij")
     z = third[0] if third else np.zeros_like(x)
-    # Higher and lower slices through an ellipsoid are smaller ones.
+    # Slices of an ellipsoid become smaller towards its ends.
     shrink = np.sqrt(np.clip(1 - 0.8 * z**2, 0.1, None))
     x, y = x / shrink, y / shrink
 
@@ -237,7 +237,7 @@ def phantom(
     white *= 1 - deep
     ventricles = _blob(np.abs(x) - 0.12 - 0.1 * y**2, y - 0.05, 0.055, 0.3)
 
-    # Fibre directions as weighted dyads, so that crossings average and signs do not matter.
+    # Fibre directions are averaged as weighted dyads, so that their signs do not matter.
     callosum = sum(_ridge(np.hypot(x / 0.62, (y - end) / 0.3) - 1, 0.14) * _step(side * (y - end), 0.05)
                    for end, side in ((0.38, -1), (-0.32, 1)))  # fmt: skip
     middle = _blob(x, y - 0.38 + 0.28, 0.3, 0.08) + _blob(x, y + 0.32 - 0.28, 0.3, 0.08)

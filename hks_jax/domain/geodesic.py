@@ -1,4 +1,4 @@
-"""The unit sphere and ball in cells of nearly one size: an icosahedron's faces, or the pyramids over them, cut up."""
+"""Meshes of the unit sphere and ball with cells of nearly equal size, by subdivision of an icosahedron."""
 
 from itertools import permutations, product
 
@@ -9,7 +9,6 @@ _CENTRE = 12
 
 
 def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
-    """Return the vertices, on the unit sphere, and the faces."""
     golden = (1 + np.sqrt(5)) / 2
     one = [(0, a, b * golden) for a, b in product((-1, 1), repeat=2)]
     vertices = np.array([np.roll(v, turn) for turn in range(3) for v in one], dtype=float)
@@ -19,11 +18,11 @@ def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
 
 
-# Kuhn cuts every cube of a lattice into the simplices that one reaches by unit steps, one along each axis in any order.
-# Those within n ≥ x₁ ≥ … ≥ x_d ≥ 0 are a subdivision of this simplex into n^d, and its facets are cut alike wherever
-# they are shared, as into triangles with edges along their own three.
+# Kuhn's subdivision cuts each cube of a lattice into d! simplices: each has the corners of a path of unit steps, one
+# along each axis. The simplices with n ≥ x₁ ≥ … ≥ x_d ≥ 0 subdivide this large simplex into n^d cells. Adjacent large
+# simplices match, because a triangular facet is cut into triangles with edges parallel to its own.
 def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.ndarray, "cells corners"]]:
-    """Return a simplex, subdivided n times: barycentric coordinates times n of the points, and the cells."""
+    """Subdivide a simplex into n^d cells; return n times the barycentric coordinates of the points, and the cells."""
     lattice = np.indices((n + 1,) * dimension).reshape(dimension, -1).T
     points = lattice[(np.diff(lattice, axis=1) <= 0).all(axis=1)]
     strides = (n + 1) ** np.arange(dimension)[::-1]
@@ -42,7 +41,7 @@ def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.
 def _glued(
     simplices: Int[np.ndarray, "s corners"], n: int
 ) -> tuple[Int[np.ndarray, "V 13"], Int[np.ndarray, "cells corners"]]:
-    """Subdivide simplices on 13 vertices: how much of each a point has, in n-ths, and the cells."""
+    """Subdivide simplices on 13 vertices; return n times the barycentric coordinates of the points, and the cells."""
     weights, cells = _kuhn(n, simplices.shape[1] - 1)
     shares = np.zeros((len(simplices), len(weights), _CENTRE + 1), np.int16)
     for i, simplex in enumerate(simplices):
@@ -52,9 +51,9 @@ def _glued(
 
 
 def geodesic(n: int, dimension: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "cells corners"]]:
-    """Return the points and the cells of the unit sphere (2) or ball (3), triangles oriented outward or tetrahedra.
+    """Return the points and cells of the unit sphere (2; triangles oriented outward) or ball (3; tetrahedra).
 
-    The sphere has 10n² + 2 points and 20n² triangles; the ball n concentric layers about its centre, 20n³ tetrahedra.
+    The sphere has 10n² + 2 points and 20n² triangles. The ball has n layers about its centre, with 20n³ tetrahedra.
     """
     corners, faces = _icosahedron()
     shares, cells = _glued(faces if dimension == 2 else np.insert(faces, 0, _CENTRE, axis=1), n)
@@ -62,6 +61,6 @@ def geodesic(n: int, dimension: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.n
     length, radius = np.linalg.norm(vertices, axis=1), 1 - shares[:, _CENTRE] / n
     vertices *= (radius / np.where(length > 0, length, 1))[:, None]
     frames = vertices[cells] if dimension == 2 else vertices[cells[:, 1:]] - vertices[cells[:, :1]]
-    # Of the cells whose frame is left-handed, two vertices are swapped.
+    # If the frame of a cell is left-handed, two of its vertices are swapped.
     left = np.linalg.det(frames) < 0
     return vertices, np.where(left[:, None], cells[:, [1, 0, *range(2, dimension + 1)]], cells)

@@ -17,21 +17,21 @@ from hks_jax.domain.components import active_elements, label_nodes
 
 @jax.tree_util.register_static
 class Grid(ByKey):
-    """A regular grid of nodes; array axis a is coordinate a.
+    """A regular grid of nodes; axis a of arrays belongs to coordinate a.
 
-    Static and hashable: it passes through `jax.jit`, `jax.grad` and `jax.vmap` as structure, with no arrays in it.
+    A grid is static and hashable: it has no leaves, and `jax.jit`, `jax.grad` and `jax.vmap` treat it as structure.
 
     Args:
-        shape: number of nodes per axis, 2 or 3 axes, at least 2 nodes each.
-        spacing: distance between nodes per axis (one number serves all axes), in coordinate units.
-        origin: coordinates of node (0, …, 0).
-        mask: bool array of `shape`, True inside. The domain is the union of the elements all of whose nodes are
-            inside; results are NaN at every other node. None: the whole grid.
-        components: what to do with a mask of several connected components: ``"raise"`` (default) says how many
-            there are, ``"largest"`` keeps the one with the most nodes, ``"all"`` keeps them all.
+        shape: the number of nodes along each of 2 or 3 axes, at least 2.
+        spacing: the distance between nodes along each axis (or one number for all axes), in coordinate units.
+        origin: the coordinates of node (0, …, 0).
+        mask: bool array of `shape`, True inside. The domain is the union of the elements with all nodes inside; results
+            are NaN at all other nodes. None: the whole grid.
+        components: the treatment of a mask with several connected components: ``"raise"`` (default) raises an error
+            with their number, ``"largest"`` keeps the one with the most nodes, ``"all"`` keeps all.
 
     Raises:
-        ValueError: bad shape, spacing, origin or mask; an empty mask; a disconnected one under ``"raise"``.
+        ValueError: a bad shape, spacing, origin or mask; an empty mask; a disconnected mask under ``"raise"``.
     """
 
     shape: tuple[int, ...]
@@ -90,7 +90,7 @@ class Grid(ByKey):
 
     @property
     def inside(self) -> np.ndarray:
-        """The mask, or True everywhere: bool (*shape)."""
+        """The mask as bool (*shape), True everywhere if there is none."""
         return np.ones(self.shape, dtype=bool) if self._mask is None else self._mask.value
 
     @property
@@ -105,12 +105,12 @@ class Grid(ByKey):
 
     @property
     def extent(self) -> tuple[float, ...]:
-        """(x_min, x_max, y_min, y_max, …): the outermost nodes, in the order that `imshow` takes."""
+        """The coordinates (x_min, x_max, y_min, y_max, …) of the outermost nodes, in the order of `imshow`."""
         return tuple(float(end) for axis in self.axes for end in (axis[0], axis[-1]))
 
     @cached_property
     def unit(self) -> "Grid":
-        """The same nodes with spacing 1 from the origin 0: all that the structure of matrices depends on."""
+        """The grid of the same nodes with spacing 1 and origin 0, which determines the structure of matrices."""
         unit = Grid(self.shape)
         unit._mask = self._mask
         return unit
@@ -128,7 +128,7 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
     try:
         return tuple(operator.index(n) for n in shape)
     except TypeError:
-        raise ValueError(f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, nodes per axis") from None
+        raise ValueError(f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, the nodes per axis") from None
 
 
 def _per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: int) -> tuple[float, ...]:
@@ -157,8 +157,8 @@ def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndar
     wrapped = (True,) * array.ndim
     if not active_elements(array, wrapped).any():
         raise ValueError(
-            f"mask: {int(array.sum())} nodes are inside but no element has all its {2**array.ndim} nodes inside; "
-            "the mask is too thin for this grid: use a thicker mask or a finer grid"
+            f"mask: got {int(array.sum())} nodes inside, but no element has all its {2**array.ndim} nodes inside; "
+            "use a thicker mask or a finer grid"
         )
     labels, count = label_nodes(array, (False,) * array.ndim)
     if count > 1 and components != "all":
@@ -166,8 +166,8 @@ def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndar
         if components == "raise":
             largest = ", ".join(str(n) for n in np.sort(sizes)[::-1][:5]) + (", …" if count > 5 else "")
             raise ValueError(
-                f"mask: {count} connected components ({largest} nodes); expected one. "
-                'Pass components="largest" to keep the largest, or components="all" to keep them all'
+                f"mask: got {count} connected components ({largest} nodes); expected one. "
+                'Pass components="largest" to keep the largest one, or components="all" to keep all'
             )
         array = labels == 1 + int(np.argmax(sizes))
     return array

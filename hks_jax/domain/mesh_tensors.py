@@ -1,4 +1,4 @@
-"""Tensors in space on a mesh: the metric that they stand for on each cell."""
+"""The metric of each cell of a mesh from tensors in the axes of space."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ def metric_of_tensors(
     at: str | None,
     interpolation: Interpolation,
 ) -> Float[Array, "n d d"]:
-    """Return the metric of tensors in space, on triangles of their tangential part, in the basis of each cell's edges.
+    """Return the metric of tensors in space, in the basis of each cell's edges; triangles take the tangential part.
 
     See `SurfaceMesh.from_tensors` and `TetMesh.from_tensors`.
     """
@@ -43,9 +43,9 @@ def metric_of_tensors(
     corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
     frames = _orthonormal(edges)
     parts = jnp.einsum("nxa,ncxy,nyb->ncab", frames, spd.symmetrise(array)[corners], frames, precision="highest")
-    # At the vertices each of a cell's, and not their mean, must be positive definite.
+    # The tensors at all vertices of a cell, and not only their mean, must be positive definite.
     parts = spd.positive_or_nan(parts)
-    # The logarithm is that of the tangential part: across a surface tensors need not be positive definite.
+    # The logarithm is that of the tangential part, since tensors may be indefinite across a surface.
     if interpolation == "linear" or not at_vertices:
         part = jnp.mean(parts, axis=1)
     else:
@@ -57,7 +57,7 @@ def metric_of_tensors(
 
 
 def _orthonormal(edges: Float[Array, "n 3 d"]) -> Float[Array, "n 3 d"]:
-    """Return an orthonormal basis, as columns, of each triangle's plane by Gram and Schmidt, or of all space."""
+    """Return an orthonormal basis, as columns, of each triangle's plane by Gram–Schmidt, or of space."""
     if edges.shape[-1] == 3:
         return jnp.broadcast_to(jnp.eye(3, dtype=edges.dtype), edges.shape)
     first, second = edges[..., 0], edges[..., 1]
@@ -67,7 +67,7 @@ def _orthonormal(edges: Float[Array, "n 3 d"]) -> Float[Array, "n 3 d"]:
 
 
 def _place(shape: tuple[int, ...], triangulation: Triangulation, at: str | None) -> str:
-    """Return whether tensors of this shape belong to the cells (of a surface: the faces) or the vertices."""
+    """Return whether tensors of this shape belong to the vertices or to the cells (the faces of a surface)."""
     words = WORDS[triangulation.dimension]
     counts = {words.argument: len(triangulation.cells), "vertices": triangulation.n_vertices}
     if at not in (None, *counts):
@@ -78,7 +78,7 @@ def _place(shape: tuple[int, ...], triangulation: Triangulation, at: str | None)
     if fitting:
         raise ValueError(
             f"at: the mesh has as many {words.argument} as vertices, {shape[0]}, and tensors of shape {shape} may "
-            f'belong to either; say which by at="{words.argument}" or at="vertices"'
+            f'belong to either; pass at="{words.argument}" or at="vertices"'
         )
     one = {words.argument: words.one, "vertices": "vertex"}
     expected = [f"({n}, 3, 3), one per {one[place]}" for place, n in counts.items() if at in (None, place)]
@@ -91,14 +91,14 @@ def _check(
     triangulation: Triangulation,
     at_vertices: bool,
 ) -> None:
-    """Raise ValueError unless the tensors are finite, symmetric, and positive definite on the cells that take them."""
+    """Raise ValueError unless the tensors are finite, symmetric, and positive definite on the cells that use them."""
     words = WORDS[triangulation.dimension]
     everywhere = triangulation.used if at_vertices else np.ones(len(tensors), dtype=bool)
     place = "vertex" if at_vertices else words.one
     if triangulation.dimension == 3:
         return require_spd("tensors", tensors, everywhere, place)
     require_finite_symmetric("tensors", tensors, everywhere, place)
-    # An orthonormal frame: positive definite or not, and by how much, must not depend on the triangle's shape.
+    # In orthonormal frames, the eigenvalues do not depend on the shape of the triangle.
     frames = np.linalg.qr(edges.astype(np.float64))[0]
     owners = triangulation.cells if at_vertices else np.arange(len(tensors))[:, None]
     parts = np.einsum("nxa,nixy,nyb->niab", frames, tensors[owners], frames)
@@ -110,5 +110,5 @@ def _check(
             f"tensors: {which.size} of {len(tensors)} tensors are not positive definite on "
             f"{'the faces around them' if at_vertices else 'their face'} (the first at {place} {which[0]}), "
             f"worst eigenvalue {least[bad].min():.3g}; expected tensors whose tangential part is "
-            "symmetric positive definite. Raise their eigenvalues, or check that they are in the axes of the vertices"
+            "symmetric positive definite. Raise their eigenvalues, or check that their axes are those of the vertices"
         )

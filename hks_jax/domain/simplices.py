@@ -1,4 +1,4 @@
-"""Triangles and tetrahedra in space as arrays: their checks, and which of them are degenerate."""
+"""Checks of triangles and tetrahedra in space, which are given as arrays."""
 
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -11,13 +11,13 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
-"""The area (volume) of a simplex, relative to that of the cube over its longest edge, up to which it has none."""
+"""A simplex is degenerate up to this area (volume), relative to the square (cube) over its longest edge."""
 _ON_EDGE = 1e-6
-"""Distance of a vertex from an edge, relative to the edge's length, up to which it lies on it."""
+"""A vertex is on an edge up to this distance from the edge, relative to the edge's length."""
 
 
 class Words(NamedTuple):
-    """What simplices of a dimension are called in messages."""
+    """The words for simplices of one dimension in messages."""
 
     argument: str
     letter: str
@@ -34,9 +34,9 @@ WORDS = {
 
 
 def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> Int[np.ndarray, "n corners"]:
-    """Return the vertex indices of simplices; raise ValueError unless they have that shape.
+    """Return the vertex indices of simplices; raise ValueError unless they are integers (n, d + 1) in range.
 
-    Without a mask every vertex must be used.
+    Without a mask every vertex must belong to a simplex.
     """
     words, indices = WORDS[dimension], np.asarray(cells)
     if indices.ndim != 2 or indices.shape[1] != dimension + 1 or not np.issubdtype(indices.dtype, np.integer):
@@ -47,15 +47,14 @@ def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> 
     if indices.size == 0 or indices.min() < 0 or indices.max() >= n_vertices:
         span = f"{indices.min()} … {indices.max()}" if indices.size else f"no {words.argument}"
         raise ValueError(
-            f"{words.argument}: got vertex indices {span}; expected 0 … {n_vertices - 1}, as there are {n_vertices} "
-            "vertices"
+            f"{words.argument}: got vertex indices {span}; expected 0 … {n_vertices - 1} for {n_vertices} vertices"
         )
     used = np.zeros(n_vertices, dtype=bool)
     used[indices] = True
     if not (used.all() or masked):
         raise ValueError(
             f"vertices: {int((~used).sum())} of {n_vertices} belong to no {words.one} (the first is vertex "
-            f"{int(np.argmin(used))}); remove them, or leave them out by a mask"
+            f"{int(np.argmin(used))}); remove them, or exclude them by a mask"
         )
     return indices
 
@@ -63,10 +62,10 @@ def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> 
 def checked_mask(
     mask: Any, cells: Int[np.ndarray, "n corners"], n_vertices: int, dimension: int
 ) -> Bool[np.ndarray, " n"]:
-    """Return which simplices are inside a mask, of themselves or of the vertices: those all of whose vertices are.
+    """Return the simplices inside a mask of simplices, or the simplices with all vertices inside a mask of vertices.
 
     Raises:
-        ValueError: another shape, other values than 0 and 1, a shape that could be either; a mask that leaves none.
+        ValueError: another shape; values other than 0 and 1; a mask that may be either; a mask without a simplex.
     """
     words, inside = WORDS[dimension], np.asarray(mask)
     if inside.shape not in ((n_vertices,), (len(cells),)):
@@ -80,8 +79,8 @@ def checked_mask(
     kept = inside[cells].all(axis=1) if len(inside) == n_vertices else inside
     if len(inside) == len(cells) and (kept != inside).any():
         raise ValueError(
-            f"mask: there are as many {words.argument} as vertices, {n_vertices}, and it may belong to either; for one "
-            f"of {words.argument} pass {words.argument}[mask], and for the mask True for each vertex"
+            f"mask: got {n_vertices} values, but there are as many {words.argument} as vertices, and it may belong to "
+            f"either; to mask {words.argument}, pass {words.argument}[mask] and a mask that is True for each vertex"
         )
     if not kept.any():
         raise ValueError(f"mask: {int(inside.sum())} of {inside.size} are inside, but no {words.simplex} is")
@@ -91,10 +90,10 @@ def checked_mask(
 def signed_measure(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n corners"]
 ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return d! times the area or signed volume of each simplex, and whether it has one beyond rounding."""
+    """Return d! times the area or signed volume of each simplex, and whether it is nonzero beyond rounding."""
     corners = vertices[cells]
     edges = corners[:, 1:] - corners[:, :1]
-    with np.errstate(over="ignore", invalid="ignore"):  # of vertices so far away that no area is a number
+    with np.errstate(over="ignore", invalid="ignore"):  # areas of distant vertices may overflow
         normal = np.cross(edges[:, 0], edges[:, 1])
         measure = np.linalg.norm(normal, axis=1) if len(edges[0]) == 2 else np.sum(normal * edges[:, 2], axis=1)
         pairs = combinations(range(cells.shape[1]), 2)
@@ -105,13 +104,13 @@ def signed_measure(
 def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
     """Raise ValueError for vertices that are not finite, and for degenerate, inverted or overlapping simplices.
 
-    Of triangles two with the same vertices overlap. Warn of surfaces with three triangles at one edge, or with an edge
-    that passes through a vertex.
+    Two triangles overlap if they have the same vertices. Warn if three triangles of a surface share an edge, or if an
+    edge of a surface passes through a vertex.
     """
     infinite = triangulation.used & ~np.isfinite(vertices).all(axis=1)
     if infinite.any():
         raise ValueError(
-            f"vertices: {int(infinite.sum())} are NaN or infinite (the first is vertex {int(np.argmax(infinite))}); "
+            f"vertices: {int(infinite.sum())} of them are NaN or infinite (the first is {int(np.argmax(infinite))}); "
             "remove them"
         )
     words, cells = WORDS[triangulation.dimension], triangulation.cells
@@ -127,8 +126,8 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
         if crowded.size:
             edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
             warn_of_accuracy(
-                f"faces: {crowded.size} edges belong to three triangles or more (the first is of vertices {edge}): "
-                "the surface branches there, and heat goes into all branches. If it should not, remove inner sheets"
+                f"faces: {crowded.size} edges belong to three triangles or more (the first has the vertices {edge}): "
+                "the surface branches there, and heat flows into all branches. To avoid that, remove inner sheets"
             )
         _warn_of_hanging(vertices, triangulation)
         return
@@ -136,21 +135,21 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
     if inverted.any():
         raise ValueError(
             f"cells: {int(inverted.sum())} of {len(cells)} tetrahedra are inverted (the first is cell "
-            f"{int(np.argmax(inverted))}): seen from v₃, v₀ v₁ v₂ should go round counterclockwise, so that "
-            "(v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0. Move the vertices of a folded mesh apart; if only the order is the "
-            "other one, swap two vertices: cells[inverted] = cells[inverted][:, [1, 0, 2, 3]]"
+            f"{int(np.argmax(inverted))}): seen from v₃, the order v₀ v₁ v₂ should be counterclockwise, so that "
+            "(v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0. If the mesh is folded, move its vertices apart; if the order is "
+            "wrong, swap two vertices: cells[inverted] = cells[inverted][:, [1, 0, 2, 3]]"
         )
     overlaps = triangulation.overlaps
     if len(overlaps):
         a, b = overlaps[0]
         raise ValueError(
             f"cells: {len(overlaps)} pairs of tetrahedra overlap, as they lie on one side of a common triangle (the "
-            f"first are cells {a} and {b}); remove duplicates, and move the vertices of a folded mesh apart"
+            f"first pair is cells {a} and {b}); remove duplicates, or move the vertices of a folded mesh apart"
         )
 
 
 def check_metric(metric: Float[np.ndarray, "n d d"], vertices: Float[np.ndarray, "V 3"], cells: np.ndarray) -> None:
-    """Raise ValueError where the metric of space on a simplex is NaN: its height is lost in rounding."""
+    """Raise ValueError if the metric of space on a simplex is NaN, because its height is lost to rounding."""
     thin = np.isnan(metric).any(axis=(1, 2))
     if not thin.any():
         return
@@ -159,14 +158,15 @@ def check_metric(metric: Float[np.ndarray, "n d d"], vertices: Float[np.ndarray,
     longest = max(np.linalg.norm(a - b) for a, b in combinations(corners, 2))
     height = np.abs(signed_measure(vertices, cells[first : first + 1])[0][0]) / longest ** (cells.shape[1] - 1)
     raise ValueError(
-        f"{words.argument}: {int(thin.sum())} of {len(cells)} {words.simplices} are so thin that {metric.dtype} knows "
-        f"no metric of them (the first is {words.one} {first}, vertices {cells[first].tolist()}, {height:.1e} high "
-        "where its longest edge is 1); merge or move their vertices" + ", or use float64" * (metric.dtype != np.float64)
+        f"{words.argument}: {int(thin.sum())} of {len(cells)} {words.simplices} are so thin that their metric is lost "
+        f"to rounding in {metric.dtype} (the first is {words.one} {first}, vertices {cells[first].tolist()}, with a "
+        f"height of {height:.1e} if its longest edge is 1); merge or move their vertices"
+        f"{', or use float64' * (metric.dtype != np.float64)}"
     )
 
 
 def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
-    """Raise ValueError for triangles that are there twice, in whatever order of their vertices."""
+    """Raise ValueError if two triangles have the same vertices, in any order."""
     vertices = np.sort(faces, axis=1)
     order = np.lexsort(vertices.T[::-1])
     again = np.flatnonzero((vertices[order[1:]] == vertices[order[:-1]]).all(axis=1))
@@ -174,12 +174,12 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
         a, b = sorted(order[again[0] : again[0] + 2].tolist())
         raise ValueError(
             f"faces: {again.size} of {len(faces)} triangles are there twice (the first are faces {a} and {b}, with the "
-            f"vertices {faces[a].tolist()}), and would count twice; remove the copies"
+            f"vertices {faces[a].tolist()}), and would count twice; remove the duplicates"
         )
 
 
 def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Warn of edges on the boundary that pass through a vertex: a crack, where one side has more vertices."""
+    """Warn of boundary edges that pass through a vertex: the surface is torn where one side has more vertices."""
     edges = triangulation.facet_vertices(triangulation.boundary_facets)
     rim = np.unique(edges)
     if not rim.size:
@@ -200,5 +200,5 @@ def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangul
         warn_of_accuracy(
             f"faces: {np.unique(vertex[hanging]).size} vertices lie on edges that they do not belong to (the first is "
             f"vertex {vertex[first]}, on the edge of the vertices {edges[which[first]].tolist()}): the surface is torn "
-            "there, and no heat goes across. Split the triangle at that edge, so that both sides have the same vertices"
+            "there, and no heat flows across. Split the triangle at that edge, so that both sides share their vertices"
         )

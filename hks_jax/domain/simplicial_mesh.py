@@ -1,4 +1,4 @@
-"""Meshes in space with a metric on each simplex: surfaces of triangles, and solids cut into tetrahedra."""
+"""Meshes in space with a metric on each simplex: surfaces of triangles, and solids of tetrahedra."""
 
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -20,7 +20,7 @@ Mesh = TypeVar("Mesh", bound="SimplicialMesh")
 
 
 class SimplicialMesh(eqx.Module):
-    """A mesh of triangles (`SurfaceMesh`) or tetrahedra (`TetMesh`) in space, with a constant metric on each."""
+    """A mesh of triangles (`SurfaceMesh`) or tetrahedra (`TetMesh`) in space, with a constant metric on each cell."""
 
     vertices: Float[Array, "V 3"]
     triangulation: Triangulation = eqx.field(static=True)
@@ -55,36 +55,35 @@ class SimplicialMesh(eqx.Module):
         interpolation: Interpolation = "linear",
         mask: Any = None,
     ) -> Mesh:
-        """Return the mesh with the metric of tensors D in the axes of space; on a surface, of their tangential part.
+        """Return the mesh with the metric of tensors D in the axes of space; a surface takes their tangential part.
 
-        The tangential part of D is D as a quadratic form on the vectors of a triangle's plane: for diffusion tensors,
-        diffusion that stays in the surface, with the diffusivities that were measured in it. What metric g it, or D,
-        stands for has no default (see `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹;
-        ``"adjugate"``, g = |D| D⁻¹, on a surface with inverse and determinant in the plane. With D the identity all
-        three are the metric of space.
+        The tangential part is D as a quadratic form on the plane of a triangle. For diffusion tensors it describes
+        diffusion within the surface, with the diffusivities that were measured in it. The choice of the metric g has no
+        default (see `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``,
+        g = |D| D⁻¹. On a surface D stands for its tangential part. If D is the identity, g is the metric of space.
 
-        Of tensors at the vertices a cell takes the mean of those of its own, or with ``"log-euclidean"`` that of their
-        logarithms, as either interpolation does at its centre: an error of second order, as that of the elements.
-        Differentiable with respect to tensors and vertices.
+        With tensors at the vertices, a cell takes the mean of the tensors at its vertices, or with ``"log-euclidean"``
+        the exponential of the mean of their logarithms. This is the interpolant at the centre, with an error of second
+        order like that of the elements. The metric is differentiable with respect to tensors and vertices.
 
         Args:
             vertices: positions (V, 3).
             cells: vertex indices of the triangles (F, 3) or tetrahedra (C, 4).
-            tensors: one for each cell, (F, 3, 3) or (C, 3, 3), or for each vertex, (V, 3, 3); symmetric, and positive
-                definite on the planes of the triangles that they act on, or in space.
+            tensors: one symmetric tensor per cell, (F, 3, 3) or (C, 3, 3), or per vertex, (V, 3, 3). They must be
+                positive definite in space, or on a surface in the planes of its triangles.
             metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
             at: whether the tensors belong to ``"faces"`` (of a surface), ``"cells"`` (of a solid) or ``"vertices"``;
-                None: their number tells, unless there are as many of one as of the other.
-            interpolation: ``"linear"`` or ``"log-euclidean"``, see `TensorField`; for tensors at vertices.
+                needed only if there are as many cells as vertices.
+            interpolation: ``"linear"`` or ``"log-euclidean"``, for tensors at vertices; see `TensorField`.
             mask: the domain, see the class; tensors outside are ignored.
 
         Raises:
-            ValueError: a metric or interpolation that is none of these; wrong shapes; tensors that are NaN or infinite,
-                unsymmetric or not positive definite (with how many, and where the first is); what the class raises.
+            ValueError: an unknown metric or interpolation; wrong shapes; tensors that are NaN, infinite, unsymmetric or
+                not positive definite (with their number and the first place); the errors of the class.
         """
         mesh = cls(vertices, cells, mask=mask)
         of_cells = metric_of_tensors(mesh._edges, mesh.triangulation, mesh.restrict(tensors), metric, at, interpolation)
-        given = _checked_metric(of_cells, mesh.triangulation)  # such as an inverse that overflows
+        given = _checked_metric(of_cells, mesh.triangulation)  # an inverse may overflow
         return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 
     def __repr__(self) -> str:
@@ -93,7 +92,7 @@ class SimplicialMesh(eqx.Module):
         return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"
 
     def restrict(self, of_cells: Any) -> Any:
-        """Return what belongs to the cells inside the mask, of an array (n, …) over all cells that were given."""
+        """Return the entries for cells inside the mask, of an array (n, …) with an entry for every given cell."""
         if self._mask is None or np.shape(of_cells)[:1] != self._mask.value.shape:
             return of_cells
         return (np.asarray(of_cells) if isinstance(of_cells, list | tuple) else of_cells)[self._mask.value]
@@ -112,7 +111,7 @@ class SimplicialMesh(eqx.Module):
         return self._oriented(jnp.swapaxes(corners[:, 1:] - corners[:, :1], -1, -2))
 
     def _oriented(self, frames: Float[Array, "*n 3 d"]) -> Float[Array, "*n 3 d"]:
-        """Return frames ∂x/∂ξ of cells; NaN in place of those that turn tetrahedra inside out."""
+        """Return the frames ∂x/∂ξ of cells, with NaN in place of those of inverted tetrahedra."""
         if self.triangulation.dimension == 2:
             return frames
         positive = jnp.linalg.det(frames) > 0
@@ -120,22 +119,22 @@ class SimplicialMesh(eqx.Module):
 
 
 class SurfaceMesh(SimplicialMesh):
-    """A triangle mesh in space, with the metric that space induces on it, or another.
+    """A triangle mesh in space, with the metric that space induces on it, or with a given metric.
 
-    A pytree: the vertex positions and the given metric, if any, are its leaves, the connectivity is structure.
+    It is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
     Args:
         vertices: positions (V, 3).
         faces: vertex indices (F, 3).
         metric: (F, 2, 2), the metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀, in place of the
-            induced one.
-        mask: the domain, bool, True inside: of the triangles (F,), or of the vertices (V,), where it consists of
-            the triangles all of whose vertices are inside. What lies outside may be degenerate or NaN. The rim of the
-            mask belongs to the boundary, results are NaN at vertices outside, and ``faces`` are those inside.
+            induced metric.
+        mask: the domain as bool, True inside: (F,) for the triangles, or (V,) for the vertices, where a triangle is
+            inside if all of its vertices are. Triangles outside may be degenerate or NaN. The rim of the mask belongs
+            to the boundary, results are NaN at vertices outside, and ``faces`` has the triangles inside.
 
     Raises:
-        ValueError: wrong shapes, a mask that leaves nothing, indices out of range, vertices without a face, triangles
-            without area, NaN, a metric that is not positive definite.
+        ValueError: wrong shapes; a mask without triangles; indices out of range; vertices without a face; triangles
+            without area; NaN; a metric that is not positive definite.
     """
 
     _dimension = 2
@@ -150,26 +149,26 @@ class SurfaceMesh(SimplicialMesh):
 
 
 class TetMesh(SimplicialMesh):
-    """A mesh of tetrahedra, with the metric of space, or another that is constant on each of them.
+    """A mesh of tetrahedra, with the metric of space, or with a given metric that is constant on each tetrahedron.
 
-    A pytree: the vertex positions and the given metric, if any, are its leaves, the connectivity is structure.
+    It is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
-    Tetrahedra are positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as VTK and Gmsh have them: so one that a
-    moved vertex has turned inside out is noticed. Under `jit`, where it cannot be refused, it gives NaN.
+    Tetrahedra must be positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as in VTK and Gmsh. So an inverted
+    tetrahedron is an error, for example after moving a vertex. Under `jit` it gives NaN instead.
 
     Args:
         vertices: positions (V, 3).
         cells: vertex indices (C, 4).
         metric: (C, 3, 3), the metric of each tetrahedron in the basis of its edges v₁ − v₀, v₂ − v₀ and v₃ − v₀, in
-            place of that of space. For tensors in the axes of space see `from_tensors`.
-        mask: the domain, bool, True inside: of the tetrahedra (C,), or of the vertices (V,), where it consists of
-            the tetrahedra all of whose vertices are inside. What lies outside may be degenerate or NaN. The rim of the
-            mask belongs to the boundary, results are NaN at vertices outside, and ``cells`` are those inside.
+            place of the metric of space. For tensors in the axes of space see `from_tensors`.
+        mask: the domain as bool, True inside: (C,) for the tetrahedra, or (V,) for the vertices, where a tetrahedron is
+            inside if all of its vertices are. Tetrahedra outside may be degenerate or NaN. The rim of the mask belongs
+            to the boundary, results are NaN at vertices outside, and ``cells`` has the tetrahedra inside.
 
     Raises:
-        ValueError: wrong shapes, a mask that leaves nothing, indices out of range, vertices without a cell, NaN, a
+        ValueError: wrong shapes; a mask without tetrahedra; indices out of range; vertices without a cell; NaN; a
             metric that is not positive definite; tetrahedra that have no volume, are inverted, or overlap across a
-            common triangle (with how many, and which is the first).
+            common triangle (with their number and the first one).
     """
 
     _dimension = 3
@@ -183,10 +182,10 @@ class TetMesh(SimplicialMesh):
         return self.triangulation.cells
 
     def boundary(self) -> tuple[SurfaceMesh, Int[np.ndarray, " B"]]:
-        """Return the triangles that belong to one tetrahedron only, with the metric of space, oriented outward.
+        """Return the surface of the triangles that belong to one tetrahedron only, with the metric of space.
 
         Returns:
-            The surface, and for each of its B vertices the number that it has in this mesh: values (…, V) on the
+            The surface, oriented outward, and the number in this mesh of each of its B vertices: values (…, V) on the
             boundary are ``values[..., numbers]``.
         """
         triangulation = self.triangulation

@@ -63,7 +63,7 @@ def inverse(tensors: Any) -> Any:
 
 
 def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the lower triangular L of T = LLᵀ; NaN for what is not positive definite."""
+    """Return the lower triangular L with T = LLᵀ; NaN for matrices that are not positive definite."""
     d, factor = tensors.shape[-1], jnp.zeros_like(tensors)
     for j in range(d):
         column = tensors[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
@@ -72,7 +72,7 @@ def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 
 
 def is_spd(tensors: np.ndarray) -> np.ndarray:
-    """Tell, by Sylvester's criterion, which matrices (..., d, d) are finite and positive definite (on the host)."""
+    """Mark the matrices (..., d, d) that are finite and positive definite (Sylvester's criterion, on the host)."""
     t = np.asarray(tensors, dtype=np.float64)
     finite = np.isfinite(t).all(axis=(-2, -1), keepdims=True)
     return _positive(np.where(finite, t, 0.0))
@@ -82,23 +82,23 @@ def _positive(t: Any) -> Any:
     return (t[..., 0, 0] > 0) & (determinant(t[..., :2, :2]) > 0) & (determinant(t) > 0)
 
 
-# A product and not a choice: the derivative at the tensor itself is NaN too.
+# Sylvester's criterion, as a product and not as `where(…)`, so that derivatives are NaN too.
 @jax.jit
 def positive_or_nan(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the matrices, d = 2 or 3, NaN in place of those that are not positive definite (Sylvester's criterion)."""
+    """Return the matrices, d = 2 or 3, with NaN in place of those that are not positive definite."""
     return tensors * jnp.where(_positive(tensors), 1, jnp.nan).astype(tensors.dtype)[..., None, None]
 
 
 @jax.jit
 def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the exponential of symmetric matrices, d = 2 or 3."""
-    return jax.checkpoint(_exp)(tensors)  # reverse mode keeps the matrices, and not a hundred numbers for each of them
+    return jax.checkpoint(_exp)(tensors)  # so that reverse mode stores the matrices, not a hundred numbers for each
 
 
-# With the trace taken off, Cayley and Hamilton say S² = qI (d = 2) or S³ = pS + |S| I (d = 3), so that exp S is a
-# polynomial in S of degree d − 1 whose coefficients are entire functions of q, or of p and |S|: no eigenvalue is
-# needed, and where eigenvalues meet nothing happens to derivatives of any order. The coefficients come from Taylor's
-# series at S/2ˢ, then s squarings; squared is E = exp − I, by 2E + E², which keeps the relative accuracy of E.
+# If tr S = 0, the Cayley–Hamilton theorem gives S² = qI (d = 2) or S³ = pS + |S| I (d = 3). So exp S is a
+# polynomial in S of degree d − 1, whose coefficients are entire functions of q, or of p and |S|. No eigenvalues are
+# needed, and derivatives of any order are smooth where eigenvalues coincide. The coefficients are those of Taylor's
+# series at S/2ˢ, followed by s squarings of E = exp − I as 2E + E², which preserves the relative accuracy of E.
 _SQUARINGS, _TERMS = 8, 20
 
 
@@ -146,13 +146,13 @@ def _exp_in_3d(deviator: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Arr
 
 @jax.jit
 def log(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the logarithm of symmetric positive definite matrices, d = 2 or 3; NaN for others."""
+    """Return the logarithm of symmetric positive definite matrices, d = 2 or 3; NaN for other matrices."""
     symmetric = symmetrise(tensors)
     return _log_in_2d(symmetric) if tensors.shape[-1] == 2 else _log_by_eigenvalues(symmetric)
 
 
-# T = mI + S, tr S = 0, S² = qI, has the eigenvalues m ± √q, so that log T = ½ log|T| I + atanh(√q/m)/√q S, and
-# atanh(x)/x is a smooth function of x² = q/m².
+# Let T = mI + S with tr S = 0 and S² = qI. Its eigenvalues are m ± √q, so that log T = ½ log|T| I + atanh(√q/m)/√q S,
+# and atanh(x)/x is a smooth function of x² = q/m².
 def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
     eye = jnp.broadcast_to(jnp.eye(2, dtype=tensors.dtype), tensors.shape)
     mean = jnp.trace(tensors, axis1=-2, axis2=-1) / 2
@@ -165,7 +165,7 @@ def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
     for n in range(12, -1, -1):
         series = series * jnp.where(small, square, 0) + 1 / (2 * n + 1)
     root = jnp.sqrt(jnp.where(small, 0.04, square))
-    # atanh x = log(1 + x) − ½ log(1 − x²), and 1 − x² is the scaled determinant, which is accurate also near zero.
+    # atanh x = log(1 + x) − ½ log(1 − x²), and 1 − x² is the scaled determinant, which is accurate near zero, too.
     factor = jnp.where(small, series, (jnp.log1p(root) - half) / root)
     return (jnp.log(mean) + half)[..., None, None] * eye + factor[..., None, None] * deviator
 
@@ -176,8 +176,8 @@ def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d
     return _log_of_pairs(values, vectors)
 
 
-# d f(T) = V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences of f (Daleckii and Krein 1965), which are smooth where
-# eigenvalues meet; the derivatives of the eigenvectors are not.
+# The derivative of f(T) is V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences [f] of f (Daleckii and Krein 1965). They
+# are smooth where eigenvalues coincide, whereas the derivatives of eigenvectors are not.
 @_log_by_eigenvalues.defjvp
 def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     values, vectors = eigh(primals[0])

@@ -1,4 +1,4 @@
-"""Checks of tensors and deformation gradients, what to do with tensors that are not positive, and the messages."""
+"""Checks of tensors and deformation gradients with their messages, and maps from indefinite tensors to metrics."""
 
 import math
 from typing import Any, Literal, NoReturn, get_args
@@ -16,11 +16,11 @@ MetricChoice = Literal["tensor", "inverse", "adjugate"]
 Interpolation = Literal["linear", "log-euclidean"]
 
 MANY = 0.05
-"""The part of invalid tensors from which on they are no exceptions: noise at a mask's rim is fewer."""
+"""The largest fraction of invalid tensors for which noise at the rim of a mask is a plausible cause."""
 
 
 def check_metric_choice(metric: str | None) -> None:
-    """Raise ValueError unless it names what metric diffusion tensors stand for."""
+    """Raise ValueError unless ``metric`` names one of the metrics that diffusion tensors can define."""
     if metric not in ("tensor", "inverse", "adjugate"):
         raise ValueError(
             f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, the distances of diffusion), '
@@ -38,7 +38,7 @@ def checked_interpolation(interpolation: Any) -> Interpolation:
 def checked_tensors(
     name: str, tensors: Any, inside: Bool[np.ndarray, "*shape"], d: int, expected: str, place: str = "node"
 ) -> Float[Array, "*shape d d"]:
-    """Return tensors (*inside.shape, d, d) as floating point; raise ValueError unless they are SPD inside."""
+    """Return tensors (*inside.shape, d, d) as floating-point numbers; raise ValueError unless they are SPD inside."""
     array = real_array(name, tensors)
     if array.shape != (*inside.shape, d, d):
         raise ValueError(f"{name}: got shape {array.shape}; expected {expected}")
@@ -52,7 +52,7 @@ def require_spd(
 ) -> None:
     """Raise ValueError unless the tensors are finite, symmetric and positive definite inside.
 
-    The place is what they belong to: ``"node"`` (of a grid, which may have a mask), ``"vertex"``, …
+    The place is the word for the location of a tensor: ``"node"`` for grids, which may have a mask, ``"vertex"``, …
     """
     require_finite_symmetric(name, tensors, inside, place)
     bad = inside & ~spd.is_spd(tensors)
@@ -61,8 +61,8 @@ def require_spd(
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
         if bad.sum() > MANY * inside.sum():
             of_grids = (
-                "So many are no noise: tensors that are indefinite by nature, such as stress, become a metric by "
-                f"hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside"
+                "So many cannot be noise. If the tensors are indefinite by nature, such as stress, make a metric by "
+                f"hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
 
@@ -90,14 +90,14 @@ def unsymmetric(tensors: Float[np.ndarray, "*shape d d"]) -> Bool[np.ndarray, "*
 
 
 def least_eigenvalue(tensors: Float[np.ndarray, "n d d"]) -> float:
-    """Return the least eigenvalue of some finite tensors, of their lower halves."""
+    """Return the least eigenvalue of finite tensors, whose lower triangles are read."""
     return float(np.linalg.eigvalsh(tensors.astype(np.float64)).min())
 
 
 def refuse(
     name: str, bad: Bool[np.ndarray, "*shape"], inside: Bool[np.ndarray, "*shape"], place: str, what: str, remedy: str
 ) -> NoReturn:
-    """Raise ValueError about some tensors: how many, where the first is, what is wrong, and what to do about it."""
+    """Raise ValueError about invalid tensors, with their number, the first place, the defect and the remedy."""
     first = tuple(int(i) for i in np.argwhere(bad)[0])
     raise ValueError(
         f"{name}: {int(bad.sum())} of {int(inside.sum())} tensors are {what} (the first at {place} {first}); "
@@ -122,15 +122,15 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
-        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # others are refused with the metric
+        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # the check of the metric finds others
         determinants = np.linalg.det(np.where(finite[..., None, None], known, np.eye(d)))
         bad = finite & (determinants <= 0)
         if bad.any():
             first = tuple(int(i) for i in np.argwhere(bad)[0])
             raise ValueError(
                 f"{name}: {int(bad.sum())} of {int(grid.inside.sum())} gradients have a determinant that is not "
-                f"positive (the first at node {first}, {determinants[first]:.3g}); expected deformations that turn "
-                f"nothing inside out. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
+                f"positive (the first at node {first}, {determinants[first]:.3g}); expected deformations that preserve "
+                f"orientation. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
             )
     inside = grid.inside[..., None, None]
     safe = jnp.where(inside, gradients, jnp.eye(m, d, dtype=gradients.dtype))
@@ -140,13 +140,13 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
 PositiveMap = Literal["exp", "shift"]
 
 MAPS: dict[str, str] = {
-    "exp": "exp(S/s), s a stress of your choice",
-    "shift": "S + c·I, c above minus the least eigenvalue",
+    "exp": "exp(S/s) with a stress s of your choice",
+    "shift": "S + c·I with c above minus the least eigenvalue",
 }
-"""The choices, for messages."""
+"""The maps, with their descriptions in messages."""
 
 NUMBERS = {"exp": "scale", "shift": "shift"}
-"""What the number of each map is called."""
+"""The name of the number of each map."""
 
 
 def checked_map(how: Any) -> PositiveMap:
@@ -158,7 +158,7 @@ def checked_map(how: Any) -> PositiveMap:
 
 
 def check_number(name: str, how: PositiveMap, number: Any) -> None:
-    """Raise ValueError unless it is a positive scale, or a finite shift; traced ones pass."""
+    """Raise ValueError unless the number is a positive scale or a finite shift; traced numbers pass."""
     if number is None:
         raise ValueError(f"number: got None; expected the {NUMBERS[how]} of the map {how!r}, in the units of {name}")
     require_number("number", number, above=0.0 if how == "exp" else -math.inf)
@@ -169,7 +169,7 @@ def check_shift(name: str, tensors: Float[np.ndarray, "n d d"], how: PositiveMap
     least = least_eigenvalue(tensors)
     if how == "shift" and not float(number) + least > 0:
         raise ValueError(
-            f"number: got the shift {float(number):g} of {name} whose least eigenvalue is {least:g}; expected more "
+            f"number: got the shift {float(number):g} of {name}, whose least eigenvalue is {least:g}; expected more "
             f"than {-least:g}, so that S + c·I is positive definite"
         )
 
@@ -177,11 +177,11 @@ def check_shift(name: str, tensors: Float[np.ndarray, "n d d"], how: PositiveMap
 def check_mapped(
     tensors: Float[np.ndarray, "n d d"], mapped: Float[np.ndarray, "n d d"], how: PositiveMap, number: Any
 ) -> None:
-    """Raise ValueError where the metric that a map gave is singular in its precision."""
+    """Raise ValueError if a mapped tensor is singular in its precision."""
     if not spd.is_spd(mapped).all():
         values = np.linalg.eigvalsh(tensors.astype(np.float64))
         raise ValueError(
-            f"number: got the {NUMBERS[how]} {float(number):g} of tensors whose eigenvalues go from {values.min():.4g} "
+            f"number: got the {NUMBERS[how]} {float(number):g} of tensors with eigenvalues from {values.min():.4g} "
             f"to {values.max():.4g}: the metric is singular in {mapped.dtype}; expected a larger number"
         )
 
@@ -189,10 +189,10 @@ def check_mapped(
 def positive_map(
     name: str, tensors: Float[Array, "*shape d d"], how: PositiveMap, number: Any, inside: Bool[np.ndarray, "*shape"]
 ) -> Float[Array, "*shape d d"]:
-    """Return exp(S/s) or S + c·I of symmetric tensors S at the nodes of a grid; the identity outside.
+    """Return exp(S/s) or S + c·I of symmetric tensors S at the nodes of a grid; outside, S is the identity.
 
     Raises:
-        ValueError: NaN, infinite or unsymmetric tensors; a number that leaves some of them not positive definite.
+        ValueError: NaN, infinite or unsymmetric tensors; a number for which a mapped tensor is not positive definite.
     """
     check_number(name, how, number)
     known = not is_traced((tensors, number))

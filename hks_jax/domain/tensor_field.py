@@ -30,22 +30,21 @@ from hks_jax.domain.tensor_checks import (
 class TensorField(eqx.Module):
     """A Riemannian metric given at the nodes of a grid.
 
-    A pytree: the tensors (or the arrays inside the metric's function) are its leaves, the grid is structure.
-    Values are checked where they are known; under `jit`, `grad` or `vmap` only shapes are, and a tensor that is not
-    positive definite gives NaN.
+    It is a pytree: its leaves are the tensors, or the arrays in the metric's function. The grid is static. Under `jit`,
+    `grad` or `vmap` only shapes are checked, not values, and a tensor that is not positive definite gives NaN.
 
     Args:
         grid: the grid.
         tensors: (*shape, d, d), symmetric positive definite inside the mask; ``tensors[i, j, 0, 1]`` is T₁₂ at node
             (i, j). Units: (length / coordinate unit)². Values outside the mask are ignored.
-        interpolation: what lies between the nodes. ``"linear"``: the components are multilinear, as in Zobel,
-            Reininghaus and Hotz; between tensors that turn from node to node this has a larger determinant than either.
-            ``"log-euclidean"``: the components of the logarithm are multilinear (Arsigny, Fillard, Pennec and Ayache),
-            so that the determinant's logarithm is, and T⁻¹ is interpolated as T is.
+        interpolation: the interpolation between the nodes. With ``"linear"`` the components are multilinear, as in
+            Zobel, Reininghaus and Hotz; if tensors rotate from node to node, the determinant is larger in between. With
+            ``"log-euclidean"`` the components of the logarithm are multilinear (Arsigny, Fillard, Pennec and Ayache).
+            Then the logarithm of the determinant is multilinear, and T⁻¹ is interpolated in the same way as T.
 
     Raises:
-        ValueError: wrong shape; NaN or infinite, unsymmetric or not positive definite inside the mask (with how many
-            nodes fail, where the first is, and the worst eigenvalue); an unknown interpolation.
+        ValueError: a wrong shape; tensors that are NaN, infinite, unsymmetric or not positive definite inside the mask
+            (with their number, the first node and the worst eigenvalue); an unknown interpolation.
     """
 
     grid: Grid = eqx.field(static=True)
@@ -65,9 +64,9 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return the metric ``fn``, which maps coordinates (d,) to a tensor (d, d) and is differentiable by JAX.
 
-        The function stays with the field, so that curvature and its derivatives are exact; `assemble` evaluates it at
-        the nodes, and interpolates between them. Parameters that should be traced belong in a `jax.tree_util.Partial`
-        or an Equinox module.
+        The field keeps the function, so that curvature and its derivatives are exact; `assemble` evaluates it at the
+        nodes, and interpolates between them. Parameters that should be traced belong in a `jax.tree_util.Partial` or an
+        Equinox module.
         """
         function: Any = fn if isinstance(fn, jtu.Partial | eqx.Module) else jtu.Partial(fn)
         field = cls.__new__(cls)
@@ -90,20 +89,20 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return the metric of a field of diffusion tensors D (*shape, d, d).
 
-        There is no default for ``metric``, because the two meanings in use differ:
+        There is no default for ``metric``, because several conventions are in use:
 
-        - ``"inverse"``: g = D⁻¹, the metric whose distances diffusion with diffusivity D takes (t in units of time);
+        - ``"inverse"``: g = D⁻¹, whose distances are those of diffusion with diffusivity D (t in units of time);
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
         - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
 
-        What is interpolated between the nodes is g. With ``"log-euclidean"`` it makes no difference whether D or its
-        inverse is interpolated.
+        The metric g is interpolated between the nodes. With ``"log-euclidean"`` the result is the same as if D were
+        interpolated.
         """
         check_metric_choice(metric)
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
         if metric == "tensor":
             return cls(grid, tensors, interpolation)
-        # In three dimensions the adjugate of −D is that of D.
+        # This comes first, since in three dimensions −D and D have the same adjugate.
         tensors = spd.positive_or_nan(spd.identity_outside(tensors, grid.inside))
         return cls(grid, spd.inverse(tensors) if metric == "inverse" else spd.adjugate(tensors), interpolation)
 
@@ -113,21 +112,21 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
 
-        ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, y the place to which what is at x goes, or wants to go. Lengths are those after the
-        deformation. F enters by C alone: rotations, also such as vary from node to node, change nothing.
+        ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, where y is the position to which the point x moves, or would move without
+        constraints. Lengths are those after the deformation. Rotations after F do not change the metric.
 
-        Where F is the gradient of a map, the metric is flat, and the signature that of the deformed body. Of growth,
-        plastic and elastic strain the curvature of C is the incompatibility: residual strain. See docs/strain.md.
+        If F is the gradient of a map, the metric is flat, and the signature is that of the deformed body. For growth,
+        plastic or elastic strain, the curvature of C is the incompatibility, or residual strain. See docs/strain.md.
 
         Args:
-            grid: of the undeformed coordinates x.
-            F: (*shape, d, d), of positive determinant inside the mask; or (*shape, m, d), m > d, such as the Jacobian
-                of a surface in space. Values outside the mask are ignored.
-            interpolation: of C between the nodes, as for the tensors of a field.
-            name: of F in messages.
+            grid: the grid of the undeformed coordinates x.
+            F: (*shape, d, d) with positive determinants inside the mask; or (*shape, m, d) with m > d, such as the
+                Jacobian of a surface in space. Values outside the mask are ignored.
+            interpolation: the interpolation of C between the nodes, as for the tensors of a field.
+            name: the name of F in messages.
 
         Raises:
-            ValueError: wrong shape; NaN or infinite; a determinant that is not positive, or no full rank.
+            ValueError: a wrong shape; NaN or infinite values; a determinant that is not positive; a rank below d.
         """
         _require_grid(grid)
         C = right_cauchy_green(name, grid, F)
@@ -146,27 +145,28 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return a metric made of symmetric tensors S (*shape, d, d) with eigenvalues of either sign, such as stress.
 
-        They are no metric themselves, and there are several ways to one: there is no default. Both keep the
+        Such tensors are not a metric themselves. There are two maps to a metric, and no default. Both keep the
         eigenvectors and the order of the eigenvalues (Hotz and others 2004):
 
-        - ``"exp"``: g = exp(S/s); `number` is the scale s > 0, in the units of S. An eigenvalue σ becomes exp(σ/s). A
-          scale near the largest |σ| shows S well.
-        - ``"shift"``: g = S + c·I; `number` is the shift c, larger than minus the least eigenvalue. The signature
-          flattens as c grows; near its limit the direction of the strongest compression has almost no length.
+        - ``"exp"``: g = exp(S/s), where `number` is the scale s > 0 in the units of S. An eigenvalue σ becomes
+          exp(σ/s). A scale near the largest |σ| shows S well.
+        - ``"shift"``: g = S + c·I, where `number` is the shift c, larger than minus the least eigenvalue. The signature
+          flattens as c grows. Near the least possible c, lengths along the strongest compression are almost zero.
 
-        docs/strain.md says what their signatures show.
+        docs/strain.md describes their signatures.
 
         Args:
             grid: the grid.
             S: the tensors; values outside the mask are ignored.
             how: ``"exp"`` or ``"shift"``.
             number: the scale or the shift; may be traced.
-            interpolation: of g between the nodes. Of ``"exp"``, ``"log-euclidean"`` interpolates S linearly.
-            name: of S in messages.
+            interpolation: the interpolation of g between the nodes. With ``"exp"``, ``"log-euclidean"`` interpolates S
+                linearly.
+            name: the name of S in messages.
 
         Raises:
-            ValueError: no map or number, or an unknown map; wrong shape; NaN, infinite or unsymmetric tensors; a scale
-                or a shift that is so small that the metric is singular.
+            ValueError: a missing or unknown map; a missing number; a wrong shape; NaN, infinite or unsymmetric tensors;
+                a scale or shift so small that the metric is singular.
         """
         _require_grid(grid)
         chosen = checked_map(how)
@@ -190,13 +190,13 @@ class TensorField(eqx.Module):
 
     @property
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
-        """The tensors, with the identity outside the mask: what computations read; NaN where not positive definite."""
+        """The tensors for computations: the identity outside the mask, NaN if a tensor is not positive definite."""
         return spd.positive_or_nan(spd.identity_outside(self.tensors, self.grid.inside))
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
-    # Outside the mask the function may be singular, and 0·NaN would reach its parameters' derivatives: there it is
-    # evaluated at a node inside instead.
+    # Outside the mask the function may be singular, and 0·NaN would spoil derivatives with respect to its parameters.
+    # So it is evaluated at a node inside instead.
     inside = grid.inside
     nodes = jnp.asarray(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]))
     flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes.reshape(-1, grid.dimension)).astype(nodes.dtype)

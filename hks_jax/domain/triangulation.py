@@ -15,16 +15,16 @@ FACETS = {
     2: np.array([[1, 2], [2, 0], [0, 1]]),
     3: np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]),
 }
-"""By dimension, the corners of a simplex's facets: row i is the facet without corner i. Where the simplex is positively
-oriented, its facets are oriented outward."""
+"""The corners of a simplex's facets by dimension: row i is the facet opposite corner i. The facets of a positively
+oriented simplex are oriented outward."""
 
 
 @jax.tree_util.register_static
 class Triangulation(ByKey):
-    """The connectivity of a mesh of triangles or tetrahedra: static, hashable.
+    """The connectivity of a mesh of triangles or tetrahedra, static and hashable.
 
-    Facets, which are the edges of triangles and the triangles of tetrahedra, are numbered cell by cell: facet
-    (d + 1) c + i is the one of cell c without its corner i. One between two cells has two numbers.
+    Facets are the edges of triangles, or the triangles of tetrahedra. They are numbered cell by cell: facet
+    (d + 1) c + i is opposite corner i of cell c. A facet between two cells has two numbers.
     """
 
     def __init__(self, cells: Int[np.ndarray, "n corners"], n_vertices: int) -> None:
@@ -49,7 +49,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def _grouped_facets(self) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """All facets, those with the same vertices beside each other; which begin such a group; the parity of each."""
+        """All facets, grouped by their vertices; whether each is the first of its group; the parity of each facet."""
         vertices = self.facet_vertices(np.arange(self.cells.size))
         odd = np.zeros(len(vertices), dtype=bool)
         for a, b in combinations(range(self.dimension), 2):
@@ -62,15 +62,15 @@ class Triangulation(ByKey):
 
     @cached_property
     def boundary_facets(self) -> Int[np.ndarray, " m"]:
-        """The facets that belong to one cell only, ascending."""
+        """The facets that belong to one cell only, in ascending order."""
         order, begins, _ = self._grouped_facets
         return np.sort(order[begins & np.append(begins[1:], True)])
 
     @cached_property
     def overlaps(self) -> Int[np.ndarray, "m 2"]:
-        """Pairs of cells with a common facet of the same orientation: if both are positive, they are on one side of it.
+        """Pairs of cells with a common facet of the same orientation: positive cells lie on the same side of it.
 
-        Of three cells or more at one facet two are always on one side.
+        If three or more cells share a facet, two of them lie on the same side.
         """
         order, begins, odd = self._grouped_facets
         again = np.flatnonzero(~begins)
@@ -79,7 +79,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def crowded_facets(self) -> Int[np.ndarray, " m"]:
-        """A facet each of those that belong to three cells or more."""
+        """The facets that belong to three or more cells, with one number for each."""
         order, begins, _ = self._grouped_facets
         starts = np.flatnonzero(begins)
         return order[starts[np.diff(np.append(starts, order.size)) > 2]]
@@ -93,7 +93,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def _edges(self) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "n m"]]:
-        """The edges, and for each cell the numbers of its own, in the order of ``combinations``."""
+        """The edges, and the numbers of each cell's edges in the order of ``combinations``."""
         pairs = list(combinations(range(self.dimension + 1), 2))
         ends = np.sort(self.cells[:, pairs], axis=-1)
         keys, numbers = np.unique(ends[..., 0] * self.n_vertices + ends[..., 1], return_inverse=True)
@@ -101,12 +101,12 @@ class Triangulation(ByKey):
 
     @property
     def edges(self) -> Int[np.ndarray, "E 2"]:
-        """The ends of each edge, the smaller number first; in ascending order."""
+        """The two vertices of each edge, the smaller number first; edges are in ascending order."""
         return self._edges[0]
 
     @property
     def cell_edges(self) -> Int[np.ndarray, "n m"]:
-        """The edges of each cell: between its corners 0 and 1, 0 and 2, 0 and 3, 1 and 2, …."""
+        """The numbers of each cell's edges: between its corners 0 and 1, 0 and 2, 0 and 3, 1 and 2, …."""
         return self._edges[1]
 
     @cached_property
@@ -119,14 +119,14 @@ class Triangulation(ByKey):
 
     @cached_property
     def used(self) -> Bool[np.ndarray, " V"]:
-        """The vertices of the cells, bool (V,): all but those outside of a mask."""
+        """The vertices that belong to a cell, bool (V,): all except those outside of a mask."""
         used = np.zeros(self.n_vertices, dtype=bool)
         used[self.cells] = True
         return used
 
     @cached_property
     def labels(self) -> tuple[Int[np.ndarray, " V"], int]:
-        """The connected component of each vertex (1 … n; 0 of those without a cell), and their number n."""
+        """The connected component of each vertex (1 … n; 0 without a cell), and the number n of components."""
         rows, cols = self.cells[:, :-1].ravel(), self.cells[:, 1:].ravel()
         graph = coo_matrix((np.ones(rows.size), (rows, cols)), shape=(self.n_vertices,) * 2)
         known, labels = np.unique(connected_components(graph, directed=False)[1][self.used], return_inverse=True)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from hks_jax.compilation import known_here
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
@@ -13,7 +14,6 @@ from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.stencil import StencilOperator
-from hks_jax.traced import is_traced
 
 SOLVERS: dict[str, Callable[[], Eigensolver]] = {
     solver.name: solver for solver in (Dense, ShiftInvert, BlockLanczos, ChebyshevFilter)
@@ -74,18 +74,21 @@ def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
 
 
 def _automatic(pencil: Pencil, k: int) -> Eigensolver:
+    ours: Eigensolver
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
+    known = known_here(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
     if not (pencil.measured and pencil.bounded):
-        return BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
+        ours = BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
+        return ShiftInvert() if known and n * k < _LARGE else ours
     exact = pencil.stiffness.dtype == np.float64
     # In 3D factorisations have much fill-in, and in float32 they lose too many digits.
     matrix_free = isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
-    ours: Eigensolver = ChebyshevFilter() if matrix_free and k < ChebyshevFilter().max_pairs(n) else BlockLanczos()
+    ours = ChebyshevFilter() if matrix_free and k < ChebyshevFilter().max_pairs(n) else BlockLanczos()
     if k >= ours.max_pairs(n):  # the driver computes one additional pair
         ours = Dense()
-    if is_traced(jax.lax.stop_gradient(pencil)) or jax.default_backend() != "cpu":
+    if not known:
         return ours
     # The host's solver computes in float64, also for float32 matrices.
     suited = ChebyshevFilter if volume or not exact else BlockLanczos

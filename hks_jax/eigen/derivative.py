@@ -29,6 +29,9 @@ from hks_jax.traced import is_traced
 Telling = Literal["nothing", "warning", "error"]
 """What follows where the derivative does not converge, besides NaN."""
 
+_ON_HOST = 1 << 23
+"""Numbers in the eigenvectors up to which NumPy differentiates, in about the same time, and compiles nothing."""
+
 Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
 Followed = tuple[
     Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""], Float[Array, ""]
@@ -139,8 +142,72 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
+def _like(*args: Any) -> tuple[Any, Any, Any]:
+    """Return what has the shapes of the tangents."""
+    functions = args[-1]
+    return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions, functions
+
+
+def _on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return the tangents, or the cotangents of the change, by NumPy."""
+    adjoint, telling, prepared, pencil, _, *pairs = known
+    values, vectors, functions = map(np.asarray, pairs)
+    if vectors.size > _ON_HOST or x is None:
+        return None
+    change, k = x[4], len(functions)
+    eigenvalues, guards = values[:k, None], vectors[k:]
+    apart, inverse = _gaps(np, values, k, np.asarray(indistinct(pencil, values.dtype)))
+
+    def outside(rhs: np.ndarray) -> np.ndarray:
+        if not _solves(pencil, k, len(values)):
+            return np.zeros_like(rhs)
+        free = np.arange(k)[:, None] >= pencil.n_fixed
+        solution = np.asarray(_solve(adjoint, prepared, pencil, *pairs[:2], jax.device_put(np.where(free, rhs, 0))))
+        if np.isnan(solution).any():
+            _told(telling, jax.device_put(solution))
+        return np.where(free, solution, 0)
+
+    def onto(force: np.ndarray) -> np.ndarray:
+        return (inverse[:, k:] * (force @ guards.T)) @ guards - outside(force)
+
+    if y is None:
+        moved = (change.mass.to_scipy() @ functions.T).T
+        force = (change.stiffness.to_scipy() @ functions.T).T - eigenvalues * moved
+        into, frame = force @ functions.T, onto(force)
+        within = np.where(apart[:, :k], inverse[:, :k] * into, -(moved @ functions.T) / 2)
+        return np.diagonal(into), within @ functions + frame, frame
+    # Of all this the transpose.
+    of_values, of_vectors, of_frame = y
+    within = of_vectors @ functions.T
+    into = np.where(apart[:, :k], inverse[:, :k] * within, 0) + np.diag(of_values)
+    force = into @ functions + onto(of_vectors + of_frame)
+    moved = np.where(apart[:, :k], 0, -within / 2) @ functions - eigenvalues * force
+    return change_of(change, functions, force, moved)
+
+
+def change_of(
+    change: SymmetricPencil, x: Float[np.ndarray, "b n_dof"], *p: Float[np.ndarray, "b n_dof"]
+) -> SymmetricPencil:
+    """Return a pencil of zeros, but for Σ pxᵀ in place of the entries of stiffness and mass, given p for each."""
+    zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
+    columns = np.ascontiguousarray(x.T)
+    matrices = tuple(
+        matrix.outer(np.ascontiguousarray(each.T), columns)
+        for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True)
+    )
+    return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
+
+
+def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
+    """Return which of the p eigenvalues differ from each of the first k, and 1/(λᵢ − λⱼ), or 0: (k, p)."""
+    gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
+    least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
+    apart = xp.abs(gap) > xp.maximum(least, rounding)
+    return apart, xp.where(apart, 1 / xp.where(apart, gap, 1), 0)
+
+
 # Without the checkpoint, the transpose would keep copies of the eigenvectors.
-@jit_quickly(static_argnames=("adjoint", "telling"))
+@jit_quickly(static_argnames=("adjoint", "telling"), linear=("change",), like=_like, on_host=_on_host)
 @partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(
     adjoint: Adjoint,
@@ -161,11 +228,7 @@ def tangents_of(
     eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
-    gap = eigenvalues[:, None] - values[None]
-    above = values - jnp.nanmin(values)
-    least = jnp.sqrt(jnp.finfo(values.dtype).eps) * jnp.maximum(above[:k, None], above[None])
-    apart = jnp.abs(gap) > jnp.maximum(least, indistinct(pencil, values.dtype))
-    inverse = jnp.where(apart, 1 / jnp.where(apart, gap, 1), 0)
+    apart, inverse = _gaps(jnp, values, k, indistinct(pencil, values.dtype))
     # Apart from the guards: reverse mode of the frame needs the product with these alone.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)

@@ -12,6 +12,7 @@ from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
+from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest, widened
@@ -52,7 +53,8 @@ def eigenpairs(
             ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces), ``"chebyshev-filter"``
             (for grids, mainly in 3D), or a solver object such as ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result
             names the solver in ``.solver_name``. An interval, or a stiffness that may be indefinite, needs ``"dense"``
-            or ``"block-lanczos"``. Derivatives in an interval use only the tolerance of the solver's ``adjoint``.
+            or ``"block-lanczos"``; for such a stiffness with concrete values, ``"shift-invert"`` works too. Derivatives
+            in an interval use only the tolerance of the solver's ``adjoint``.
         mass: ``"consistent"`` or ``"lumped"``; a given pencil already has it.
         multiplet: the treatment of a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns.
             ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8 additional pairs and includes
@@ -166,6 +168,10 @@ def _lowest(
         pairs = solve_doubled(pencil, solvers, size, extra, throw, report)
     else:
         pairs = solve_lowest(widened(pencil, solvers, size + extra).parts[0], solvers[0], size, extra, throw, report)
+        found = jax.lax.stop_gradient(pairs)
+        doubtful = solver == "auto" and isinstance(solvers[0], ShiftInvert) and not pencil.bounded
+        if doubtful and (found.unconfirmed or not found.converged.all()):  # as where k cuts many copies
+            pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
     return truncate(pairs, k, multiplet)
 
 

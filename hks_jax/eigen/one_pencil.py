@@ -4,17 +4,19 @@ import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
 from hks_jax.checks import require_count
-from hks_jax.compilation import by_numpy, jit_quickly, known_and_few
+from hks_jax.compilation import by_numpy, jit_quickly, known_and_few, known_here
 from hks_jax.eigen.complement.adjoint import Scalar, Values, Vectors
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.host.shift_invert import ShiftInvert, lower_bound
 from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, measure_pairs, measured_on_host
@@ -36,6 +38,9 @@ def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPen
 def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
     """Return the k lowest pairs; with ``extra`` = 1 also the next eigenvalue. See `solved` for ``throw``."""
     n_dof = pencil.size
+    if isinstance(solver, ShiftInvert) and not pencil.bounded and known_here(jax.lax.stop_gradient(pencil)):
+        bound = lower_bound(jax.lax.stop_gradient(pencil))
+        pencil = eqx.tree_at(lambda p: p.lower_bound, pencil, bound, is_leaf=lambda leaf: leaf is None)
     if not (pencil.bounded or solver.indefinite):
         raise ValueError(
             f"solver: got {solver.name!r}, which needs a positive semidefinite stiffness with a known null space; the "

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.compilation import by_numpy, known_and_few
+from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import products_with_columns, row_blocks
 
@@ -60,7 +62,7 @@ def measured_on_host(
     twice = np.zeros(len(values), bool)
     if vectors.dtype == np.float32:
         twice = np.any(np.abs(np.tril(vectors @ image, -1)) > _ALIKE, axis=1)
-    return residuals, twice, 4 * np.max(np.abs(stiffness.diagonal()) / mass.diagonal())
+    return residuals, twice, _largest(np, stiffness.diagonal(), mass.diagonal())
 
 
 def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp) -> Any:
@@ -77,7 +79,18 @@ def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
     return 4 * jnp.finfo(dtype).eps * largest(pencil)
 
 
-@jax.jit
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
     """Return about the largest eigenvalue: 4·max|Kᵢᵢ/Mᵢᵢ| is λ_max on a uniform grid in 2D and 3D."""
-    return 4 * jnp.max(jnp.abs(pencil.stiffness.diagonal()) / pencil.mass.diagonal())
+    matrices = pencil.stiffness, pencil.mass
+    if not known_and_few(matrices):
+        return _largest_by_jax(*matrices)
+    return by_numpy(lambda: _largest(np, *(matrix.to_scipy().diagonal() for matrix in matrices)))
+
+
+@jax.jit
+def _largest_by_jax(stiffness: Operator, mass: Operator) -> Float[Array, ""]:
+    return _largest(jnp, stiffness.diagonal(), mass.diagonal())
+
+
+def _largest(xp: Any, stiffness: Any, mass: Any) -> Any:
+    return 4 * xp.max(xp.abs(stiffness) / mass)

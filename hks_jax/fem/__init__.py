@@ -1,1 +1,1 @@
-"""From domains to matrices: elements, boundaries, assembly, operators."""
+"""Assembly of matrices on domains: elements, boundary conditions, weak forms and operators."""

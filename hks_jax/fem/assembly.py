@@ -1,4 +1,4 @@
-"""From a tensor field or a mesh to a pencil: what is asked for, checked, and assembled on its domain."""
+"""Assembly of the matrix pencil of an operator on a tensor field or a mesh, with checks of all arguments."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -40,78 +40,80 @@ def assemble(
     midpoints: Any = None,
     quadrature: Quadrature = "gauss",
 ) -> AnyPencil:
-    """Assemble the generalized eigenproblem Kφ = λMφ of an operator: by default the Laplace–Beltrami operator.
+    """Assemble the generalized eigenproblem Kφ = λMφ of an operator, by default of the Laplace–Beltrami operator.
 
-    K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus and Hotz, section 3), with Q1 elements and 2^d
-    Gauss points on grids, T (or its logarithm: `TensorField.interpolation`) interpolated multilinearly; with P1 or P2
-    elements on meshes, where T is constant on each triangle or tetrahedron.
+    The matrices are K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus and Hotz, section 3). On grids
+    the elements are Q1 with 2^d Gauss points, and the metric T (or its logarithm, see `TensorField`) is interpolated
+    multilinearly. On meshes the elements are P1 or P2, and T is constant on each triangle or tetrahedron.
 
-    A *field* is a number, an array over the nodes (interpolated; shape of the grid, or (V,)), an array over the
-    elements (n − 1 along each axis of a grid, n where it is periodic; the faces or cells of a mesh), or a function of
-    one position x, the coordinates of a grid or a place in space, which JAX can trace. An array that could be either
-    belongs to the nodes.
+    A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
+    trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries
+    along each axis of a grid (n if the axis is periodic), or an entry for each cell of a mesh. An array that fits both
+    is taken as nodal.
 
     Args:
         domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
         boundary: ``"neumann"`` (natural), ``"dirichlet"`` (φ = 0: these nodes are eliminated), ``"periodic"`` (node n
-            is node 0: an axis of n nodes has the period n·h), ``"mirror"`` (the domain reflected on every side) or
-            ``"mean"`` (two copies of the domain, glued along all of the rim); one name for all axes or one per axis,
-            where a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"`` tells the sides apart. The rim of
-            a mask is natural, but under ``"mean"``, and under ``"dirichlet-rim"``, which is Dirichlet on all sides and
-            there; or as one more entry says, after those of the axes: ``("periodic", "periodic", "dirichlet")``. A mesh
-            takes ``"neumann"``, ``"dirichlet"`` or ``"mean"``, which act on its boundary.
-        mass: ``"consistent"`` or ``"lumped"`` (row sums; diagonal); or a form of your own.
-        potential: a field V of either sign: the operator is −Δ + V.
-        density: a positive field ρ: the operator is −ρ⁻¹ div(ρ ∇·), in L² with the volume ρ√|T| dx.
-        stiffness: a form of your own in place of both: a function ``form(u, v, w)``, linear in u and in v, of two shape
-            functions with ``.value`` and ``.grad`` and of a point with ``.metric`` (d, d), its ``.inverse``, the
-            position ``.x``, and ``w["name"]``, the fields. It returns one number, and is integrated with the volume
-            √|T| dx. On meshes gradients and metric are those of space, along a surface tangential to it. Define it
-            once: each new function is compiled anew (docs/operators.md).
-        fields: for your forms, by name; they may have axes of their own after those of the places.
-        components: of the functions. With c > 1 of them, as for elasticity, ``u.value`` is (c,), ``u.grad`` (c, d) with
-            ``grad[i, j]`` = ∂uᵢ/∂xⱼ, and results have an axis of c after those of the nodes.
-        degree: 1 or, on meshes, 2: values at the V vertices, then at the middles of the edges
-            ``domain.triangulation.edges``.
-        midpoints: of degree 2, where the middles of the edges are, (E, 3), which curves the sides; or a function of a
-            place in space that moves the middles of straight sides there, on a `TetMesh` those of its boundary alone.
-        quadrature: ``"gauss"``, or on grids ``"cancelling"``: points at which the leading error of heat kernel
-            signatures cancels (docs/accuracy.md). The mass is consistent, and nodal values are no longer the unknowns
-            φ: all signatures read them from ½(I + D⁻¹M)φ, D the row sums of M.
+            is node 0: an axis of n nodes has the period n·h), ``"mirror"`` (the domain is reflected on every side) or
+            ``"mean"`` (two copies of the domain are glued along the whole rim). On grids give one name for all axes, or
+            one entry per axis, which may be a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"``. The
+            rim of a mask is natural, except under ``"mean"`` and ``"dirichlet-rim"``, which act on the rim and on all
+            sides. It has its own condition in a further entry after those of the axes: ``("periodic", "periodic",
+            "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
+        mass: ``"consistent"``, ``"lumped"`` (the diagonal matrix of row sums), or your own form.
+        potential: a field V of either sign; the operator becomes −Δ + V.
+        density: a positive field ρ; the operator becomes −ρ⁻¹ div(ρ ∇·), in L² with the volume element ρ√|T| dx.
+        stiffness: your own form, which replaces potential and density: a function ``form(u, v, w)`` that is linear in u
+            and in v and returns one number. The shape functions u and v have ``.value`` and ``.grad``. The point w has
+            the metric ``.metric`` (d, d), its inverse ``.inverse``, the position ``.x`` and the fields ``w["name"]``.
+            The number is integrated with the volume element √|T| dx. On meshes, gradients and metric are in the axes
+            of space, and tangential to a surface. Define a form once: each new function is compiled anew
+            (docs/operators.md).
+        fields: the fields that your forms read, by name; they may have further axes after those of nodes or elements.
+        components: the number c of components of a function. For c > 1, as in elasticity, ``u.value`` is (c,),
+            ``u.grad`` is (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ, and results have an axis of length c after those of the
+            nodes.
+        degree: 1 or, on meshes, 2. Nodal values of degree 2 are those at the V vertices, followed by those at the
+            midpoints of the edges ``domain.triangulation.edges``.
+        midpoints: for degree 2, the positions (E, 3) of the edges' midpoints, which curve the edges; or a function from
+            the midpoint of a straight edge to its new position, which on a `TetMesh` moves boundary edges only.
+        quadrature: ``"gauss"`` or, on grids, ``"cancelling"``: points for which the leading error of heat kernel
+            signatures cancels (docs/accuracy.md). The mass is then consistent, and the unknowns φ are not nodal values:
+            all signatures compute nodal values as ½(I + D⁻¹M)φ, where D has the row sums of M.
 
     Returns:
-        The pencil (stiffness, mass); with ``"mirror"`` and ``"mean"`` the `MirrorPencil` of the problems that make it
-        up. With a potential or forms of your own nothing is known of the null space.
+        The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` it is the `MirrorPencil` of the problems into
+        which the doubled domain decomposes. With a potential or your own form, the null space is not known.
 
     Raises:
-        ValueError: an unknown boundary, mass, degree or quadrature, a domain without elements or free nodes; ``"mean"``
-            without a rim; a field of another shape, that is NaN, or a density that is not positive; a form that does
-            not return one number, is not linear, or whose matrix is not symmetric (by how much, and where);
-            ``"cancelling"`` with a mesh, a lumped mass or a form of your own.
+        ValueError: an unknown boundary, mass, degree or quadrature; a domain without elements or free nodes; ``"mean"``
+            without a rim; a field that has another shape or contains NaN; a density that is not positive; a form that
+            does not return one number, is not linear, or has an unsymmetric matrix (the message has the entry);
+            ``"cancelling"`` with a mesh, a lumped mass or your own form.
 
     Warns:
-        AccuracyWarning: a Dirichlet condition that no node of the domain feels.
+        AccuracyWarning: a Dirichlet condition holds at no node of the domain.
     """
     operator, given = _checked_operator(mass, stiffness, components, potential, density, fields)
     if quadrature not in get_args(Quadrature):
         raise ValueError(f'quadrature: got {quadrature!r}; expected "gauss" or "cancelling"')
     if quadrature == "cancelling":
         for what, is_given in (
-            ("a mesh, where no such points are known", isinstance(domain, SimplicialMesh)),
-            ("a lumped mass, whose error no points cancel", operator.lumped),
-            ("a form of your own, whose error is not known", operator.own),
+            ("a mesh, for which no such points are known", isinstance(domain, SimplicialMesh)),
+            ("a lumped mass, for which no such points exist", operator.lumped),
+            ("your own form, whose error is not known", operator.own),
         ):
             if is_given:
                 raise ValueError(f'quadrature: got "cancelling" with {what}; expected "gauss"')
         operator = operator._replace(cancelling=True)
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
-            raise ValueError(f"boundary: got {boundary!r}; a mesh takes one of {', '.join(map(repr, MESH_BOUNDARIES))}")
+            raise ValueError(f"boundary: got {boundary!r}; expected one of {', '.join(map(repr, MESH_BOUNDARIES))}")
         conditions = ("neumann", "dirichlet") if boundary == "mean" else (boundary,)
         nodes = mesh_nodes(domain, degree, midpoints)
         if degree == 2 and operator.lumped:
             raise ValueError(
-                'mass: got "lumped" with degree=2, whose row sums vanish at the vertices; use "consistent"'
+                'mass: got "lumped" with degree=2; row sums at the vertices are not positive. Use "consistent"'
             )
         spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
         points = partial(mesh_points, nodes, spaces[0])
@@ -126,18 +128,18 @@ def assemble(
         pencils = [assemble_mesh(domain, nodes, held, each, operator, curved) for each in spaces]
         if curved and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
             raise ValueError(
-                "midpoints: they fold cells, or turn them inside out; move them nearer to the middles of straight sides"
+                "midpoints: got positions that fold or invert cells; move them closer to the straight edges"
             )
         return _joined(pencils, operator)
     if not isinstance(domain, TensorField):
         raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
     if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
-        raise ValueError("domain: got a batch of tensor fields; expected one. Map over the batch with jax.vmap")
+        raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch with jax.vmap")
     if degree != 1 or midpoints is not None:
-        raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; they are for meshes")
+        raise ValueError(f"degree, midpoints: got degree {degree!r} for a grid; leave both out, as elements are Q1")
     sides = normalise_boundary(boundary, domain.grid.dimension)
     if components > 1 and any("mirror" in pair for pair in sides):
-        raise ValueError('boundary: got "mirror" with components, which a reflection would have to turn; use another')
+        raise ValueError('boundary: got "mirror" with components; it is for scalar functions only. Use another')
     problems = doubled_problems(sides)
     spaces = [grid_space(domain.grid, problem) for problem in problems]
     space, held = spaces[0], {}
@@ -148,9 +150,9 @@ def assemble(
     pencils = [assemble_grid(domain, held, each, operator) for each in spaces]
     if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
         where = (
-            'acts on the sides of the grid, which the mask does not reach. "dirichlet-rim" takes in the mask\'s own rim'
+            'acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "dirichlet-rim"'
             if sides[-1] == ("neumann", "neumann")
-            else "acts nowhere: there is no mask whose rim it could hold on"
+            else "acts nowhere: there is no mask, and so no rim. Leave it out"
         )
         warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
     return _joined(pencils, operator)
@@ -164,26 +166,25 @@ def _checked_operator(
     density: Any,
     fields: Mapping[str, Any] | None,
 ) -> tuple[WeakForm, dict[str, Any]]:
-    """Return what is to be assembled, and the fields that are given for it."""
     if mass not in ("consistent", "lumped") and not callable(mass):
         raise ValueError(f'mass: got {mass!r}; expected "consistent", "lumped" or a form')
     if stiffness is not None and not callable(stiffness):
-        raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form, a function of u, v and w")
+        raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form: a function of u, v and w")
     for name, form in (("stiffness", stiffness), ("mass", mass)):
         if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
-            raise ValueError(f"{name}: the form closes over traced values; hand them over by fields={{…}}, numbers too")
+            raise ValueError(f"{name}: the form closes over traced values; pass them as fields={{…}}, even numbers")
     require_count("components", components)
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
     if own and named:
         raise ValueError(
-            f"{', '.join(named)}: got with a form of your own; pass fields={{{next(iter(named))!r}: …}}, for your "
-            "form to read"
+            f"{', '.join(named)}: got a field with your own form; pass fields={{{next(iter(named))!r}: …}}, and read "
+            "the field in the form"
         )
     if (given or components > 1) and not own:
-        raise ValueError("fields, components: they are for forms of your own; give stiffness= or mass=")
+        raise ValueError("fields, components: got one of them without your own form; pass stiffness= or mass= too")
     if components > 1 and stiffness is None:
-        raise ValueError("stiffness: got None with components; expected a form of functions with components")
+        raise ValueError("stiffness: got None with components; expected a form for functions with several components")
     of_mass = mass if callable(mass) else l2
     return WeakForm(stiffness or laplace_beltrami, of_mass, mass == "lumped", components, own), given | named
 
@@ -199,7 +200,7 @@ def _checked_fields(
 
 
 def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
-    """Return the pencil, or the problems that make up a doubled domain; checked where their forms are the user's."""
+    """Return the pencil, or the problems of a doubled domain; check that the user's forms are symmetric."""
     if operator.own and operator.checked:
         for name in ("stiffness", "mass"):
             matrix = getattr(pencils[0], name)
@@ -208,7 +209,7 @@ def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
     if len(pencils) == 1:
         return pencils[0]
     if pencils[0].space.n_dof == pencils[-1].space.n_dof:
-        raise ValueError('boundary: got "mean", but the domain has no rim: leave it out')
+        raise ValueError('boundary: got "mean", but the domain has no rim; pass "neumann"')
     free = [pencil.space.free for pencil in pencils]
     including = (tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))
     return MirrorPencil(tuple(pencils), tuple(including))

@@ -1,4 +1,4 @@
-"""Boundary conditions per axis and side, and on the rim of a mask; doubled domains as sets of problems; strips."""
+"""Boundary conditions of grids and masks, the problems of doubled domains, and strips around fields."""
 
 from itertools import product
 from types import EllipsisType
@@ -20,17 +20,17 @@ BoundarySpec: TypeAlias = str | tuple[str | Sides, ...]
 _SIDE_BY_SIDE = ("neumann", "dirichlet", "mean")
 _CONDITIONS = (*_SIDE_BY_SIDE, "periodic", "mirror")
 _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
-"""Names that, given alone, hold on the rim of a mask, too, and what they mean there."""
+"""The condition on the rim of a mask that each of these names sets, if it is given alone."""
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
-    """Return the (low, high) conditions of every axis and, last, the condition on the rim of a mask, twice.
+    """Return the conditions (low, high) of every axis and, as last pair, twice the condition on the rim of a mask.
 
     Args:
         boundary: ``"neumann"``, ``"dirichlet"``, ``"mean"``, ``"periodic"``, ``"mirror"`` or ``"dirichlet-rim"``; or a
-            tuple with one entry per axis, each one of these names but the last, or a pair (low, high) of the first
-            three. One more entry, the first three again, is for the rim of a mask. Without it that rim is natural, or
-            has the mean where an axis has it.
+            tuple with one entry per axis, which is one of these names except the last, or a pair (low, high) of the
+            first three. A further entry, one of the first three names, is for the rim of a mask. By default the rim
+            has the mean if an axis has it, and is natural otherwise.
         dimension: the number of axes.
     """
     if isinstance(boundary, str):
@@ -38,8 +38,8 @@ def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, .
         entries: tuple[str | Sides, ...] = (everywhere or boundary,) * dimension + (everywhere or "neumann",)
     elif not isinstance(boundary, tuple | list) or len(boundary) not in (dimension, dimension + 1):
         raise ValueError(
-            f"boundary: got {boundary!r}; expected one name, or a tuple of {dimension}, one per axis, "
-            f"or of {dimension + 1}, the last for the rim of a mask"
+            f"boundary: got {boundary!r}; expected one name, a tuple of {dimension} entries, one per axis, "
+            f"or {dimension + 1} entries, of which the last is for the rim of a mask"
         )
     else:
         entries = tuple(boundary)
@@ -63,17 +63,18 @@ def _pair(entry: str | Sides) -> Sides:
     unknown = [name for name in pair if name not in _CONDITIONS]
     if unknown:
         known = ", ".join(map(repr, _CONDITIONS))
-        alone = ', or "dirichlet-rim" alone, for all sides and the rim of a mask'
+        alone = ', or "dirichlet-rim" alone, which is for all sides and the rim of a mask'
         raise ValueError(f"boundary: got {unknown[0]!r}; expected one of {known}{alone}")
     if low != high and not {low, high} <= set(_SIDE_BY_SIDE):
-        raise ValueError(f'boundary: got {entry!r} for one axis; "periodic" and "mirror" bind both sides of an axis')
+        raise ValueError(f'boundary: got {entry!r} for one axis; "periodic" and "mirror" must be on both sides')
     return low, high
 
 
 def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
-    """Return the boundary that suits a domain, and why: the mean where it has a mask, whose rim else covers all.
+    """Return the boundary condition that suits a domain, and the reason.
 
-    The command line takes it where none is asked for; the functions of the library take ``"neumann"``.
+    It is the mean if the domain has a mask, since the natural condition on its rim would dominate the signature. The
+    command line uses it by default; the functions of the library use ``"neumann"``.
 
     Args:
         inside: (*shape) the nodes of the domain, as `Grid.inside`.
@@ -83,15 +84,15 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     every_axis = (False,) * inside.ndim
     elements = active_elements(inside, every_axis)
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
-    if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet half leaves the grid's sides out, too
-        return "neumann", "the mask is so thin that all of it is rim, and the mean needs voxels off it"
-    return "mean", 'the domain has a mask; pass boundary="neumann" to leave its rim natural'
+    if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet problem eliminates the grid's sides, too
+        return "neumann", "the mask is so thin that all of its voxels are on the rim, and the mean needs voxels off it"
+    return "mean", 'the domain has a mask; pass boundary="neumann" for a natural rim'
 
 
 def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
-    """Say which conditions have no effect, because the mask does not reach the side of the grid that they are for."""
+    """Return a warning for each condition on a side of the grid that the mask does not reach."""
     *axes, (rim, _) = normalise_boundary(boundary, inside.ndim)
-    own = 'is natural (Neumann); "dirichlet-rim" and "mean" take it in' if rim == "neumann" else f'has "{rim}"'
+    own = 'is natural (Neumann); "dirichlet-rim" and "mean" act on it' if rim == "neumann" else f'has "{rim}"'
     return [
         f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
         f"the mask's own rim {own}"
@@ -102,12 +103,12 @@ def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) 
 
 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
-    """Return the problems whose spectra together are that of the domain doubled along mirrors and the mean's rim.
+    """Return the problems whose spectra together form that of the domain doubled by ``"mirror"`` or ``"mean"``.
 
-    Functions on the doubled, periodic axis are even or odd about both mirrors: even ones have no normal derivative
-    there, odd ones vanish. So each mirror axis stands for a Neumann and a Dirichlet problem, and m mirror axes
-    for 2^m of them. Likewise two copies of a domain, glued along all of the rim that has the mean, have even functions
-    (Neumann there) and odd ones (Dirichlet). The first problem is that of functions even in every respect.
+    Functions on the doubled, periodic axis are even or odd about both mirrors. Even functions satisfy the Neumann
+    condition there, and odd functions vanish. So a mirror axis gives a Neumann and a Dirichlet problem, and m mirror
+    axes give 2^m problems. Likewise, two copies of a domain that are glued along the rim have even functions (Neumann)
+    and odd functions (Dirichlet). In the first problem, functions are even under all reflections.
     """
     choices = [
         [("neumann", "neumann"), ("dirichlet", "dirichlet")] if sides == ("mirror", "mirror") else [sides]
@@ -121,10 +122,10 @@ def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
 
 
 def reflect(field: TensorField, width: int) -> TensorField:
-    """Extend a field by a strip of its mirror image on every side, as the paper does before it crops.
+    """Extend a field by a strip of its mirror image on every side, as in the paper; `crop` removes the strip.
 
-    A reflection is an isometry only if the off-diagonal components across the mirror change their sign; in the strip
-    beyond a side of axis a, Tₐᵦ (b ≠ a) is negated.
+    A reflection is an isometry only if the off-diagonal components across the mirror change sign. So in the strip
+    beyond a side of axis a, Tₐᵦ is negated for b ≠ a.
 
     Args:
         field: the field on a grid of shape (n₁, …).
@@ -150,13 +151,13 @@ def reflect(field: TensorField, width: int) -> TensorField:
 def crop(
     values: Float[Array | np.ndarray, "*leading_and_enlarged"], grid: Grid
 ) -> Float[Array | np.ndarray, "*leading_and_shape"]:
-    """Cut the trailing axes of ``values`` centrally down to the shape of ``grid``: the inverse of `reflect`."""
+    """Return the centre of the trailing axes of ``values``, in the shape of ``grid``: the inverse of `reflect`."""
     d = grid.dimension
     excess = [big - n for big, n in zip(np.shape(values)[-d:], grid.shape, strict=True)]
     if min(excess) < 0 or any(e % 2 for e in excess):
         raise ValueError(
             f"values: got trailing shape {np.shape(values)[-d:]}; expected {grid.shape} plus an even number of nodes "
-            "per axis, as `reflect` makes it"
+            "per axis, as `reflect` adds"
         )
     centre = [slice(e // 2, e // 2 + n) for e, n in zip(excess, grid.shape, strict=True)]
     index: tuple[EllipsisType | slice, ...] = (..., *centre)

@@ -1,4 +1,4 @@
-"""The element: shape functions at quadrature points, the integrals of one, and points at which its error cancels."""
+"""Elements: shape functions at quadrature points, element matrices, and points for which errors cancel."""
 
 import math
 from collections.abc import Mapping
@@ -19,8 +19,8 @@ from hks_jax.fem.forms import Point, ShapeFunction, WeakForm, integrate, of_comp
 class Element:
     """Shape functions tabulated at the quadrature points of a reference element.
 
-    `values` (q, n), `gradients` (q, n, d), `weights` (q,): q points, n nodes, d coordinates. The weights include the
-    element's volume in coordinate units.
+    For q points, n nodes and d coordinates, `values` is (q, n), `gradients` is (q, n, d) and `weights` is (q,). The sum
+    of the weights is the element's volume in coordinate units.
     """
 
     values: Float[np.ndarray, "q n"]
@@ -28,7 +28,7 @@ class Element:
     weights: Float[np.ndarray | Array, " q"]
 
     def stretched(self, sides: tuple[float, ...]) -> "Element":
-        """Return the element with its sides multiplied by these lengths."""
+        """Return the element with its sides multiplied by these factors."""
         return Element(self.values, self.gradients / np.array(sides), self.weights * math.prod(sides))
 
 
@@ -40,10 +40,10 @@ def element_matrices(
     fields: Mapping[str, Array] | None = None,
     frames: Float[Array, "q m d"] | None = None,
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """Integrate one element: by default stiffness ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and mass ∫ √|T| hᵢhⱼ.
+    """Return stiffness and mass of one element, by default ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and ∫ √|T| hᵢhⱼ.
 
-    The metric T, positions x and fields are those at the quadrature points. With frames ∂x/∂ξ of the element's
-    coordinates ξ the forms see places x in space; else they see ξ.
+    The metric T, the positions x and the fields are given at the quadrature points. With the frames ∂x/∂ξ of the
+    element's coordinates ξ, forms see gradients and metric in the axes of space; otherwise in the coordinates ξ.
     """
     h, dh = jnp.asarray(element.values, metric.dtype), jnp.asarray(element.gradients, metric.dtype)
     volume = jnp.asarray(element.weights, metric.dtype) * jnp.sqrt(spd.determinant(metric))
@@ -60,17 +60,17 @@ def element_matrices(
 
 
 def at_quadrature(nodal: Float[Array, "n d d"], element: Element) -> Float[Array, "q d d"]:
-    """Interpolate nodal tensors to the quadrature points with the element's own shape functions."""
+    """Interpolate nodal tensors to the quadrature points with the element's shape functions."""
     return jnp.einsum("qn,nab->qab", jnp.asarray(element.values, nodal.dtype), nodal, precision="highest")
 
 
 GAUSS = 1 / math.sqrt(3)
-"""ξ of Gauss's two points ±ξ on [−1, 1]."""
+"""The coordinate ξ of the two Gauss points ±ξ on [−1, 1]."""
 
 
 @lru_cache(maxsize=4)
 def tensor_product_element(dimension: int, point: float = GAUSS) -> Element:
-    """Return the Q1 element (bilinear, trilinear) on the unit square or cube, with points at ±``point`` of [−1, 1]^d.
+    """Return the Q1 element on the unit square or cube, with quadrature points at ±``point`` on each axis of [−1, 1]^d.
 
     Nodes and points are in the order of ``itertools.product((0, 1), repeat=d)``.
     """
@@ -81,20 +81,20 @@ def tensor_product_element(dimension: int, point: float = GAUSS) -> Element:
     return Element(reduce(np.kron, [h] * dimension), np.stack(gradients, axis=-1), np.full(n, 1 / n))
 
 
-# With d + 1 points, one beside each corner, whose barycentric coordinates are 1 − d·a and d times a, the rule of equal
-# weights is exact for polynomials of degree two if Σ over the points of hᵢhⱼ has the mean 1/((d + 1)(d + 2)), i ≠ j:
-# 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), whose smaller solution is the a below.
+# The d + 1 points have equal weights and the barycentric coordinates 1 − d·a (once) and a (d times). The rule is exact
+# for polynomials of degree two if hᵢhⱼ, i ≠ j, has the mean 1/((d + 1)(d + 2)) over the points. Then
+# 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), and the smaller solution a is ``beside``.
 def _linear_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
-    """Return barycentric coordinates and weights, exact for degree two."""
+    """Return the barycentric coordinates and weights of a rule that is exact for degree two."""
     beside = (d + 2 - math.sqrt(d + 2)) / ((d + 1) * (d + 2))
     points = np.full((d + 1, d + 1), beside) + (1 - (d + 1) * beside) * np.eye(d + 1)
     return points, np.full(d + 1, 1 / math.factorial(d + 1))
 
 
-# Radon's rule of 7 points for triangles, and Keast's of 15 for tetrahedra: the centre; two orbits of points beside the
-# corners; in 3D one beside the middles of the edges.
+# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, two orbits near the
+# corners and, in 3D, one orbit near the midpoints of the edges.
 def _quadratic_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
-    """Return barycentric coordinates and weights, exact for degree five."""
+    """Return the barycentric coordinates and weights of a rule that is exact for degree five."""
     root, n = math.sqrt(15), d + 1
     points, weights = [np.full((1, n), 1 / n)], [[9 / 80 if d == 2 else 8 / 405]]
     for sign in (1, -1):
@@ -114,9 +114,9 @@ def _quadratic_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray,
 
 @lru_cache(maxsize=4)
 def simplex_element(dimension: int, degree: int = 1) -> Element:
-    """Return the P1 or P2 element on the unit triangle or tetrahedron; the mass is exact where sides are straight.
+    """Return the P1 or P2 element on the unit triangle or tetrahedron; the mass is exact if edges are straight.
 
-    The nodes of P2 are the corners, then the middles of the edges in the order of `Triangulation.cell_edges`.
+    The nodes of P2 are the corners, followed by the midpoints of the edges in the order of `Triangulation.cell_edges`.
     """
     points, weights = (_linear_rule if degree == 1 else _quadratic_rule)(dimension)
     slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])  # of the barycentric coordinates
@@ -132,31 +132,31 @@ def simplex_element(dimension: int, degree: int = 1) -> Element:
 Quadrature = Literal["gauss", "cancelling"]
 
 MASS = math.sqrt(2 / 3)
-"""ξ of the two points ±ξ along each axis of [−1, 1]^d at which the mass takes shape functions."""
+"""The coordinate ξ of the points ±ξ on each axis of [−1, 1]^d where the mass evaluates shape functions."""
 _LEAST, _GREATEST = 0.01, 1.0
-"""Between these is ξ² of the stiffness: inside the cell, and not in its centre, where hourglasses have no energy."""
+"""Bounds of ξ² for the stiffness, so that points are in the cell and not at its centre (hourglasses have no energy)."""
 
 
-# Take a constant tensor, A = T⁻¹, spacings hₐ, a plane wave of wave vector k, and θₐ = kₐhₐ. The rule of points ±ξ with
-# μ = (1 − ξ²)/4 gives the mass along one axis the symbol 1 − μθ² + O(θ⁴). In the stiffness ∂h∂h' has k²(1 − θ²/12), and
-# ∂h h' has (sin θ)/h whatever ξ is. With μ in the mass and ν in the stiffness (along the axes in which it does not
-# differentiate) the eigenvalue λ = Σ Aₐᵦkₐkᵦ becomes, to leading order,
+# Let the tensor T be constant, A = T⁻¹, hₐ the spacings, k the wave vector of a plane wave, and θₐ = kₐhₐ. With points
+# ±ξ and μ = (1 − ξ²)/4, the mass along one axis has the symbol 1 − μθ² + O(θ⁴). In the stiffness, ∂h∂h' has the symbol
+# k²(1 − θ²/12), and ∂h h' has (sin θ)/h for every ξ. Let the mass have μ, and the stiffness ν along the axes where it
+# does not differentiate. Then the eigenvalue λ = Σ Aₐᵦkₐkᵦ becomes, to leading order,
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
-# μ = ν = 1/12 leaves −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 of it: nothing where the tensor is diagonal. Elsewhere 3^d
-# couplings a node cannot cancel that for every k, but ν = 1/12 + δ can in the mean that the heat kernel takes, in which
-# θ is normal with a covariance proportional to S, Sₐᵦ = hₐhᵦTₐᵦ. With A now the inverse of S, and Isserlis' theorem
-# E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c,
+# For μ = ν = 1/12 the error −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 remains, which is zero for a diagonal tensor. Otherwise no
+# stencil with 3^d couplings cancels it for every k. But ν = 1/12 + δ cancels its mean over the heat kernel, in which θ
+# is normal with a covariance proportional to S, where Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the inverse of S. With Isserlis'
+# theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c,
 #
 #     δ = −(1/12) Σ_{a<b} 2Aₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Aₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Aₐᵦ E θₐθᵦθ_c²);
 #
-# neither t nor the size of S matters. In the plane δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so that ξ² = 2/3 − 4δ is between 0 and
-# 2/3. The denominator is positive: E θ_c² times the energy of the other axes, summed over c.
+# δ depends neither on t nor on the size of S. In two dimensions δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so that ξ² = 2/3 − 4δ is
+# between 0 and 2/3. The denominator is positive: it is the sum over c of E θ_c² times the energy of the other axes.
 #
-# Functions of norm 1 have nodal values that are too large by the factor 1 + Σ μθₐ²/2: `Pencil.read` undoes that.
+# The nodal values of functions of norm 1 are too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:
-    """Return ξ² of the points of the stiffness in a cell with this metric."""
+    """Return ξ² of the quadrature points of the stiffness in a cell with this metric."""
     s = metric * spacing[:, None] * spacing
     d = len(s)
     s = d * s / jnp.trace(s)
@@ -171,16 +171,16 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
     return jnp.clip(2 / 3 + numerator / (3 * denominator), _LEAST, _GREATEST)
 
 
-# Only the shape functions are taken at these points. The tensors stay those at Gauss's points, by which their own
-# integrals over a cell are right: with tensors at the points themselves, errors on brains were twice as large.
+# Only the shape functions are evaluated at these points. The tensors are evaluated at Gauss points, which integrate
+# them accurately: with tensors at the new points, errors on brains were twice as large.
 #
-# On a cell a function is a sum of products of coordinates, one for every set of axes, and a derivative along one axis
-# leaves the coordinates of the others, which grow with ξ. So the stiffness at other points is Gauss's with products of
-# m coordinates times (ξ/ξ₀)^(m−1). By their values at the corners, 1 or −1, the products are orthogonal.
+# On a cell, a function is a sum of products of m coordinates, one for each set of m axes. Its derivative along an axis
+# has products of m − 1 coordinates, which grow with ξ. So the stiffness for points ±ξ is the one for Gauss points ±ξ₀
+# with each product multiplied by (ξ/ξ₀)^(m−1). The products are an orthogonal basis: at the corners they are 1 or −1.
 def moved(
     stiffness: Float[Array, "n n"], metric: Float[Array, "q d d"], spacing: Float[np.ndarray | Array, " d"]
 ) -> Float[Array, "n n"]:
-    """Return a cell's stiffness, integrated at Gauss's points, as one at the points that its tensor asks for."""
+    """Convert a cell's stiffness for Gauss points into the stiffness for the points of `stiffness_point`."""
     ratio = jnp.sqrt(stiffness_point(jnp.mean(metric, axis=0), spacing)) / GAUSS
     basis, powers = (jnp.asarray(each, stiffness.dtype) for each in _products_of_coordinates(len(spacing)))
     factors = ratio**powers
@@ -190,7 +190,7 @@ def moved(
 
 @lru_cache(maxsize=2)
 def _products_of_coordinates(dimension: int) -> tuple[Float[np.ndarray, "nn nn"], Float[np.ndarray, " n"]]:
-    """Return what takes matrices to the basis of products of coordinates and back, and m − 1 for each; 0 for m = 0."""
+    """Return the change of matrices to the basis of products of coordinates and back, and max(m − 1, 0) for each."""
     one = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
     basis = reduce(np.kron, [one] * 2 * dimension)
     degrees = np.indices((2,) * dimension).sum(axis=0).ravel()

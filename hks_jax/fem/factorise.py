@@ -1,4 +1,4 @@
-"""The factorisation of K − σM, for users and as a solver of lineax."""
+"""Factorisation of K − σM: a function for users, and a linear solver for lineax."""
 
 import math
 from typing import Any
@@ -27,27 +27,27 @@ def factorise(
     boundary: BoundarySpec = "neumann",
     mass: MassKind = "consistent",
 ) -> FactorisedMatrix:
-    """Factorise A = K − σM for solves, its determinant, its inertia and the diagonal of its inverse.
+    """Factorise A = K − σM, which gives solves, the determinant, the inertia and the diagonal of the inverse.
 
-    A may be indefinite. All results are differentiable with respect to the entries of K and M, σ and right-hand sides,
-    in forward and reverse mode and any number of times, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ
-    along a nested dissection, without pivoting from one front to the next. It is tried out on random right-hand sides;
-    where small pivots spoil it, it is repeated with these replaced, and solutions are refined.
+    The matrix A may be indefinite. All results are differentiable with respect to K, M, σ and right-hand sides, in
+    forward and reverse mode to any order, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ along a nested
+    dissection, without pivoting across fronts, and is tested on random right-hand sides. If small pivots make it
+    inaccurate, it is repeated with these pivots replaced, and solutions are refined iteratively.
 
     Args:
-        domain: what `eigenpairs` takes: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the
-            identity), or (K, M).
-        shift: σ.
-        boundary: see `assemble`; belongs to the pencil if one is given.
+        domain: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the identity), or (K, M), as
+            for `eigenpairs`.
+        shift: the shift σ.
+        boundary: see `assemble`; leave it out for a pencil or matrices.
         mass: likewise.
 
     Returns:
-        The factorised matrix: ``.solve(b)``, ``.logdet()``, ``.inertia``, ``.inverse_diagonal()``. Where values are
+        The factorised matrix with ``.solve(b)``, ``.logdet()``, ``.inertia`` and ``.inverse_diagonal()``. If values are
         traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Raises:
-        ValueError: σ is not a finite number; a matrix that is singular, with the number of its null vectors; what
-            `eigenpairs` refuses of the domain; a domain that is doubled.
+        ValueError: a shift that is not a finite number; a singular matrix (with the number of its null vectors); a
+            domain that `eigenpairs` refuses; a doubled domain.
     """
     return factorised(_shifted(domain, shift, boundary, mass), "domain: K − σM")
 
@@ -57,13 +57,13 @@ def _shifted(domain: Any, shift: Any, boundary: BoundarySpec, mass: MassKind) ->
     pencil = pencil_of(domain, boundary, mass)
     if not isinstance(pencil, Pencil):
         raise ValueError(
-            'domain: under "mirror" and "mean" there are several matrices; factorise each of `assemble(…).parts`'
+            'domain: got "mirror" or "mean", which give several matrices; factorise each of `assemble(…).parts`'
         )
     return pencil.stiffness.with_flat(pencil.shifted(jnp.asarray(shift, pencil.stiffness.dtype)))
 
 
 class SparseLinearOperator(lx.AbstractLinearOperator):
-    """K − σM as a symmetric operator of lineax, on vectors (n,).
+    """The symmetric matrix K − σM as a linear operator of lineax, on vectors (n,).
 
     Attributes:
         matrix: the sparse matrix.
@@ -72,7 +72,7 @@ class SparseLinearOperator(lx.AbstractLinearOperator):
     matrix: PatternedOperator
 
     def __init__(self, domain: Any, shift: Float[Array, ""] | float = 0.0) -> None:
-        """Take what `factorise` takes; see there for errors. Its indices must not be traced, its entries may."""
+        """Assemble K − σM, with arguments and errors as for `factorise`. Entries may be traced, but not indices."""
         self.matrix = _shifted(domain, shift, "neumann", "consistent")
 
     def mv(self, vector: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -126,9 +126,9 @@ class _State(eqx.Module):
     """A factorised operator.
 
     Attributes:
-        factor: of A, or where it is complex, of the real symmetric matrix of real and imaginary parts.
-        hermitian: whether A is complex and Hermitian; None where it is real.
-        conjugate: whether the conjugate of A is meant.
+        factor: the factorisation of A or, if A is complex, of the real symmetric matrix of its real and imaginary part.
+        hermitian: whether a complex A is Hermitian and not symmetric; None if A is real.
+        conjugate: whether the state stands for the conjugate of A.
     """
 
     factor: FactorisedMatrix
@@ -138,9 +138,9 @@ class _State(eqx.Module):
     def conjugated(self) -> "_State":
         return _State(self.factor, self.hermitian, self.hermitian is not None and not self.conjugate)
 
-    # With A = R + iS, x = u + iv and b = c + id, A x = b is R u − S v = c and S u + R v = d. If A is Hermitian, S is
-    # antisymmetric and the matrix of both is symmetric as it stands; if A is symmetric, it is with the sign of the
-    # second equation changed.
+    # Let A = R + iS, x = u + iv and b = c + id. Then A x = b means R u − S v = c and S u + R v = d. If A is Hermitian,
+    # S is antisymmetric, and the matrix of this system is symmetric. If A is symmetric, the system becomes symmetric
+    # when the second equation changes sign.
     def solve(self, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         if self.hermitian is None:
             return self.factor.solve(b)
@@ -153,9 +153,9 @@ class _State(eqx.Module):
 class Multifrontal(lx.AbstractLinearSolver[_State]):
     """The factorisation of `factorise` as a solver of lineax, for symmetric and Hermitian operators, definite or not.
 
-    Sparse are `SparseLinearOperator`, multiples and sums of these, and real ones that are tridiagonal. All others are
-    made full by ``as_matrix``, and take n³ operations; complex ones those of a real one of twice the size. Derivatives
-    are those of lineax. The matrix must be regular.
+    A `SparseLinearOperator`, multiples and sums of these, and real tridiagonal operators are factorised as sparse
+    matrices. All other operators are converted by ``as_matrix`` and take n³ operations; a complex operator takes as
+    many as a real one of twice the size. Derivatives are those of lineax. The matrix must be nonsingular.
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> _State:
@@ -167,7 +167,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         definite = lx.is_positive_semidefinite(operator) or lx.is_negative_semidefinite(operator)
         if not (lx.is_symmetric(operator) or definite):
             raise ValueError(
-                "operator: `Multifrontal` takes symmetric and Hermitian ones; say so by a tag, such as "
+                "operator: it is not known to be symmetric or Hermitian; if it is, add a tag, such as "
                 "`lineax.TaggedLinearOperator(operator, lineax.symmetric_tag)`, or use `lineax.LU`"
             )
         if not jnp.issubdtype(jnp.result_type(*jax.tree.leaves(operator.in_structure())), jnp.complexfloating):
@@ -178,7 +178,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         return _State(factorised(_full(jnp.block([[real, -imaginary], below])), "operator"), hermitian)
 
     def compute(self, state: _State, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        """Solve with a factorised operator; NaN, which lineax calls singular, where it was."""
+        """Solve with a factorised operator; for a singular operator it is NaN, which lineax reports as singular."""
         flat, unflatten = ravel_pytree(vector)
         return unflatten(state.solve(flat)), lx.RESULTS.successful, {}
 

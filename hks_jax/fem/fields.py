@@ -1,4 +1,4 @@
-"""Fields that forms read: given at the nodes, on the elements, or as functions of the position."""
+"""Fields that forms read, given at the nodes, on the elements, or as functions of position."""
 
 from collections.abc import Callable
 from typing import Any, Literal
@@ -20,9 +20,9 @@ class Field(eqx.Module):
     """A field on the elements of a domain.
 
     Attributes:
-        values: one for all, or those of the nodes (*node_shape, …), of the elements (*elements, …), or of the
-            quadrature points in each element (*elements, q, …).
-        at: which of these; static.
+        values: one value for the domain, or values at the nodes (*node_shape, …), on the elements (*elements, …), or at
+            the quadrature points of each element (*elements, q, …).
+        at: the kind of places that have a value; static.
     """
 
     values: Float[Array, "..."]
@@ -33,7 +33,7 @@ class Field(eqx.Module):
     ) -> Float[Array, "E q ..."]:
         """Return the field at the quadrature points of all elements.
 
-        Nodal values are interpolated by the shape functions at these points; `corners` takes them to each element's.
+        Nodal values are interpolated by the shape functions; `corners` gathers the nodal values of each element.
         """
         values, n, q, axes = self.values, int(np.prod(elements)), len(shape_values), len(elements)
         if self.at == "nodes":
@@ -56,16 +56,16 @@ def checked_field(
     scalar: bool = False,
     positive: bool = False,
 ) -> Field:
-    """Return what a user gives as a field: a number, an array over nodes or elements, or a function of one position.
+    """Return the `Field` of a number, an array over nodes or elements, or a function of position.
 
-    What lies outside of the domain is ignored. Where values are traced, those that should be positive and are not
-    become NaN. Functions are evaluated at the quadrature points, whose `positions` are computed for them alone.
+    Values outside the domain are ignored. If a field must be positive, traced values that are not become NaN. Functions
+    are evaluated at the quadrature points, and only then `positions` is called.
 
     Raises:
-        ValueError: another shape; values that are NaN, infinite, or not positive (how many, and where the first is).
+        ValueError: another shape; values that are NaN, infinite or not positive (with their number and the first one).
     """
     values, at, inside = _placed(name, given, space, positions)
-    # A field with several numbers at each place is judged by the worst of them.
+    # If a field has several numbers at each place, one wrong number makes the place wrong.
     rest = values.ndim - (0 if inside is None else inside.ndim)
     if scalar and rest:
         raise ValueError(f"{name}: got shape {values.shape}; expected one number at each place: {_expected(space)}")
@@ -84,7 +84,7 @@ def checked_field(
 def _placed(
     name: str, given: Any, space: FunctionSpace, positions: Callable[[], Float[Array, "*elements q m"]]
 ) -> tuple[Array, Place, Bool[np.ndarray, "..."] | None]:
-    """Return the values of a field, what they belong to, and which of these are in the domain."""
+    """Return the values of a field, the kind of places that have them, and which places are in the domain."""
     nodes, elements = space.node_shape, space.elements
     if callable(given):
         x = positions()
@@ -105,7 +105,7 @@ def _placed(
 
 def _expected(space: FunctionSpace) -> str:
     return (
-        f"{space.node_shape}, one per node, {space.elements.shape}, one per element, a number, or a function of the "
+        f"{space.node_shape}, one per node, {space.elements.shape}, one per element, a number, or a function of "
         "position"
     )
 
@@ -134,5 +134,5 @@ def _check(
     remedy = "Raise" if positive and what == "not positive" else "Replace"
     raise ValueError(
         f"{name}: {int(wrong.sum())} of {int(counted.sum())} values are {what} (the first is {number}at {where}). "
-        f"{remedy} them, or leave these places out by a mask"
+        f"{remedy} these values, or exclude the places by a mask"
     )

@@ -1,7 +1,7 @@
-"""Weak forms: what is integrated for stiffness and mass. Those of the Laplace–Beltrami operator come first.
+"""Weak forms, the integrands of stiffness and mass, and their integrals over one element.
 
-A form is a function of two shape functions u and v and of a point w, linear in u and in v, and symmetric in the two. It
-is read as scikit-fem's forms are, and integrated over the domain with the volume √|T| dx.
+A form is a function of two shape functions u and v and of a point w. It is bilinear and symmetric in u and v, written
+as in scikit-fem, and integrated over the domain with the volume element √|T| dx.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,8 +19,8 @@ class ShapeFunction(NamedTuple):
     """A shape function at a point.
 
     Attributes:
-        value: (), or (c,) of one with c components.
-        grad: (d,) its derivatives by the coordinates x; or (c, d), ``grad[i, j]`` = ∂uᵢ/∂xⱼ.
+        value: its value, (), or (c,) for c components.
+        grad: (d,) its derivatives with respect to the coordinates x; or (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ.
     """
 
     value: Float[Array, "*c"]
@@ -28,13 +28,13 @@ class ShapeFunction(NamedTuple):
 
 
 class Point(eqx.Module):
-    """What is known at a point, beside shape functions.
+    """A point with the metric and the fields there.
 
     Attributes:
         metric: (d, d) the tensor T.
-        inverse: (d, d) its inverse; of a surface in space, where T is known in its tangential plane, the inverse there.
-        x: (d,) the position: coordinates on a grid, a place in space on a mesh. None for forms of the package.
-        fields: what a user gave, interpolated; ``w["name"]`` reads one.
+        inverse: (d, d) its inverse; on a surface in space, T and its inverse act on the tangent plane.
+        x: (d,) the position: coordinates on a grid, a point in space on a mesh. None for the package's own forms.
+        fields: the values of the user's fields; ``w["name"]`` reads one.
     """
 
     metric: Float[Array, "*q d d"]
@@ -46,7 +46,7 @@ class Point(eqx.Module):
         """Return a field at this point."""
         if name not in self.fields:
             there = ", ".join(map(repr, self.fields)) or "none"
-            raise ValueError(f"fields: a form reads {name!r}, and there is {there}; give fields={{{name!r}: …}}")
+            raise ValueError(f"fields: a form reads {name!r}; the fields are {there}. Pass fields={{{name!r}: …}}")
         return self.fields[name]
 
 
@@ -54,7 +54,7 @@ Form = Callable[[ShapeFunction, ShapeFunction, Point], Array]
 
 
 def laplace_beltrami(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
-    """The stiffness of −ρ⁻¹ div(ρ ∇·) + V: T⁻¹∇u·∇v + V u v, times ρ. Without V and ρ these are 0 and 1."""
+    """Return the stiffness ρ (T⁻¹∇u·∇v + V u v) of −ρ⁻¹ div(ρ ∇·) + V, with the defaults V = 0 and ρ = 1."""
     energy = u.grad @ w.inverse @ v.grad
     if "potential" in w.fields:
         energy = energy + w["potential"] * u.value * v.value
@@ -62,7 +62,7 @@ def laplace_beltrami(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
 
 
 def l2(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
-    """The mass, the inner product of L²: u v, or u·v, times ρ."""
+    """Return the mass ρ u·v, which is the inner product of L²."""
     return _weighted(jnp.sum(u.value * v.value), w)
 
 
@@ -71,16 +71,16 @@ def _weighted(density: Array, w: Point) -> Array:
 
 
 class WeakForm(NamedTuple):
-    """What is assembled on a domain; static.
+    """The forms of stiffness and mass, and how they are assembled; static.
 
     Attributes:
-        stiffness: its form.
-        mass: likewise.
-        lumped: whether the mass becomes a diagonal of row sums.
-        components: of the functions.
-        own: whether a form is the user's, of which nothing is known.
-        cancelling: whether shape functions are taken where the leading error of signatures cancels.
-        checked: whether their matrices can be looked at afterwards; else those that are not symmetric become NaN.
+        stiffness: the form of the stiffness.
+        mass: the form of the mass.
+        lumped: whether the mass becomes the diagonal matrix of its row sums.
+        components: the number of components of a function.
+        own: whether a form is the user's, so that no property of the operator is known.
+        cancelling: whether shape functions are evaluated where the leading error of signatures cancels.
+        checked: whether symmetry can be checked after assembly; otherwise unsymmetric element matrices become NaN.
     """
 
     stiffness: Form = laplace_beltrami
@@ -93,7 +93,7 @@ class WeakForm(NamedTuple):
 
 
 def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
-    """Return the functions (q, n) that are each of some in one component and 0 in the others: (q, n·c, c)."""
+    """Return the vector functions (q, n·c, c) that have one of n functions in one component, and 0 in the others."""
     if components == 1:
         return functions
     (h, dh), eye = functions, jnp.eye(components, dtype=functions.value.dtype)
@@ -102,15 +102,15 @@ def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
     return ShapeFunction(value.reshape(q, n, components), grad.reshape(q, n, components, -1))
 
 
-# A form is linear in u, so that it is a number for the value of u and one for each derivative, which its transpose
-# reads off: form(u, v, w) = flux(v)·(value, grad of u). For T⁻¹∇u·∇v it is T⁻¹∇v. So n evaluations do for n² pairs.
+# A form is linear in u, so that form(u, v, w) is the inner product of flux(v) with the value and gradient of u. The
+# transpose of the form gives the flux; for T⁻¹∇u·∇v it is T⁻¹∇v. So n evaluations suffice for n² pairs.
 def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, points: Point) -> Float[Array, "n n"]:
     """Integrate a form over one element, for all pairs of n shape functions: value (q, n, *c), grad (q, n, *c, d).
 
-    The volume of each of the q points includes √|T|.
+    Each of the q entries of ``volume`` is the weight of a quadrature point times √|T|.
 
     Raises:
-        ValueError: a form that does not return one number, or is not linear in u.
+        ValueError: a form that does not return one number, or that is not linear in u.
     """
     read = _reads(form, *(jax.tree.map(lambda leaf: leaf[0], each) for each in (functions, points)))
 
@@ -122,7 +122,7 @@ def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, 
         try:
             fluxes = jax.vmap(jax.vmap(flux, (0, None)))(functions, points)
         except (AssertionError, NotImplementedError) as error:
-            raise ValueError(f"{_name(form)}: not linear in u, a shape function; expected a bilinear form") from error
+            raise ValueError(f"{_name(form)}: got a form that is not linear in u; expected a bilinear form") from error
     total = jnp.zeros((), volume.dtype)
     for basis, of_form, counts in zip(functions, fluxes, read, strict=True):
         if counts:
@@ -132,16 +132,16 @@ def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, 
 
 
 def _reads(form: Form, functions: ShapeFunction, w: Point) -> tuple[bool, ...]:
-    """Return whether a form reads the value of u and its derivatives: by what it does not, nothing is multiplied."""
+    """Return whether a form depends on the value of u, and whether it depends on the gradient of u."""
     u = jax.tree.map(lambda leaf: leaf[0], functions)
     traced = jax.make_jaxpr(lambda *leaves: form(ShapeFunction(*leaves), u, w))(*u)
     if [(result.shape, result.dtype) for result in traced.out_avals] != [((), u.value.dtype)]:
         got = ", ".join(f"{result.dtype} of shape {result.shape}" for result in traced.out_avals)
-        raise ValueError(f"{_name(form)}: returns {got}; expected one number, {u.value.dtype} of shape ()")
+        raise ValueError(f"{_name(form)}: the form returns {got}; expected one number, {u.value.dtype} of shape ()")
     inputs = [id(variable) for equation in traced.jaxpr.eqns for variable in equation.invars]
     read = tuple(id(variable) in inputs for variable in traced.jaxpr.invars)
     if not any(read):
-        raise ValueError(f"{_name(form)}: reads nothing of u, a shape function; expected a form bilinear in u and v")
+        raise ValueError(f"{_name(form)}: got a form that does not depend on u; expected a form bilinear in u and v")
     return read
 
 
@@ -150,7 +150,7 @@ def _name(form: Form) -> str:
 
 
 def symmetric_or_nan(matrices: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
-    """Return matrices, NaN in place of those that are unsymmetric beyond rounding."""
+    """Return the matrices, with NaN in place of those that are unsymmetric beyond rounding."""
     skew = jnp.abs(matrices - jnp.swapaxes(matrices, -1, -2)).max((-2, -1), keepdims=True)
     size = jnp.abs(matrices).max((-2, -1), keepdims=True)
     return jnp.where(skew > ROUNDING * jnp.finfo(matrices.dtype).eps * size, jnp.nan, matrices)

@@ -1,4 +1,4 @@
-"""Stiffness and mass on grids: one element's integrals, mapped over all elements, as stencils."""
+"""Stiffness and mass on grids: the integrals over all elements, which are assembled into stencils."""
 
 from dataclasses import replace
 from functools import partial
@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
+from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
@@ -23,11 +24,14 @@ from hks_jax.fem.resolution import SampledMetric
 from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator
 
+_ON_HOST = 1 << 17
+"""Numbers in the tensors up to which NumPy integrates, in milliseconds, for which nothing is compiled."""
+
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
-    """Return the pencil of a field, of one problem of a doubled domain."""
-    # Masks, element and spacing go in as arrays, so that problems that differ only in them share one compilation. The
-    # element is made in double precision: its rounding would scale the whole metric.
+    """Return the pencil of a field, or of one problem of a doubled domain."""
+    # Masks, element and spacing are passed as arrays, so that problems that differ only in them share one compilation.
+    # The element is computed in double precision, since its rounding would scale the whole metric.
     tensors, spacing = field.tensors, field.grid.spacing
     element = tensor_product_element(space.dimension).stretched(spacing)
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
@@ -47,7 +51,7 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
-    """Return the positions of the quadrature points; those of an element that exists in place of those of others."""
+    """Return the positions of the quadrature points; elements outside the domain get those of one inside."""
     first = np.argwhere(space.elements)[0].astype(dtype)
     corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
     inner = tensor_product_element(space.dimension).values @ corners
@@ -68,7 +72,60 @@ def _points_from(
     return jnp.asarray(origin + spacing * (low[..., None, :] + inner))
 
 
-@jit_quickly(static_argnames=("periodic", "interpolation", "operator"))
+def _on_host(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return by NumPy the integrals of the Laplace–Beltrami operator, their change, or cotangents of the tensors."""
+    tensors, domain, elements, couplings, gradients, weights, _, _, fields, periodic, interpolation, operator = args
+    plain = operator == WeakForm(lumped=operator.lumped) and interpolation == "linear" and not fields
+    if not plain or tensors.size > _ON_HOST or (x is not None and len(jax.tree.leaves(x)) > 1):
+        return None
+    d, n, dtype, shape = len(periodic), 2 ** len(periodic), tensors.dtype, domain.shape
+    h, nodes = tensor_product_element(d).values.astype(dtype), np.asarray(tensors).reshape(-1, d, d)
+    corners = np.array(list(product((0, 1), repeat=d)))
+    offsets = (corners[None] - corners[:, None] + 1) @ 3 ** np.arange(d)[::-1]
+    numbers = wrap_nodes(np.arange(domain.size).reshape(shape), periodic)
+    cells = [numbers[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
+    cells = np.stack(cells, axis=-1)[np.asarray(elements)]
+    places = cells[:, :, None] + offsets * domain.size
+    of_stiffness = np.einsum("q,qia,qjb->qabij", weights, gradients, gradients).reshape(-1, n * n)
+    of_mass = np.einsum("q,qi,qj->qij", weights, h, h).reshape(-1, n * n)
+    coupled = np.ones((), bool) if couplings is None else couplings
+    known = np.where(spd.is_spd(nodes), 1, np.nan).astype(dtype)[:, None, None]
+
+    def inside(nodal: np.ndarray) -> np.ndarray:
+        at_corners = (nodal * known)[cells].reshape(-1, n, d * d)
+        return np.matmul(h, at_corners).reshape(-1, n, d, d)
+
+    def integrals(flux: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, ...]:
+        of_elements = flux.reshape(len(cells), -1) @ of_stiffness, root @ of_mass
+        sums = (np.bincount(places.ravel(), each.ravel(), 3**d * domain.size) for each in of_elements)
+        stiffness, mass = (each.astype(dtype).reshape(3**d, *shape) for each in sums)
+        lumped = mass.sum(axis=0)
+        return np.where(coupled, stiffness, 0), np.where(coupled, mass, 0), lumped, lumped.sum()
+
+    # Integrated are √|T| T⁻¹ and √|T|, whose changes are √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and ½√|T| tr(T⁻¹dT).
+    metric = inside(nodes)
+    root, inverse = np.sqrt(spd.determinant(metric)), spd.inverse(metric)
+    flux, across = root[..., None, None] * inverse, np.swapaxes(inverse, -1, -2)
+    if x is None:
+        return integrals(flux, root)
+    if y is None:
+        change = inside(np.asarray(x[0]).reshape(-1, d, d))
+        half = np.sum(across * change, axis=(-2, -1)) / 2
+        return integrals(half[..., None, None] * flux - flux @ change @ inverse, root * half)
+    stiffness, mass = np.where(coupled, y[0], 0), np.where(coupled, y[1], 0) + y[2] + y[3]
+    of_flux, of_root = (
+        each.ravel()[places].reshape(-1, n * n) @ table.T
+        for each, table in ((stiffness, of_stiffness), (mass, of_mass))
+    )
+    of_flux = of_flux.reshape(metric.shape)
+    half = (np.sum(flux * of_flux, axis=(-2, -1)) + root * of_root) / 2
+    of_metric = half[..., None, None] * across - root[..., None, None] * across @ of_flux @ across
+    of_corners = np.matmul(h.T, of_metric.reshape(-1, n, d * d)).reshape(-1, d * d)
+    sums = [np.bincount(cells.ravel(), each, domain.size) for each in of_corners.T]
+    return [(np.stack(sums, axis=-1).reshape(-1, d, d) * known).astype(dtype).reshape(tensors.shape)]
+
+
+@jit_quickly(static_argnames=("periodic", "interpolation", "operator"), on_host=_on_host)
 def _grid_integrals(
     tensors: Float[Array, "*shape d d"],
     domain: Bool[np.ndarray | Array, "*shape"],
@@ -85,13 +142,13 @@ def _grid_integrals(
 ) -> tuple[Array, Array, Array, Array]:
     """Return stiffness and mass as stencils, the row sums of the mass at all nodes, and the volume.
 
-    Of functions with several components the matrices of all elements in place of stencils.
+    If functions have several components, return the matrices of all elements in place of stencils.
     """
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 
-    # Logarithms are taken at the nodes, and exponentials at the quadrature points, once: the compiler would fuse them
-    # into everything that reads a component, and compute them again for each.
+    # Logarithms are computed at the nodes, and exponentials at the quadrature points. The barriers keep the compiler
+    # from fusing the exponentials into each use of a component, and so from repeating them.
     nodal = tensors if interpolation == "linear" else spd.log(tensors)
     metric = jax.vmap(lambda corners: at_quadrature(corners, element))(_at_corners(nodal, periodic))
     if interpolation == "log-euclidean":
@@ -119,7 +176,7 @@ def _grid_integrals(
     if operator.components > 1:
         return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
     stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
-    # Before the couplings to eliminated nodes go: the basis functions add up to one only together with theirs.
+    # The sums include the couplings to eliminated nodes, because only all basis functions add up to one.
     lumped = volumes = jnp.sum(mass, axis=0)
     if "density" in fields:
         volumes = kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None])
@@ -130,7 +187,7 @@ def _grid_integrals(
 
 
 def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ...]) -> Float[Array, "E n ..."]:
-    """Gather what is at the nodes at the corners of every element."""
+    """Gather nodal values at the corners of every element."""
     d, rest = len(periodic), nodal.shape[len(periodic) :]
     nodes = jnp.pad(nodal, [*[(0, int(wraps)) for wraps in periodic], *[(0, 0)] * len(rest)], mode="wrap")
     corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
@@ -138,19 +195,19 @@ def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ..
 
 
 def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
-    """Add up element matrices into 3^d coefficients a node.
+    """Assemble element matrices into 3^d coefficients per node.
 
-    Local pair (a, b) of corners couples the element's node at corner a to the node at offset b − a.
+    Entry (a, b) of an element matrix couples the node at corner a to the node at offset b − a.
     """
     d = len(periodic)
     couplings = jnp.moveaxis(matrices, (-2, -1), (0, 1)).reshape(2**d, *(2,) * d, *matrices.shape[:d])
-    # For all corners b at once: one pad for each a, and not one for each pair, is half as long to compile in 3D.
+    # One pad for each a, with all corners b at once, compiles twice as fast in 3D as one for each pair.
     total = jnp.zeros((), matrices.dtype)
     for a, node in enumerate(product((0, 1), repeat=d)):
         total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
     total = total.reshape(3**d, *total.shape[d:])
     for axis, wraps in enumerate(periodic, start=1):
-        if wraps:  # the last node is the first again
+        if wraps:  # the last node is the first node
             inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
             last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])

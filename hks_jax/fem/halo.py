@@ -1,4 +1,4 @@
-"""The nodes beyond a nodal array: its rim, and for grids cut into slabs, one for each device, the adjacent planes."""
+"""Nodal arrays padded by the nodes beyond their sides, and grids that are cut into one slab per device."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from hks_jax.traced import is_traced
 
 
 def with_rim(x: Float[Array, "*shape"], periodic: tuple[bool, ...], first: int = 0) -> Float[Array, "*rimmed"]:
-    """Return x with a node more at either end of some axes, from the ``first`` on: the opposite one's, or zero."""
+    """Pad x by one node at both ends of the axes from ``first`` on: periodically, or by zeros."""
     for axis, wraps in enumerate(periodic, start=first):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
         x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
@@ -23,7 +23,7 @@ def with_rim(x: Float[Array, "*shape"], periodic: tuple[bool, ...], first: int =
 
 
 def neighbours(x: Float[Array, "*rimmed"], dimension: int) -> Iterator[Float[Array, "*shape"]]:
-    """Go through x shifted by each offset along its first axes, so many, which are given with their rim."""
+    """Yield x shifted by each of 3^d offsets along its first d = ``dimension`` axes, along which x is padded."""
     after = (0,) * (x.ndim - dimension)
     shape = [n - 2 if axis < dimension else n for axis, n in enumerate(x.shape)]
     for start in product((0, 1, 2), repeat=dimension):
@@ -32,9 +32,9 @@ def neighbours(x: Float[Array, "*rimmed"], dimension: int) -> Iterator[Float[Arr
 
 
 def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:
-    """Return the coefficients, a node's side by side in memory: read in 3^d places, a product takes twice as long.
+    """Return the coefficients with those of each node adjacent in memory, which halves the time of a product.
 
-    Flat, as XLA would otherwise choose an order of the axes itself.
+    The result is flat, since XLA would otherwise choose the order of its axes.
     """
     return jnp.moveaxis(coefficients, 0, -1).reshape(-1)
 
@@ -42,7 +42,7 @@ def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, "
 def product_with_rim(
     coefficients: Float[Array, "offsets *shape"],
 ) -> Callable[[Float[Array, "*rimmed b"]], Float[Array, "*shape b"]]:
-    """Return the product of a stencil with columns whose neighbours beyond all sides are there."""
+    """Return the product of a stencil with columns that are padded by `with_rim`."""
     shape, together = coefficients.shape[1:], side_by_side(coefficients)
 
     def apply(x: Float[Array, "*rimmed b"]) -> Float[Array, "*shape b"]:
@@ -56,7 +56,7 @@ def product_with_rim(
 
 
 def checked_mesh(mesh: Any) -> Mesh:
-    """Return a mesh of devices with one axis, of which XLA chooses the layout of arrays where we do not."""
+    """Return a mesh of devices with one axis, on which XLA chooses the layout of arrays that have none."""
     if not isinstance(mesh, Mesh) or len(mesh.axis_names) != 1:
         got = f"the axes {mesh.axis_names}" if isinstance(mesh, Mesh) else type(mesh).__name__
         raise ValueError(
@@ -70,12 +70,12 @@ def checked_mesh(mesh: Any) -> Mesh:
 class Slabs:
     """A grid cut across its first axis into slabs of equal thickness, one for each device. Static and hashable.
 
-    Where the axis does not divide evenly, the last slabs are padded: with zeros, which couple to nothing.
+    If the axis does not divide evenly, the last slabs are padded with zeros, which are coupled to no node.
 
     Attributes:
-        mesh: devices along one axis, in the order of the slabs.
-        shape: nodes along each axis of the grid.
-        periodic: whether each axis is.
+        mesh: the devices along one axis, in the order of the slabs.
+        shape: the number of nodes along each axis of the grid.
+        periodic: for each axis, whether it is periodic.
 
     Raises:
         ValueError: a mesh with several axes.
@@ -95,7 +95,7 @@ class Slabs:
 
     @property
     def thickness(self) -> int:
-        """Nodes of a slab along the first axis."""
+        """The number of nodes of a slab along the first axis."""
         return -(-self.shape[0] // self.mesh.size)
 
     @property
@@ -109,20 +109,20 @@ class Slabs:
         return (self.thickness * self.mesh.size, *self.shape[1:])
 
     def spec(self, axis: int) -> PartitionSpec:
-        """Return the partition of arrays whose ``axis`` is the grid's first."""
+        """Return the partition of arrays whose ``axis`` is the first axis of the grid."""
         return PartitionSpec(*[None] * axis, self.name)
 
     def split(self, x: Any, axis: int = 0) -> Array:
-        """Pad an array whose ``axis`` is the grid's first, and lay each slab on its device.
+        """Pad an array whose ``axis`` is the first axis of the grid, and place each slab on its device.
 
-        Of several processes, each gives the whole array.
+        If there are several processes, each passes the whole array.
         """
         if is_traced(x):
             return jax.lax.with_sharding_constraint(self._padded(x, axis), NamedSharding(self.mesh, self.spec(axis)))
         return jax.jit(self._padded, static_argnums=1, out_shardings=NamedSharding(self.mesh, self.spec(axis)))(x, axis)
 
     def join(self, x: Array, axis: int = 0) -> Array:
-        """Cut the padding off again. If there was any, every device has the result whole."""
+        """Remove the padding. If there was any, every device holds the whole result."""
         return jax.lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
 
     @partial(jax.jit, static_argnums=0)
@@ -131,7 +131,7 @@ class Slabs:
     ) -> Float[Array, "*padded b"]:
         """Return the product of a stencil's coefficients with columns, both from `split` (axes 1 and 0).
 
-        Linear in both, differentiable, transposable. Each device sends two planes of the columns, and receives two.
+        The product is bilinear and differentiable. Each device sends and receives two planes of the columns.
         """
         self.check("coefficients", coefficients, 1)
         self.check("x", x, 0)
@@ -145,17 +145,17 @@ class Slabs:
         return jax.shard_map(share, mesh=self.mesh, in_specs=specs, out_specs=self.spec(0))(coefficients, x)
 
     def check(self, name: str, x: Array, axis: int) -> None:
-        """Raise unless the array is one that `split` returned."""
+        """Raise ValueError unless the array has the padded shape that `split` returns."""
         got = x.shape[axis : axis + len(self.shape)]
         if got != self.padded_shape:
             raise ValueError(
-                f"{name}: got shape {x.shape}; expected {self.padded_shape} at axis {axis}, as Slabs.split makes it"
+                f"{name}: got shape {x.shape}; expected {self.padded_shape} at axis {axis}, as Slabs.split returns it"
             )
 
-    # What follows is for the inside of shard_map, on one device's share.
+    # The methods below are called inside `shard_map`, on the slab of one device.
 
     def with_halo(self, x: Float[Array, "*slab b"]) -> Float[Array, "*rimmed b"]:
-        """Return the slab with the neighbours' adjacent planes, and its rim along the other axes."""
+        """Return the slab with the adjacent planes of its neighbours, and padded along the other axes."""
         last, planes = divmod(self.shape[0] - 1, self.thickness)
         up = [(i, i + 1) for i in range(last)]
         down = [(i + 1, i) for i in range(last)]
@@ -164,7 +164,7 @@ class Slabs:
         if self.periodic[0]:
             up, down = [*up, (last, 0)], [*down, (0, last)]
             if planes + 1 < self.thickness:
-                # The last node, and what follows it, are amid the padding of the last slab that has any nodes.
+                # In the last slab that has nodes, padding follows them, and the plane above belongs right after them.
                 is_last = jax.lax.axis_index(self.name) == last
                 top = jnp.where(is_last, jax.lax.slice_in_dim(x, planes, planes + 1, axis=0), top)
                 place = jnp.where(is_last, planes + 2, place)
@@ -176,7 +176,7 @@ class Slabs:
         return with_rim(x, self.periodic[1:], first=1)
 
     def own(self, x: Array, axis: int = 0) -> Array:
-        """Return this device's slab of an array that every device has whole."""
+        """Return this device's slab of an array that is whole on every device."""
         start = jax.lax.axis_index(self.name) * self.thickness
         return jax.lax.dynamic_slice_in_dim(self._padded(x, axis), start, self.thickness, axis=axis)
 
@@ -187,6 +187,6 @@ class Slabs:
     def _padded(self, x: Any, axis: int) -> Array:
         x = jnp.asarray(x)
         if x.shape[axis : axis + len(self.shape)] != self.shape:
-            raise ValueError(f"x: got shape {x.shape}; expected the grid's {self.shape} from axis {axis} on")
+            raise ValueError(f"x: got shape {x.shape}; expected the grid's {self.shape} at axis {axis}")
         missing = self.padded_shape[0] - self.shape[0]
         return jnp.pad(x, [(0, missing if a == axis else 0) for a in range(x.ndim)]) if missing else x

@@ -19,19 +19,19 @@ from hks_jax.fem.space import MeshSpace, vector_space
 
 
 def mesh_nodes(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array, "nodes 3"]:
-    """Return the places of the nodes: the vertices, and of degree 2 the middles of the edges."""
+    """Return the positions of the nodes: the vertices and, for degree 2, the midpoints of the edges."""
     if degree not in (1, 2):
         raise ValueError(f"degree: got {degree!r}; expected 1 or 2")
     vertices = mesh.vertices
     if degree == 1:
         if midpoints is not None:
-            raise ValueError("midpoints: got with degree=1, whose sides are straight; pass degree=2")
+            raise ValueError("midpoints: got positions with degree=1, whose edges are straight; pass degree=2")
         return vertices
     middles = jnp.mean(vertices[mesh.triangulation.edges], axis=1)
     if midpoints is None:
         return jnp.concatenate([vertices, middles])
     if mesh._metric is not None:
-        raise ValueError("midpoints: the mesh has a metric of its own, constant in each cell; leave midpoints out")
+        raise ValueError("midpoints: got positions for a mesh with a given metric; leave out midpoints or metric")
     moved = midpoints
     if callable(midpoints):
         on_surface = mesh.triangulation.boundary_edges | (mesh.triangulation.dimension == 2)
@@ -39,14 +39,14 @@ def mesh_nodes(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array
     moved = real_array("midpoints", moved)
     if moved.shape != middles.shape:
         raise ValueError(
-            f"midpoints: got shape {moved.shape}; expected {middles.shape}, one for each of "
-            "mesh.triangulation.edges, or a function of one place"
+            f"midpoints: got shape {moved.shape}; expected {middles.shape}, a position for each of "
+            "mesh.triangulation.edges, or a function of one position"
         )
     return jnp.concatenate([vertices, moved.astype(vertices.dtype)])
 
 
 def mesh_points(nodes: Float[Array, "nodes 3"], space: MeshSpace) -> Float[Array, "n q 3"]:
-    """Return the places of the quadrature points in each cell."""
+    """Return the positions of the quadrature points in each cell."""
     values = jnp.asarray(simplex_element(space.dimension, space.degree).values, nodes.dtype)
     return jnp.einsum("qi,nix->nqx", values, nodes[space.cells], precision="highest")
 
@@ -60,7 +60,7 @@ def assemble_mesh(
     operator: WeakForm,
     curved: bool,
 ) -> Pencil:
-    """Return the pencil of a mesh, whose sides the nodes curve or not."""
+    """Return the pencil of a mesh; if it is ``curved``, its edges pass through their midpoints."""
     element = simplex_element(space.dimension, space.degree)
     shape = len(space.cells), element.weights.size
     if curved:
@@ -82,7 +82,7 @@ def assemble_mesh(
     lumped = volumes = row_sums_of(own, mass)
     if "density" in fields:
         volumes = jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype)
-    # How far P1 elements err is known from their edges; of P2 no such estimate is.
+    # The error of P1 elements is estimated from the lengths of edges. No such estimate is known for P2.
     sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
     return assembled(
         gathered(own, stiffness), gathered(own, mass), lumped, sampled, jnp.sum(volumes), own, operator, fields

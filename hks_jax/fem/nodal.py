@@ -1,4 +1,4 @@
-"""The pencil of a grid on nodal arrays, without a mask: what is compiled for it serves every mask."""
+"""The pencil of a grid on all nodes, with masks as arrays, so that all masks share compiled code."""
 
 from collections.abc import Callable
 
@@ -21,14 +21,14 @@ from hks_jax.traced import is_traced
 
 
 class NodalPencil(eqx.Module):
-    """K and M on one grid, its nodes' masks as arrays: what is compiled for one mask serves all.
+    """The matrices K and M on all nodes of a grid, with masks as arrays.
 
     Attributes:
         stiffness: K.
         mass: M; a diagonal if lumped.
-        lumped: (*shape,) the row sums D of M, constant to derivatives; 1 at nodes that are not free.
-        free: (*shape,) nodes that carry a degree of freedom.
-        domain: (*shape,) nodes of the domain: free ones, and those where functions vanish.
+        lumped: (*shape,) the row sums D of M, without derivatives; 1 at nodes that are not free.
+        free: (*shape,) the nodes that carry a degree of freedom.
+        domain: (*shape,) the nodes of the domain: free nodes, and nodes where functions vanish.
     """
 
     stiffness: Stencil
@@ -44,27 +44,27 @@ class NodalPencil(eqx.Module):
 
     @property
     def periodic(self) -> tuple[bool, ...]:
-        """Whether each axis is."""
+        """Whether each axis is periodic."""
         return self.stiffness.periodic
 
     @property
     def lumped_or_zero(self) -> Float[Array, "*shape"]:
-        """D, 0 at nodes that are not free."""
+        """The row sums D, but 0 at nodes that are not free."""
         return jnp.where(self.free, self.lumped, 0)
 
     def cut(self, mesh: Mesh | None) -> Slabs | None:
-        """Return the cuts of the grid for a number of devices; None for one."""
+        """Return the cut of the grid for several devices; None for one device."""
         return None if mesh is None else Slabs(mesh, self.shape, self.periodic)
 
     def own(self, slabs: Slabs | None) -> "NodalPencil":
-        """Return this device's share, inside of `shard_map`."""
+        """Return this device's slab, inside `shard_map`."""
         if slabs is None:
             return self
         masks = (slabs.own(x) for x in (self.lumped, self.free, self.domain))
         return NodalPencil(self.stiffness.own(slabs), self.mass.own(slabs), *masks)
 
     def products(self) -> Callable[[Float[Array, "*shape b"]], tuple[Float[Array, "*shape b"], ...]]:
-        """Return x ↦ (Kx, Mx), for which neighbours are fetched once; for products in a loop, call this outside."""
+        """Return x ↦ (Kx, Mx), which fetches neighbours once for both; call this outside of a loop."""
         stiffness, mass = self.stiffness.of_rimmed(), self.mass.of_rimmed()
 
         def both(x: Float[Array, "*shape b"]) -> tuple[Float[Array, "*shape b"], ...]:
@@ -73,13 +73,13 @@ class NodalPencil(eqx.Module):
 
         return both
 
-    # A polynomial in D⁻¹M with fixed coefficients, so that P is linear and symmetric: |1 − μ p(μ)| ≤ 1/T_m(σ) on the
-    # spectrum [low, 1] of D⁻¹M, σ = (1 + low)/(1 − low). (Its upper end is 1 by Gershgorin's theorem, as the entries of
-    # M are not negative.)
+    # P is p(D⁻¹M)D⁻¹ with a fixed polynomial p, and so linear and symmetric. On the spectrum [low, 1] of D⁻¹M,
+    # |1 − μ p(μ)| ≤ 1/T_m(σ), where σ = (1 + low)/(1 − low). The upper end is 1 by Gershgorin's theorem, since the
+    # entries of M are not negative.
     def mass_solve(
         self, low: Float[Array, ""] | float, degree: int
     ) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return r ↦ Pr, P ≈ M⁻¹ by a number of steps of Chebyshev iteration; exact where the mass is lumped."""
+        """Return r ↦ Pr, where P ≈ M⁻¹ by ``degree`` steps of Chebyshev iteration; P is exact if M is lumped."""
         inverse, mass = 1 / self.lumped[..., None], self.mass.of_columns()
         if self.mass.is_diagonal:
             return lambda r: inverse * r
@@ -88,19 +88,19 @@ class NodalPencil(eqx.Module):
 
 
 def lump(stiffness: Stencil, mass: Stencil, free: Bool[Array, "*shape"], domain: Bool[Array, "*shape"]) -> NodalPencil:
-    """Return the pencil of these matrices."""
+    """Return the pencil of these matrices, with the row sums of the mass."""
     sums = jnp.where(free, jnp.sum(mass.coefficients, axis=0), 1)
     return NodalPencil(stiffness, mass, jax.lax.stop_gradient(sums), free, domain)
 
 
 def nodal_pencil(pencil: Pencil) -> NodalPencil:
-    """Return a grid's pencil on nodal arrays."""
+    """Return the pencil of a grid on nodal arrays."""
     space = pencil.space
     assert isinstance(space, GridSpace)
     stiffness, mass = (
         Stencil(coefficients_of(each, space), space.periodic) for each in (pencil.stiffness, pencil.mass)
     )
-    # Under `jit` they are known, and without the barrier the compiler would compute with them, node by node.
+    # Under `jit` the masks are constants, and without the barrier the compiler would compute with them.
     masks = (jnp.asarray(mask_for(pencil, mask)) for mask in (space.free, space.domain))
     return lump(stiffness, mass, *jax.lax.optimization_barrier(tuple(masks)))
 
@@ -108,7 +108,7 @@ def nodal_pencil(pencil: Pencil) -> NodalPencil:
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
     """Return rows of flat nodal arrays as a block of columns."""
     # The barriers, here and below, keep XLA from fusing the transposition with the products before or after it, which
-    # would then go through memory in the wrong order.
+    # would then access memory in the wrong order.
     return jax.lax.optimization_barrier(jnp.moveaxis(rows.reshape(-1, *shape), 0, -1))
 
 
@@ -118,16 +118,16 @@ def to_rows(columns: Float[Array, "*shape b"]) -> Float[Array, "b nodes"]:
 
 
 _FILLED = {2: 0.45, 3: 0.6}
-"""The least share of free nodes, by dimension. With half of them, later calls are 1.4 to 1.9 times slower in 2D, which
-some ten of them take to lose what the first one gains; factors of volumes grow faster."""
+"""The least fraction of free nodes, by dimension. If half are free, later calls in 2D are 1.4 to 1.9 times slower, and
+about ten of them lose the time that the first call saves. In 3D the costs of factors grow faster."""
 
 
 def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
-    """Return a pencil on all nodes of a grid, whose lowest eigenpairs are those of the pencil given, if that pays.
+    """Return a pencil on all nodes of a grid with the same lowest eigenpairs, if that is faster.
 
-    Each node that is not free is an equation of its own, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
-    the spectrum; eigenvectors of others vanish there. The pencil is returned as it is where k, the number of pairs that
-    are wanted, exceeds that quarter, and where values are traced: they are compiled for their mask in any case.
+    Each node i that is not free gets a separate equation, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
+    the spectrum; other eigenvectors vanish there. The pencil is returned unchanged if the number k of pairs exceeds
+    that quarter, or if values are traced, since code is then compiled for each mask anyway.
     """
     parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
     return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)
@@ -154,21 +154,20 @@ def _of_one(pencil: Pencil) -> Pencil:
         vectors = space.extend(nulls.vectors, outside=0.0)
         nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
     sums = pencil.row_sums
-    if sums is not None:  # with infinite ones, nothing is read from neighbours
+    if sums is not None:  # an infinite sum ignores the neighbours
         sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
     known_of_it = StencilOperator(of_stiffness, whole), mass, pencil.metric, pencil.volume, whole
     return Pencil(*known_of_it, null_space=nulls, lower_bound=pencil.lower_bound, row_sums=sums)
 
 
-# A Rayleigh quotient, the largest Kᵢᵢ/Mᵢᵢ is no more than the largest eigenvalue: the spectrum becomes no wider. It is
-# more than the lowest quarter of the spectrum: on a uniform grid with the consistent mass it is 6/h² in 2D and 9/h² in
-# 3D, where by Weyl's law that quarter ends at 3.1/h² and 6/h². With a lumped mass it is 2.7/h² in both, hence the
-# factor.
+# The largest Kᵢᵢ/Mᵢᵢ is a Rayleigh quotient and so at most the largest eigenvalue: the spectrum does not become wider.
+# It exceeds the lowest quarter of the spectrum: on a uniform grid with the consistent mass it is 6/h² in 2D and 9/h² in
+# 3D, and by Weyl's law that quarter ends at 3.1/h² and 6/h². With a lumped mass it is 2.7/h² in both, hence the factor.
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]
 ) -> tuple[Float[Array, "offsets *shape"], Float[Array, "m *shape"]]:
-    """Return the coefficients with an equation of its own for each node that is not free."""
+    """Return the coefficients with a separate equation for each node that is not free."""
     of_stiffness, of_mass = len(stiffness) // 2, len(mass) // 2
     diagonals = jax.lax.stop_gradient((stiffness[of_stiffness], mass[of_mass]))
     own, unit = (jnp.where(free, diagonal, 0) for diagonal in diagonals)

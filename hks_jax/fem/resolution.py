@@ -1,4 +1,4 @@
-"""How well a grid or a mesh resolves a metric: the nodal numbers behind estimates of the discretisation error."""
+"""The resolution of a metric by a grid or a mesh: nodal quantities for estimates of the discretisation error."""
 
 from itertools import combinations
 from typing import Any
@@ -16,12 +16,12 @@ from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, mask_for
 
 
 class SampledMetric(eqx.Module):
-    """The metric that a pencil was assembled from, for estimates; constant to derivatives.
+    """The metric from which a pencil was assembled, for error estimates; derivatives treat it as constant.
 
     Attributes:
-        tensors: (*shape, d, d) at the nodes of a grid; or (n_cells, d, d) in the cells of a mesh, in their own edges.
-        spacing: (d,) of the grid; None on a mesh.
-        interpolation: what lies between the nodes.
+        tensors: (*shape, d, d) at the nodes of a grid; or (n_cells, d, d) in the basis of each mesh cell's edges.
+        spacing: (d,) the spacing of the grid; None on a mesh.
+        interpolation: the interpolation between the nodes.
     """
 
     tensors: Float[Array, "*shape d d"]
@@ -30,15 +30,14 @@ class SampledMetric(eqx.Module):
 
 
 class Resolution(eqx.Module):
-    """What the spacing does to heat kernel signatures, to leading order; see `truncation`. Constant to derivatives.
+    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`); not differentiated.
 
     Attributes:
-        mesh_width: (*shape) the local distance of neighbouring nodes in the units of the metric.
-        dispersion: (*shape) a in the bias (a/t)^order, in (metric length)², of tensors that do not vary.
-        turning: (*shape) the relative error of eigenvalues, whatever their size, because tensors turn or stretch
-            between neighbours.
+        mesh_width: (*shape) the local distance between neighbouring nodes in the units of the metric.
+        dispersion: (*shape) the number a in the relative bias (a/t)^order for constant tensors, in (metric length)².
+        turning: (*shape) the relative error of every eigenvalue from tensors that rotate or stretch between neighbours.
         swelling: the relative error of the domain's area or volume.
-        order: 2 where the leading error cancels, else 1.
+        order: 2 if the leading error cancels, else 1.
     """
 
     mesh_width: Float[Array, "*shape"]
@@ -49,9 +48,9 @@ class Resolution(eqx.Module):
 
 
 def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, cancelling: bool) -> Resolution:
-    """Return what the spacing of a grid, or the edges of a mesh, do to the functions of a space."""
+    """Return the resolution of the functions of a space, from the spacing of a grid or the edges of a mesh."""
     if isinstance(space, GridSpace):
-        # The mask goes in as an array, so that grids that differ only in it share one compilation.
+        # The mask is passed as an array, so that grids that differ only in the mask share one compilation.
         domain = mask_for(metric.tensors, space.domain)
         settings = space.periodic, metric.interpolation, lumped, cancelling
         return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings), order=1 + cancelling)
@@ -59,21 +58,21 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
     return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
 
 
-# Where tensors hardly vary, a plane wave of wave vector k has the discrete eigenvalue λ(1 + δ) with
-# λδ = Σₐ hₐ² g^aa kₐ⁴/12 and, the mass being that of the interpolant, a nodal square larger by Σₐ hₐ²kₐ²/6. In the
-# signature k is normal with covariance g/2t: E kₐ² = gₐₐ/2t and E kₐ⁴ = 3gₐₐ²/4t², so that its relative error is
+# If tensors are nearly constant, a plane wave with wave vector k has the discrete eigenvalue λ(1 + δ), where λδ =
+# Σₐ hₐ² g^aa kₐ⁴/12. With the consistent mass, its squared nodal values are too large by the factor 1 + Σₐ hₐ²kₐ²/6. In
+# the signature, k is normal with covariance g/2t: E kₐ² = gₐₐ/2t and E kₐ⁴ = 3gₐₐ²/4t². So its relative error is
 #
 #     −t E λδ + E Σₐ hₐ²kₐ²/6 = Σₐ hₐ² (gₐₐ/12 − g^aa gₐₐ²/16)/t.
 #
-# A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6, which adds d/24 Σₐ hₐ²gₐₐ/t, by E λkₐ² = (d + 2)gₐₐ/4t²;
-# 1/20 in place of 1/24 is what the next terms make of it at t = 6h².
+# A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6. By E λkₐ² = (d + 2)gₐₐ/4t² this adds d/24 Σₐ hₐ²gₐₐ/t. The
+# code has 1/20 in place of 1/24, which includes the next terms at t = 6h².
 #
-# Where the leading error cancels (hks_jax/fem/elements.py) and the tensor is diagonal, λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240 and
-# the nodal square is larger by (Σₐ hₐ²kₐ²)²/576: with E kₐ⁶ = 15gₐₐ³/8t³ the relative error is
+# If the leading error cancels (hks_jax/fem/elements.py) and the tensor is diagonal, λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240, and the
+# squared nodal values have the factor 1 + (Σₐ hₐ²kₐ²)²/576. With E kₐ⁶ = 15gₐₐ³/8t³ the relative error is
 #
 #     Σₐ hₐ⁴gₐₐ²/128t² + Σₐᵦ hₐ²hᵦ² (gₐₐgᵦᵦ + 2gₐᵦ²)/2304t².
 #
-# Of tensors that are turned it is twice to half as much.
+# For tensors that are not diagonal, the error is half to twice as large.
 def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> Any:
     """Return `Resolution.dispersion` (*shape) of Q1 elements."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
@@ -90,12 +89,12 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
     return total
 
 
-# Between neighbours along axis a the flux matrix A = √|T| T⁻¹ varies by δA. An element sees its mean; the exact
-# solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p, and its energy, Aₐₐ(∂ₐ²w)² hₐ²/12, is what the
-# element lacks: with p of covariance A⁻¹ it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, in units of what p has along one axis. That is for
-# √t above the length on which A varies. Below it the error is of the same size, but no such sum of neighbours.
+# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element averages it. The exact
+# solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. An element lacks the energy of the corrector,
+# Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis.
+# The estimate holds for √t above the length on which A varies; for smaller t only its size is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
-    """Return the relative error (*shape) of eigenvalues because the tensors vary between neighbours in the domain."""
+    """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]
     flux, reciprocal = spd.adjugate(tensors) / root, tensors / root
     total = xp.zeros(tensors.shape[:-2], tensors.dtype)
@@ -110,10 +109,11 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> 
     return total
 
 
-# Interpolation along axis a errs by −ξ(h − ξ)/2 times the second derivative, in the mean by −h²/12 times it, and the
-# density √|T| by half the trace of T⁻¹ times that: tr T⁻¹∂ₐ²T for T interpolated, ∂ₐ²log|T| for its logarithm.
+# The error of interpolation along axis a is −ξ(h − ξ)/2 times the second derivative, on average −h²/12 times it. The
+# relative error of the density √|T| is half the trace of T⁻¹ times the error of T. This gives tr T⁻¹∂ₐ²T if T is
+# interpolated, and ∂ₐ²log|T| if its logarithm is interpolated.
 def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
-    """Return the relative error of the domain's volume because of the interpolation between the nodes."""
+    """Return the relative error of the domain's volume due to the interpolation between the nodes."""
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)
     density, total = xp.sqrt(determinant), xp.zeros((), tensors.dtype)
     for a, wraps in enumerate(periodic):
@@ -130,7 +130,7 @@ def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], in
 
 
 def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
-    """Tell which nodes (*shape) are in the domain with the next one along the axis."""
+    """Mark the nodes (*shape) that are in the domain together with the next node along the axis."""
     pairs = xp.logical_and(domain, xp.roll(domain, -1, axis))
     if wraps:
         return pairs
@@ -160,10 +160,10 @@ def _of_grid(
 
 
 _BIAS = (0.03, 0.22)
-"""c in the relative bias c·h²/t of P1 elements with consistent and lumped mass, h the longest edge.
+"""The constant c in the relative bias c·h²/t of P1 elements with consistent and lumped mass; h is the longest edge.
 
-The medians over the nodes of squares, spheres, boxes and balls, cut regularly or jittered, were 0.008 … 0.028 and
-0.03 … 0.14.
+The medians of c over the nodes of regular and perturbed meshes of squares, spheres, boxes and balls were 0.008 … 0.028
+and 0.03 … 0.14.
 """
 
 
@@ -171,7 +171,7 @@ The medians over the nodes of squares, spheres, boxes and balls, cut regularly o
 def _of_mesh(
     metric: Float[Array, "n d d"], cells: Int[np.ndarray | Array, "n corners"], n_vertices: int, lumped: bool
 ) -> Resolution:
-    """A vertex is as coarse as the longest edge of its cells: the metric as it is, without turning between them."""
+    """Return the resolution of P1 elements, where the mesh width at a vertex is the longest edge of its cells."""
     d = metric.shape[-1]
     corners = np.concatenate([np.zeros((1, d)), np.eye(d)])
     edges = jnp.asarray([b - a for a, b in combinations(corners, 2)], metric.dtype)

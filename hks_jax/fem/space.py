@@ -1,4 +1,4 @@
-"""Finite element spaces: which nodes carry a degree of freedom, null vectors, and masks for computations."""
+"""Finite element spaces: their degrees of freedom, their null vectors, and masks for computations."""
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, reduce
@@ -15,24 +15,24 @@ from hks_jax.domain.components import active_elements, element_nodes, label_node
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
-from hks_jax.traced import is_traced
+from hks_jax.traced import is_staged, is_traced
 
 _COPIED = 1 << 22
-"""Numbers that NumPy copies in less time than it takes to compile that."""
+"""The largest number of values that NumPy copies in less time than a compilation takes."""
 
 
 class FunctionSpace:
-    """The nodes of a domain and those among them that are free. Static and hashable.
+    """The nodes of a domain, and the free nodes, which carry a degree of freedom. Static and hashable.
 
     Attributes:
         node_shape: shape of a nodal array: the grid's shape, or (V,).
         dimension: the dimension of the manifold.
         domain: nodes of the domain, bool (*node_shape). Results are NaN elsewhere.
-        free: nodes that carry a degree of freedom, bool (*node_shape). Dirichlet nodes are in the domain, not free.
-        boundary: the conditions per axis and, last, on the rim of a mask; ``(("neumann", "neumann"),)`` or its like for
-            a mesh.
+        free: nodes that carry a degree of freedom, bool (*node_shape). Dirichlet nodes are in the domain, but not free.
+        boundary: the conditions (low, high) of each axis and, last, those on the rim of a mask; for a mesh one pair,
+            such as ``(("neumann", "neumann"),)``.
         n_components: the number of connected components of the domain.
-        elements: the elements that exist, bool; of a grid n − 1 per axis, n where periodic, of a mesh all its cells.
+        elements: the elements of the domain, bool: n − 1 along each axis of a grid (n if periodic), or all cells.
     """
 
     node_shape: tuple[int, ...]
@@ -63,7 +63,7 @@ class FunctionSpace:
 
     @cached_property
     def degrees_of_freedom(self) -> Int[np.ndarray, " nodes"]:
-        """For each node, flat, the number of its degree of freedom, or −1."""
+        """The number of each node's degree of freedom, or −1; nodes are in flat order."""
         numbers = np.full(self.free.size, -1)
         numbers[self._free_indices] = np.arange(self.n_dof)
         return numbers
@@ -74,9 +74,9 @@ class FunctionSpace:
 
     @cached_property
     def null_labels(self) -> Int[np.ndarray, " n_dof"]:
-        """For each degree of freedom the number 0 … n_null − 1 of its constant null vector, or −1.
+        """The number 0 … n_null − 1 of each degree of freedom's constant null vector, or −1.
 
-        The stiffness annihilates the constant on each connected component that no Dirichlet node touches.
+        The stiffness annihilates the constant on each connected component that has no Dirichlet node.
         """
         pinned = np.unique(self._labels[self.domain & ~self.free])
         labels = self._labels.ravel()[self._free_indices]
@@ -85,11 +85,11 @@ class FunctionSpace:
 
     @property
     def n_null(self) -> int:
-        """The number of zero eigenvalues: natural components."""
+        """The number of zero eigenvalues, one for each component without Dirichlet nodes."""
         return int(self.null_labels.max(initial=-1)) + 1
 
     def restrict(self, nodal: Float[Array, "*leading_and_node_shape"]) -> Float[Array, "... n_dof"]:
-        """Take the values at the free nodes."""
+        """Return the values at the free nodes."""
         flat = jnp.reshape(nodal, (*nodal.shape[: nodal.ndim - len(self.node_shape)], self.free.size))
         return flat if self._all_free else taken(flat, self._free_indices)
 
@@ -101,11 +101,11 @@ class FunctionSpace:
         if self._all_free:
             return values.reshape(shape)
         fill = np.where(self.domain.ravel(), 0.0, outside).astype(values.dtype)
-        with jax.debug_nans(False):  # outside the domain it is meant
+        with jax.debug_nans(False):  # NaN is intended outside the domain
             return _spread(values, self._free_indices, fill).reshape(shape)
 
     def transfer(self, values: Float[Array, "... n_dof"], to: "FunctionSpace") -> Float[Array, "... n"]:
-        """Return functions of this space as those of another on the same nodes, zero where that has Dirichlet nodes."""
+        """Return functions of this space as functions of another one on the same nodes, zero at its Dirichlet nodes."""
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
 
     def __eq__(self, other: object) -> bool:
@@ -116,7 +116,7 @@ class FunctionSpace:
 
 
 def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Float[Array, "... m"]:
-    """Return the values at some places of the last axis."""
+    """Return the values at given indices of the last axis."""
     if _by_numpy(values):
         return by_numpy(lambda known: np.take(known, indices, axis=-1), values)
     return _taken(values, indices)
@@ -125,7 +125,7 @@ def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Floa
 def _spread(
     values: Float[Array, "... m"], indices: Int[np.ndarray, " m"], fill: Float[np.ndarray, " n"]
 ) -> Float[Array, "... n"]:
-    """Return values put at some places of the last axis, and others elsewhere."""
+    """Return an array with values at given indices of the last axis, and with ``fill`` elsewhere."""
     if not _by_numpy(values):
         return _spread_by_jax(values, indices, fill)
     full = np.tile(fill, (*values.shape[:-1], 1))
@@ -137,7 +137,7 @@ def _by_numpy(values: Array) -> bool:
     return np.size(values) <= _COPIED and known_here(values)
 
 
-# The indices go in as arrays, so that equal numbers of them, wherever they lie, share one compilation.
+# The indices are passed as arrays, so that sets of equally many indices share one compilation.
 @jax.jit
 def _taken(values: Float[Array, "... n"], indices: Int[np.ndarray | Array, " m"]) -> Float[Array, "... m"]:
     return values[..., indices]
@@ -155,11 +155,11 @@ def _spread_by_jax(
 class GridSpace(FunctionSpace):
     """The Q1 space on a grid with given boundary conditions, as `normalise_boundary` writes them.
 
-    Its grids' spacing and origin are no part of it: computations compiled for one serve all.
+    Spacing and origin of the grid are not part of the space, so that they can change without recompilation.
 
     Attributes:
         inside: the nodes inside the mask, bool (*shape).
-        periodic: per axis, whether node n is node 0 again.
+        periodic: for each axis, whether node n is node 0.
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
@@ -169,7 +169,7 @@ class GridSpace(FunctionSpace):
         *axes, rim = boundary
         self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)
         if any(wraps and n < 3 for wraps, n in zip(self.periodic, grid.shape, strict=True)):
-            raise ValueError(f"boundary: a periodic axis needs at least 3 nodes; the grid has shape {grid.shape}")
+            raise ValueError(f'boundary: got "periodic" for shape {grid.shape}; a periodic axis needs at least 3 nodes')
         self.elements = active_elements(grid.inside, self.periodic)
         self.domain = element_nodes(self.elements, self.periodic)
         if not self.domain.any():
@@ -191,7 +191,7 @@ class GridSpace(FunctionSpace):
 
     @cached_property
     def cells(self) -> Int[np.ndarray, "E n"]:
-        """The nodes of each element that exists."""
+        """The nodes of each element of the domain."""
         numbers = wrap_nodes(np.arange(self.free.size).reshape(self.node_shape), self.periodic)
         corners = [numbers[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * self.dimension)]
         return np.stack(corners, axis=-1)[self.elements]
@@ -202,9 +202,9 @@ class MeshSpace(FunctionSpace):
     """The space of P1 or P2 elements on a mesh of triangles or tetrahedra.
 
     Attributes:
-        triangulation: the cells.
+        triangulation: the connectivity of the mesh.
         degree: 1 or 2.
-        cells: the nodes of each cell. Of degree 2 they are its vertices and then the middles of its edges: node
+        cells: the nodes of each cell. For degree 2 they are its vertices, then the midpoints of its edges: node
             ``n_vertices + e`` belongs to edge e of the triangulation.
     """
 
@@ -228,11 +228,11 @@ class MeshSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class VectorSpace(FunctionSpace):
-    """Functions of several components on the nodes of another space: results have an axis more, of components.
+    """Functions with several components on the nodes of another space; results have a last axis of components.
 
     Attributes:
         base: the space of each component.
-        cells: the unknowns of each element, those of a node beside each other.
+        cells: the unknowns of each element, where those of a node are adjacent.
     """
 
     def __init__(self, base: "GridSpace | MeshSpace", components: int) -> None:
@@ -248,10 +248,10 @@ class VectorSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class MatrixSpace(FunctionSpace):
-    """Nodes of which nothing is known but their number, in any shape: those of matrices from elsewhere.
+    """The nodes of matrices from elsewhere, for which only the shape of nodal arrays is known.
 
     Attributes:
-        dimension: that of the manifold; None if it is not known.
+        dimension: the dimension of the manifold; None if it is not known.
     """
 
     dimension: int | None  # type: ignore[assignment]
@@ -268,7 +268,7 @@ class MatrixSpace(FunctionSpace):
 
 
 def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
-    """Return the space, one for all grids of the same nodes."""
+    """Return the space of a grid, which grids with the same nodes share."""
     return _unit_space(grid.unit, boundary)
 
 
@@ -278,26 +278,26 @@ vector_space = lru_cache(maxsize=32)(VectorSpace)
 
 
 def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
-    """Return colours along one axis: nodes of one colour are ``spacing`` or more apart."""
+    """Return colours along one axis: nodes of one colour are at least ``spacing`` nodes apart."""
     if not wraps:
         return np.arange(n) % min(spacing, n)
-    # As many runs as fit, some a node longer than others: the first of one run is `spacing` or more after the last.
+    # The axis is split into as many runs of at least `spacing` nodes as fit. A colour is a position in the run.
     runs = max(n // spacing, 1)
     return np.concatenate([np.arange(len(run)) for run in np.array_split(np.arange(n), runs)])
 
 
 def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray | Array, "*shape"]:
     """Return a mask for a computation with some values."""
-    axes = _box(mask) if is_traced(values) else None
+    axes = _box(mask) if is_traced(values) and is_staged() else None
     return mask if axes is None else _outer([axis[None] for axis in axes])[0]
 
 
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
-    """Tell for which offsets and nodes both ends are free, for a computation with some values.
+    """Mark the offsets and nodes of couplings with two free ends, for a computation with ``values``.
 
     None where these are traced and all nodes of the domain are free, so that nothing is to be eliminated.
     """
-    if not is_traced(values):
+    if not (is_traced(values) and is_staged()):
         return free_couplings(space)
     if (space.free == space.domain).all():
         return None
@@ -314,7 +314,7 @@ def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "of
 
 @lru_cache(maxsize=16)
 def free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
-    """Tell for which offsets and nodes both ends are free."""
+    """Mark the offsets and nodes of couplings with two free ends."""
     free, d = space.free, space.dimension
     for axis, wraps in enumerate(space.periodic):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
@@ -327,19 +327,19 @@ def free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
 
 
 def _box(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:
-    """Return which places along each axis are in a mask, of which it is the product; None if it is not."""
+    """Return a mask for each axis, whose product is the given mask; None if it is not such a product."""
     d = mask.ndim
     axes = [np.asarray(mask.any(axis=tuple(a for a in range(d) if a != axis))) for axis in range(d)]
     return axes if mask[np.ix_(*axes)].all() else None
 
 
 def _outer(axes: Sequence[Bool[np.ndarray, "_m _n"]]) -> Bool[Array, "ms *ns"]:
-    """Return products of what is along each axis, (m₁, n₁), (m₂, n₂), …: (m₁m₂⋯, n₁, n₂, …)."""
+    """Return the products (m₁m₂⋯, n₁, n₂, …) of masks (m₁, n₁), (m₂, n₂), … along each axis."""
     d, shapes = len(axes), np.array([axis.shape for axis in axes]).T
     whole = tuple(map(int, shapes.ravel()))
     result = jnp.ones((), bool)
     if not all(axis.all() for axis in axes):
-        # Behind the barrier the compiler does not compute with them, place by place.
+        # The barrier keeps the compiler from computing the product when it compiles.
         known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
         places = [tuple(n if i % d == axis else 1 for i, n in enumerate(whole)) for axis in range(d)]
         result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(known, places, strict=True)])

@@ -1,4 +1,4 @@
-"""What users have as sparse matrices, as operators with one symmetric pattern."""
+"""Conversion of the users' sparse matrices into operators with one symmetric sparsity pattern."""
 
 import math
 import numbers
@@ -25,11 +25,11 @@ from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
 
 _FEW = 8
-"""Null vectors that are checked one by one."""
+"""The number of null vectors up to which each vector is checked."""
 
 
 class _Entries(NamedTuple):
-    """A matrix by its entries, of which those at one place add up."""
+    """The entries of a matrix; entries with the same row and column add up."""
 
     values: Float[Array, " m"]
     rows: Int[np.ndarray, " m"]
@@ -46,42 +46,42 @@ def sparse_pencil(
     volume: Any = None,
     shape: tuple[int, ...] | None = None,
 ) -> Pencil:
-    """Return a pair of matrices as a pencil with one pattern, that of either matrix and of its transpose.
+    """Return the pencil of two matrices, with one sparsity pattern: the union of their patterns and the transposes.
 
-    Of an entry and the one across the diagonal the mean counts, in derivatives too. Eigenpairs of the pencil have every
-    signature. Those that need a geometry say which of the arguments below they lack.
+    Both matrices are replaced by their symmetric parts, also in derivatives. All signatures can be computed from the
+    eigenpairs of the pencil. A signature that needs a geometry raises an error that names the missing argument.
 
     Args:
-        K: symmetric (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data may be
-            traced, and whose indices may not), an operator of this package, or a full array; or a pencil, without M.
-        M: symmetric, positive definite, likewise; or its diagonal (n,); None is the identity. Its pattern may be
-            another one.
-        null_vectors: (m, n) a basis of the null space of K ⪰ 0, all of it: m may be 0. None if nothing is known; then K
+        K: a symmetric matrix (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data
+            may be traced, but not its indices), an operator of this package, or a full array; or a pencil, without M.
+        M: a symmetric positive definite matrix of the same kinds, or its diagonal (n,); None is the identity. Its
+            pattern may differ from that of K.
+        null_vectors: (m, n) a basis of the whole null space of K ⪰ 0, where m may be 0. None if it is not known; then K
             may be indefinite, and eigenvalues that are zero within rounding are set to zero.
-        dimension: 2 or 3, that of the manifold: for Weyl's law, and signatures with ``normalisation="flat"``.
-        volume: in the units of the metric, for ``normalisation="volume"``.
-        shape: of the nodes, n in all; None is (n,).
+        dimension: the dimension of the manifold, 2 or 3, for Weyl's law and for ``normalisation="flat"``.
+        volume: the volume in the units of the metric, for ``normalisation="volume"``.
+        shape: the shape of nodal arrays, with n nodes; None is (n,).
 
     Returns:
-        The pencil: ``.stiffness`` is a `SparseOperator`, ``.mass`` one with the same pattern or diagonal.
+        The pencil. ``.stiffness`` is a `SparseOperator`, and ``.mass`` has the same pattern or is diagonal.
 
     Raises:
-        ValueError: matrices that are not square or of different sizes, complex, NaN or infinite, or unsymmetric (by how
-            much, and where); a diagonal M with an entry that is not positive; traced indices; null vectors that K does
-            not annihilate (by how much), or that depend on each other; another dimension, volume or shape.
+        ValueError: matrices that are not square, differ in size, are complex, NaN, infinite or unsymmetric (the message
+            has the entry); a diagonal M with an entry that is not positive; traced indices; null vectors that are
+            linearly dependent, or that K does not annihilate (with the residual); another dimension, volume or shape.
     """
     if isinstance(K, SymmetricPencil):
         if M is not None:
-            raise ValueError("M: a pencil has its mass already; leave it out")
+            raise ValueError("M: got a mass for a pencil, which has one already; leave M out")
         K, M = K.stiffness, K.mass
     pencil = _pencil(K, M)
     n, dtype = pencil.size, pencil.stiffness.dtype
     if dimension not in (None, 2, 3):
-        raise ValueError(f"dimension: got {dimension!r}; expected 2 or 3, or None if there is none")
+        raise ValueError(f"dimension: got {dimension!r}; expected 2 or 3, or None if there is no manifold")
     if shape is not None:
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
         if math.prod(shape) != n or min(shape) < 1:
-            raise ValueError(f"shape: got {shape}, {math.prod(shape)} nodes; expected {n} in all")
+            raise ValueError(f"shape: got {shape}, {math.prod(shape)} nodes; expected {n} nodes")
     if volume is not None:
         require_number("volume", volume)
         volume = jnp.asarray(volume, dtype)
@@ -91,15 +91,15 @@ def sparse_pencil(
 
 
 def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a field, a mesh, a matrix K or a pair (K, M); or the one that is given, checked."""
+    """Return the pencil of a field, a mesh, a matrix K or a pair (K, M); a given pencil is checked and returned."""
     matrices = BCOO | BCSR | Operator | np.ndarray | jax.Array | list | LinearOperator
     matrix = issparse(domain) or isinstance(domain, matrices)
     if not matrix and not isinstance(domain, SymmetricPencil | MirrorPencil | tuple):
         return assemble(domain, boundary, mass, quadrature=quadrature)
     if (boundary, mass, quadrature) != ("neumann", "consistent", "gauss"):
-        raise ValueError("boundary, mass, quadrature: a pencil has them already; give them to `assemble` instead")
+        raise ValueError("boundary, mass, quadrature: a pencil has them already; pass them to `assemble` instead")
     if isinstance(domain, tuple) and len(domain) != 2:
-        raise ValueError(f"domain: got a tuple of {len(domain)}; expected a pair (K, M)")
+        raise ValueError(f"domain: got a tuple of {len(domain)} entries; expected a pair (K, M)")
     if not isinstance(domain, Pencil | MirrorPencil):
         domain = sparse_pencil(*domain) if isinstance(domain, tuple) else sparse_pencil(domain)
     if isinstance(domain, Pencil) and isinstance(domain.space, MatrixSpace):
@@ -114,28 +114,28 @@ def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Q
 def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[Array, "m n"]:
     vectors = jnp.asarray(real_array("null_vectors", null_vectors), pencil.stiffness.dtype)
     if vectors.ndim != 2 or vectors.shape[1] != pencil.size or len(vectors) > pencil.size:
-        raise ValueError(f"null_vectors: got shape {vectors.shape}; expected (m, {pencil.size}), a vector in each row")
+        raise ValueError(f"null_vectors: got shape {vectors.shape}; expected (m, {pencil.size}), one vector per row")
     if not is_traced(vectors) and len(vectors):
         lengths = np.linalg.norm(np.asarray(vectors), axis=1, keepdims=True)
         sizes = np.linalg.svd(np.asarray(vectors) / np.where(lengths > 0, lengths, 1), compute_uv=False)
         if sizes[-1] < np.finfo(vectors.dtype).eps ** 0.25:
             raise ValueError(
-                f"null_vectors: they depend on each other, their least singular value is {sizes[-1]:.2g}; expected a "
-                "basis without zero vectors, as orthogonal as may be"
+                f"null_vectors: got dependent vectors, whose least singular value is {sizes[-1]:.2g} at length 1; "
+                "expected a basis. Orthogonalise the vectors, and leave out zero vectors"
             )
     require_null_space(SymmetricPencil(pencil.stiffness, pencil.mass, null_space=NullSpace(vectors)))
-    # Orthonormal, so that what becomes M-orthonormal of them does so to rounding.
+    # The vectors are made orthonormal, so that they can be made M-orthonormal up to rounding.
     return vectors if is_traced(vectors) else jnp.asarray(np.linalg.qr(np.asarray(vectors).T)[0].T)
 
 
 def require_null_space(pencil: SymmetricPencil) -> None:
-    """Raise ValueError where the stiffness does not annihilate what is said to be its null space.
+    """Raise ValueError if the stiffness does not annihilate the null space of its pencil.
 
-    Nothing is checked where values are traced.
+    Traced values are not checked.
     """
     if pencil.null_space is None or is_traced(pencil) or not pencil.n_null:
         return
-    # On the host, where nothing is compiled for it.
+    # The check uses NumPy, which needs no compilation.
     where, rows, cols = pencil.pattern.places()
     data, finfo = np.asarray(pencil.stiffness.flat())[where], np.finfo(pencil.stiffness.dtype)
     size = max(np.bincount(rows, np.abs(data), pencil.size).max(), finfo.tiny)
@@ -146,7 +146,7 @@ def require_null_space(pencil: SymmetricPencil) -> None:
 
     vectors = np.asarray(pencil.null_space.vectors)
     lengths = np.abs(vectors).max(axis=1, keepdims=True)
-    # Of many, a random combination does for all.
+    # Of many vectors, only a random linear combination is checked.
     weights = np.random.default_rng(0).standard_normal(len(vectors))
     some = vectors if len(vectors) <= _FEW else [weights @ (vectors / np.where(lengths > 0, lengths, 1))]
     if max(map(defect, some)) > ROUNDING * finfo.eps:
@@ -154,8 +154,8 @@ def require_null_space(pencil: SymmetricPencil) -> None:
         worst = int(np.argmax(defects))
         raise ValueError(
             f"null_vectors: the stiffness does not annihilate vector {worst}: ‖Kv‖ is {defects[worst]:.2g} ‖K‖ ‖v‖ in "
-            "the largest entry, which is more than rounding. After a change of K, say nothing of its null space: "
-            "`pencil.with_stiffness(K)`, or `sparse_pencil(K, M)`"
+            "the maximum norm, which is more than rounding. If K has changed, pass no null vectors: use "
+            "`pencil.with_stiffness(K)` or `sparse_pencil(K, M)`"
         )
 
 
@@ -163,7 +163,7 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
     for name, matrix in (("K", K), ("M", M)):
         if isinstance(matrix, LinearOperator):
             raise TypeError(
-                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full: it is factorised"
+                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full, as it is factorised"
             )
     if np.ndim(M) == 0 and isinstance(M, numbers.Number):
         raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If it is k, pass k={M}")
@@ -180,13 +180,13 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
             matrices.append(mass)
     given = matrices[-1].values.dtype if diagonal is None else diagonal.dtype
     if given != dtype:
-        raise ValueError(f"M: got {given}, and K is {dtype}; expected one dtype. Convert one of them with .astype")
+        raise ValueError(f"M: got {given}; expected {dtype}, the dtype of K. Convert one of them with .astype")
     if diagonal is not None and not is_traced(diagonal):
         wrong = np.flatnonzero(~(np.asarray(diagonal) > 0))
         if wrong.size:
             raise ValueError(
                 f"M: {wrong.size} of its {diagonal.size} diagonal entries are not positive (the first is "
-                f"{float(diagonal[wrong[0]]):.6g}, of row {wrong[0]}); a mass must be positive definite"
+                f"{float(diagonal[wrong[0]]):.6g}, in row {wrong[0]}); expected a positive definite mass"
             )
     pattern = _pattern(n, *matrices)
     one, *other = (_operator(pattern, matrix) for matrix in matrices)
@@ -194,7 +194,7 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
 
 
 def _entries(name: str, matrix: Any) -> _Entries:
-    """Return the entries of a square matrix, checked where they are not traced."""
+    """Return the entries of a square matrix; check its symmetry unless they are traced."""
     if isinstance(matrix, BCSR):
         matrix = matrix.to_bcoo()
     if isinstance(matrix, BCOO):
@@ -204,7 +204,7 @@ def _entries(name: str, matrix: Any) -> _Entries:
         entries = _Entries(values, rows, cols, matrix.size)
     elif issparse(matrix):
         _check_square(name, matrix.shape)
-        held = matrix.tocoo(copy=True)  # what follows would otherwise change the caller's
+        held = matrix.tocoo(copy=True)  # a copy, since the next line changes it
         held.sum_duplicates()
         entries = _Entries(real_array(name, held.data), held.row, held.col, held.shape[0])
     else:
@@ -216,7 +216,7 @@ def _entries(name: str, matrix: Any) -> _Entries:
             rows, cols = np.nonzero(np.asarray(array))
         entries = _Entries(array[rows, cols], rows, cols, array.shape[0])
     if not is_traced(entries.values):
-        places, remedy = (entries.rows, entries.cols), f"If it means nothing, pass ({name} + {name}.T) / 2"
+        places, remedy = (entries.rows, entries.cols), f"If that is noise, pass ({name} + {name}.T) / 2"
         require_symmetric(name, entries.values, places, entries.size, remedy)
     return entries
 
@@ -227,16 +227,16 @@ def _of_bcoo(name: str, matrix: BCOO) -> _Entries:
     _check_square(name, matrix.shape)
     if is_traced(matrix.indices):
         raise ValueError(
-            f"{name}: its indices are traced, and the pattern must be known. Make them a JAX array outside jax.jit and "
-            "build the matrix from it inside, or make the pencil outside with `sparse_pencil` and hand it over"
+            f"{name}: its indices are traced; expected a known pattern. Make the array of indices outside jax.jit and "
+            "the matrix from it inside, or make the pencil outside with `sparse_pencil` and pass it"
         )
     rows, cols = np.asarray(matrix.indices).T
-    valid = (rows < matrix.shape[0]) & (cols < matrix.shape[1])  # others are padding
+    valid = (rows < matrix.shape[0]) & (cols < matrix.shape[1])  # other indices are padding
     return _Entries(real_array(name, matrix.data)[np.flatnonzero(valid)], rows[valid], cols[valid], matrix.shape[0])
 
 
 def _diagonal(M: Any, n: int, dtype: np.dtype) -> Array | None:
-    """Return the diagonal of a mass that is given as such, or is the identity."""
+    """Return the diagonal of a mass that is given by its diagonal or is the identity; otherwise None."""
     if M is None:
         return jnp.ones(n, dtype)
     if isinstance(M, DiagonalOperator):
@@ -255,14 +255,14 @@ def _check_square(name: str, shape: tuple[int, ...]) -> None:
 
 
 def _pattern(n: int, *matrices: _Entries) -> SparsePattern:
-    """Return the places of all matrices, of their transposes, and the diagonal."""
+    """Return the union of the patterns of all matrices, their transposes and the diagonal."""
     keys = [rows.astype(np.int64) * n + cols for m in matrices for rows, cols in ((m.rows, m.cols), (m.cols, m.rows))]
     places = np.unique(np.concatenate([*keys, np.arange(n) * (n + 1)]))
     return SparsePattern(n, places // n, places % n)
 
 
 def _operator(pattern: SparsePattern, matrix: _Entries) -> SparseOperator:
-    """Return the symmetric part of a matrix: half of each entry, and half of it across the diagonal."""
+    """Return the symmetric part of a matrix: half of each entry at its place, and half at the transposed place."""
     n = pattern.size
     places = pattern.rows.astype(np.int64) * n + pattern.cols
     rows, cols = matrix.rows.astype(np.int64), matrix.cols.astype(np.int64)

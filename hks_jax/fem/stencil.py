@@ -1,4 +1,4 @@
-"""Matrices on grids: stencils on nodal arrays and on degrees of freedom, their pattern, and where to cut it."""
+"""Matrices on grids: stencils on nodal arrays and on degrees of freedom, their sparsity pattern and bisection."""
 
 import math
 from collections.abc import Callable
@@ -22,19 +22,19 @@ from hks_jax.linear.pattern import Pattern
 from hks_jax.linear.products import of_each_row
 
 _CELL = {2: 25, 3: 64}
-"""The number of nodes from which on a cell is divided further: fewer operations against more, smaller batches."""
+"""The largest number of nodes of a cell that is not divided: smaller cells need fewer operations, but more batches."""
 
 
 @jax.tree_util.register_static
 class GridPattern(ByKey, Pattern):
-    """The couplings of a grid's free nodes with their 3^d neighbours, as places in stencil coefficients."""
+    """The couplings of a grid's free nodes with their 3^d neighbours, as indices into stencil coefficients."""
 
     def __init__(self, space: GridSpace) -> None:
         self.space, self.size, self.n_entries = space, space.n_dof, 3**space.dimension * space.free.size
         self._key = space
 
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return for each place its index into the flat coefficients, its row, and its column."""
+        """Return for each entry its index into the flat coefficients, its row and its column."""
         return _couplings(self.space)
 
     def diagonal(self) -> Int[np.ndarray, " n"]:
@@ -42,13 +42,12 @@ class GridPattern(ByKey, Pattern):
         return 3**self.space.dimension // 2 * self.space.free.size + np.flatnonzero(self.space.free)
 
     def bisect(self) -> Parts:
-        """Return how to cut the grid."""
+        """Return the nested bisection of the grid."""
         return _bisect(self.space)
 
 
 @lru_cache(maxsize=16)
 def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where in the coefficients each entry lies, its row and its column, for the couplings of free nodes."""
     own = space.degrees_of_freedom.reshape(space.node_shape).astype(np.int32)
     rimmed = own
     for axis, wraps in enumerate(space.periodic):
@@ -65,7 +64,7 @@ def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _bisect(space: GridSpace) -> Parts:
-    """Cut across lines of nodes or two (planes in 3D), at the median of the longest side."""
+    """Bisect the grid recursively by one or two lines of nodes (a plane in 3D), at the median of the longest side."""
     x = np.stack(np.nonzero(space.free)).astype(np.int32)
     d, n = x.shape
     level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
@@ -92,10 +91,10 @@ def _bisect(space: GridSpace) -> Parts:
         cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1).astype(np.int32)
         beyond = along - cut[q]
         separates = beyond == 0
-        if d == 2:  # two lines of an even number leave equal halves, and batches without padding
+        if d == 2:  # with an even number of lines, two cut lines leave equal halves, and so batches without padding
             even = (highest - lowest) % 2 == 1
             separates |= (beyond == -1) & even[q]
-        if depth == 0:  # what is cut once more here is no longer periodic
+        if depth == 0:  # also cut at node 0, so that the parts are not periodic
             separates |= np.any(x[list(space.periodic)] == 0, axis=0)
         cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
         level[left[cutting]], part[left[cutting]] = depth, q[cutting]
@@ -105,16 +104,16 @@ def _bisect(space: GridSpace) -> Parts:
 
 
 class Stencil(eqx.Module):
-    """A matrix that couples a node of a grid to its 3^d neighbours, applied to nodal columns (*shape, b).
+    """A matrix that couples each node of a grid to its 3^d neighbours, applied to blocks of nodal columns (*shape, b).
 
-    In this layout each coefficient is read once for all columns: in 3D it is about twice as fast as row after row. What
-    is compiled for one stencil serves all of its shape, whatever their masks.
+    In this layout a product reads each coefficient once for all columns, which in 3D is about twice as fast as one row
+    at a time. Stencils of one shape share compiled code, even if their masks differ.
 
     Attributes:
-        coefficients: (3^d, *shape), offsets in the order of ``product((-1, 0, 1), repeat=d)``: the entry at o and i
-            couples node i to i + offset(o). Or (1, *shape), a diagonal. Those across a side that is not periodic are 0.
-        periodic: per axis, whether node n is node 0 again; static.
-        slabs: how the grid is cut, where this is one device's share of it, inside of `shard_map`; static.
+        coefficients: (3^d, *shape), with the offsets o in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i)
+            couples node i to node i + o. A diagonal is (1, *shape). Couplings across non-periodic sides are 0.
+        periodic: for each axis, whether node n is node 0; static.
+        slabs: the cut of the grid, if this is one device's slab inside `shard_map`; static.
     """
 
     coefficients: Float[Array, "offsets *shape"]
@@ -123,11 +122,11 @@ class Stencil(eqx.Module):
 
     @property
     def is_diagonal(self) -> bool:
-        """Whether there is a single coefficient per node, as a lumped mass has it."""
+        """Whether each node has a single coefficient, as with a lumped mass."""
         return self.coefficients.shape[0] == 1
 
     def own(self, slabs: Slabs) -> "Stencil":
-        """Return this device's share."""
+        """Return this device's slab of the stencil."""
         return Stencil(slabs.own(self.coefficients, 1), self.periodic, slabs)
 
     def __matmul__(self, x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
@@ -135,15 +134,15 @@ class Stencil(eqx.Module):
         return self.of_columns()(x)
 
     def of_columns(self) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return the product with columns.
+        """Return the function that multiplies columns by the matrix.
 
-        What is done to the coefficients is done here: for products in a loop, call this outside.
+        It prepares the coefficients: for products in a loop, call it outside of the loop.
         """
         apply = self.of_rimmed()
         return (lambda x: apply(x, x)) if self.is_diagonal else (lambda x: apply(x, self.rimmed(x)))
 
     def rimmed(self, x: Float[Array, "*shape b"]) -> Float[Array, "..."]:
-        """Return columns together with their neighbours beyond the sides, as `of_rimmed` takes them."""
+        """Return columns that are padded by the nodes beyond the sides, as `of_rimmed` requires."""
         if self.slabs is not None:
             return self.slabs.with_halo(x)
         if any(self.periodic):
@@ -152,18 +151,18 @@ class Stencil(eqx.Module):
         return jnp.pad(x.reshape(-1, x.shape[-1]), ((reach, reach), (0, 0)))
 
     def of_rimmed(self) -> Callable[[Float[Array, "*shape b"], Float[Array, "..."]], Float[Array, "*shape b"]]:
-        """Return the product with columns x, given x and `rimmed` x, which several stencils can share."""
+        """Return the product as a function of columns x and of `rimmed` x, which several stencils can share."""
         if self.is_diagonal:
             return lambda x, _: self.coefficients[0][..., None] * x
         if self.slabs is not None or any(self.periodic):
             of_box = product_with_rim(self.coefficients)
             return lambda _, rimmed: of_box(rimmed)
-        # Node after node in one row, a neighbour is a fixed distance away. Across the sides, where the row goes on
-        # elsewhere, there is nothing: elements end there, and their entries were never written.
+        # If the nodes are numbered in one row, each neighbour is at a fixed distance. Where the row continues beyond a
+        # side, the coefficients are zero, since no element couples these nodes.
         distances, reach = _distances(self.coefficients.shape[1:])
         row = side_by_side(self.coefficients).reshape(-1, len(distances))
         nodes = len(row)
-        # On accelerators an array for each offset, behind a barrier: XLA would take them apart anew for each product.
+        # Accelerators take an array per offset. Without the barrier, XLA would split the array for each product.
         apart = jax.lax.optimization_barrier(jnp.split(row, len(distances), axis=1)) if accelerators.at_hand() else ()
 
         def of_row(x: Float[Array, "*shape b"], padded: Float[Array, "padded b"]) -> Float[Array, "*shape b"]:
@@ -177,20 +176,20 @@ class Stencil(eqx.Module):
         return of_row
 
     def outer(self, p: Float[Array, "*shape b"], x: Float[Array, "*shape b"]) -> Float[Array, "offsets *shape"]:
-        """Return Σ_b p[i, b] x[i + o, b] for every offset: the derivative of Σ_b pᵀCx by the coefficients of C."""
+        """Return Σ_b p[i, b] x[i + o, b] for every offset o: the derivative of Σ_b pᵀCx with respect to C."""
         shifts = [x] if self.is_diagonal else neighbours(with_rim(x, self.periodic), len(self.periodic))
         return jnp.stack([jnp.sum(p * shifted, axis=-1) for shifted in shifts])
 
 
 def _distances(shape: tuple[int, ...]) -> tuple[list[int], int]:
-    """Return how far away each neighbour is where the nodes stand in one row, and the largest of these."""
+    """Return the distance of each neighbour if the nodes are numbered in one row, and the largest distance."""
     strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
     distances = [sum(map(mul, offset, strides)) for offset in product((-1, 0, 1), repeat=len(shape))]
     return distances, distances[-1]
 
 
 def coefficients_of(operator: Operator, space: GridSpace) -> Float[Array, "offsets *shape"]:
-    """Return the coefficients of a grid's matrix, (1, *shape) of a diagonal one."""
+    """Return the stencil coefficients of a grid's matrix, (1, *shape) if it is diagonal."""
     if isinstance(operator, DiagonalOperator):
         return space.extend(operator.entries, outside=0.0)[None]
     assert isinstance(operator, StencilOperator)
@@ -198,9 +197,9 @@ def coefficients_of(operator: Operator, space: GridSpace) -> Float[Array, "offse
 
 
 class StencilOperator(PatternedOperator):
-    """A stencil on the free nodes of a grid: 9 coefficients a node in 2D, 27 in 3D.
+    """A stencil on the free nodes of a grid, with 9 coefficients per node in 2D and 27 in 3D.
 
-    ``coefficients`` are those of a `Stencil`. Couplings to nodes that are not free are zero.
+    The coefficients are those of a `Stencil`. Couplings to nodes that are not free are zero.
     """
 
     coefficients: Float[Array, "offsets *shape"]
@@ -208,7 +207,7 @@ class StencilOperator(PatternedOperator):
 
     @property
     def pattern(self) -> GridPattern:
-        """Where the entries are."""
+        """The sparsity pattern."""
         return GridPattern(self.space)
 
     def flat(self) -> Float[Array, " m"]:
@@ -224,7 +223,7 @@ class StencilOperator(PatternedOperator):
         shape, coefficients = self.space.node_shape, list(self.coefficients)
 
         def product_with(row: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-            # Behind the barrier the neighbours are slices of an array, and not what decides of each node where it is.
+            # The barrier makes the neighbours slices of an array. Without it XLA would compute the padding per node.
             rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic))
             terms = zip(coefficients, neighbours(rimmed, len(shape)), strict=True)
             return reduce(add, (c * shifted for c, shifted in terms))
@@ -233,13 +232,13 @@ class StencilOperator(PatternedOperator):
         return self.space.restrict(of_each_row(product_with, rows).reshape(*x.shape[:-1], *shape))
 
     def of_columns(self) -> OfColumns:
-        """Return the product with a block of columns, twice as fast as with rows."""
+        """Return the function that multiplies a block of columns, which is twice as fast as with rows."""
         shape = self.space.node_shape
         product_with = Stencil(self.coefficients, self.space.periodic).of_columns()
         free, numbers = np.flatnonzero(self.space.free), self.space.degrees_of_freedom
         if free.size == numbers.size:
             return lambda x: product_with(x.reshape(*shape, -1)).reshape(x.shape)
-        numbers = np.where(numbers < 0, free.size, numbers)  # out of range, where there is none
+        numbers = np.where(numbers < 0, free.size, numbers)  # out of range if there is none
 
         def product_of_free(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
             nodal = x.at[numbers].get(mode="fill", fill_value=0)

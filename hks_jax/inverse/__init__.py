@@ -1,4 +1,4 @@
-"""From signatures back to metrics."""
+"""Inverse problems: fits of metrics to signatures."""
 
 from hks_jax.inverse.fit import fit_metric as fit_metric
 from hks_jax.inverse.gauss_newton import GaussNewton as GaussNewton

@@ -1,4 +1,4 @@
-"""Checkpoints of a fit, which appear whole or not at all."""
+"""Checkpoints of a fit, whose files are written completely or not at all."""
 
 import dataclasses
 import hashlib
@@ -14,19 +14,19 @@ from hks_jax.storage import load_npz, write_npz
 
 @dataclasses.dataclass
 class Checkpoint:
-    """Where a fit stands."""
+    """The state of a fit between steps."""
 
     values: Any  # the unknowns
     history: list[Step]  # the steps so far
-    start: int  # which of the starts
-    stage: int  # which stage of the continuation
-    step_size: float  # by which the damping is divided
-    best: Any  # the unknowns of the best of the starts before
-    losses: list[float]  # of the starts before
+    start: int  # the number of the current start
+    stage: int  # the number of the current stage of the continuation
+    step_size: float  # the divisor of the damping
+    best: Any  # the unknowns of the best earlier start
+    losses: list[float]  # the losses of earlier starts
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and settings. A function counts by its name, which another process gives it too."""
+    """Return a hash of arrays and settings. Functions enter by name, which does not depend on the process."""
     digest = hashlib.blake2b(digest_size=16)
     for leaf in jax.tree.leaves(parts):
         text = getattr(leaf, "__qualname__", repr(leaf)).encode()
@@ -47,14 +47,14 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
     try:
         data = load_npz(path)
     except (OSError, ValueError) as error:
-        raise ValueError(f"checkpoint: {error}; or give another name, or remove it") from error
+        raise ValueError(f"checkpoint: {error}. Use another name, or remove the file") from error
     lacking = {"mark", *(field.name for field in dataclasses.fields(Checkpoint))} - set(data)
     if lacking:
         names = ", ".join(sorted(lacking))
-        raise ValueError(f"checkpoint: {path} is not one of a fit, it lacks {names}; give another name, or remove it")
+        raise ValueError(f"checkpoint: {path} is no file of a fit, it lacks {names}. Use another name, or remove it")
     if str(data["mark"]) != mark:
         raise ValueError(
-            f"checkpoint: {path} is of another fit (another target, initial field or setting); give another name, "
+            f"checkpoint: {path} belongs to another fit (another target, initial field or setting). Use another name, "
             "or remove it"
         )
     history = [Step(*row) for row in data["history"].tolist()]

@@ -1,4 +1,4 @@
-"""Fits of conformal factors to heat kernel signatures: a smoother of factors, and a preconditioner."""
+"""Inner products and preconditioners for Gauss–Newton steps, in particular for conformal factors."""
 
 from abc import abstractmethod
 
@@ -20,34 +20,33 @@ from hks_jax.linear.multifrontal import Factorisation, factorise
 
 
 class Preconditioner(eqx.Module):
-    """An approximation of JᵀJ + μB up to a factor: symmetric, positive definite, and easily inverted."""
+    """A symmetric positive definite approximation of JᵀJ + μB, up to a factor, that is easily inverted."""
 
     @abstractmethod
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return the product of the inverse with the unknowns, for damping μ."""
+        """Return the product of the approximation's inverse with the unknowns, for damping μ."""
 
 
 class InnerProduct(Preconditioner):
-    """A symmetric positive definite operator on unknowns: the identity, unless a subclass says otherwise."""
+    """A symmetric positive definite operator on unknowns, by default the identity."""
 
     def apply(self, values: Values) -> Values:
-        """Return its product with the unknowns."""
+        """Return the product of the operator with the unknowns."""
         return values
 
     def solve(self, values: Values) -> Values:
-        """Return the product of its inverse with the unknowns."""
+        """Return the product of the operator's inverse with the unknowns."""
         return values
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return `solve`: of JᵀJ nothing is known."""
+        """Return the result of `solve`, without an approximation of JᵀJ."""
         return self.solve(values)
 
 
 class Smoothing(InnerProduct):
-    """⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ over the domain, for each component: ℓ is the length below which steps are smooth.
+    """The inner product ⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ of each component, where ℓ is the length below which steps are smooth.
 
-    With the mass and not the identity, because a node at the side stands for half a cell: where the same change of the
-    field is a smaller one of the data.
+    It uses the mass matrix because a node at the boundary has half a cell, so its changes affect the data less.
     """
 
     pencil: Pencil  # stiffness and lumped mass of the flat metric
@@ -56,19 +55,19 @@ class Smoothing(InnerProduct):
     cell: Float[Array, ""]  # the mean of the masses, by which they are divided
 
     def apply(self, values: Values) -> Values:
-        """Return (M + ℓ²K) x over the cell's mass."""
+        """Return (M + ℓ²K) x divided by the mass of a cell."""
         x = values.T
         return ((self.pencil.mass.apply(x) + self.length**2 * self.pencil.stiffness.apply(x)) / self.cell).T
 
     def solve(self, values: Values) -> Values:
-        """Return the inverse's product."""
+        """Return the product of the operator's inverse with the unknowns."""
         if self.factor is None:
             return values * (self.cell / self.pencil.mass.diagonal())[:, None]
         return self.factor.solve(values) * self.cell / self.length**2
 
 
 def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
-    """Return the inner product for numbers at the nodes of a grid's domain."""
+    """Return the inner product of nodal values on a grid's domain."""
     pencil = assemble(flat_field(grid, dtype), mass="lumped")
     assert isinstance(pencil, Pencil)
     assert isinstance(pencil.space, GridSpace)
@@ -80,34 +79,34 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
 
 
 _TOP = 0.03
-"""The size of the eigenvalues of JᵀJ where a(λt)² is largest, for weights that add up to one."""
+"""The size of the eigenvalues of JᵀJ at the maximum of a(λt)², for weights that add up to one."""
 _POWER, _REACH = 3, 9.0
-"""In fits on 32² and 64² nodes from t = 0.0045 on, (1 + λt/9)³ takes the fewest steps among such powers, or nearly."""
+"""In fits on 32² and 64² nodes with t ≥ 0.0045, (1 + λt/9)³ takes nearly the fewest steps of all such powers."""
 
 
-# In the plane T = (1 + εu) I has the Laplacian (1 − εu) Δ and the area (1 + εu) dx. By Duhamel's formula its signature
-# is h₀ (1 + εv), h₀ = 1/(4πt), where for u = exp(iξx), with x = t|ξ|²,
+# In the plane T = (1 + εu) I has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx. By Duhamel's formula its
+# signature is h₀ (1 + εv) with h₀ = 1/(4πt). For u = exp(iξx) and x = t|ξ|²,
 #
 #     v = a(x) u,    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1:
 #
-# x/6 for small x, which is the curvature's share tK/3, and of the order of 1/x for large. So JᵀJ is about Σₜ wₜ a(tL)²,
-# L the Laplacian, and its eigenvalues fall off with those of L, beyond the first few. On a grid they do so faster: the
-# factor is interpolated between nodes, which damps oscillations from node to node.
+# which is x/6 for small x, the contribution tK/3 of the curvature, and of order 1/x for large x. So JᵀJ is about Σₜ wₜ
+# a(tL)², where L is the Laplacian. Except for the first few, its eigenvalues decrease as those of L increase. On a grid
+# they decrease faster, because interpolation between nodes damps oscillations of the factor.
 class ConformalInformation(Preconditioner):
-    """B½ (1 + L/λ₁)⁻³ B½, B the lumped mass and L the Laplacian of the initial metric by differences along edges.
+    """B½ (1 + L/λ₁)⁻³ B½ with the lumped mass B and a Laplacian L of the initial metric by differences along edges.
 
-    Its inverse is a polynomial: it takes three products. Where JᵀJ is below μ, JᵀJ + μB falls off no further: λ₁ is so
-    large that the preconditioner does not either.
+    Its inverse is a polynomial, which takes three products. Where JᵀJ is less than μ, JᵀJ + μB does not decrease
+    further. The value of λ₁ is so large that the same holds for the preconditioner.
     """
 
     unknowns: Nodal  # the factors at the nodes
     root: Float[Array, "n 1"]  # the square roots of the masses, relative to that of a cell
-    weights: list[Float[Array, "..."]]  # of the edges, axis by axis
+    weights: list[Float[Array, "..."]]  # the weights of the edges along each axis
     level: Float[Array, ""]  # λ₁ without damping
     largest: Float[Array, ""]  # a bound on the eigenvalues of L
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return the inverse's product."""
+        """Return the product of the operator's inverse with the unknowns."""
         fall = jnp.maximum(_TOP / damping, 1.01) ** (1 / _POWER)
         level = jnp.maximum(self.level, self.largest / (fall - 1))
         y = values / self.root
@@ -120,11 +119,11 @@ class ConformalInformation(Preconditioner):
 
 @jit_quickly(eqx.filter_jit)
 def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Array, " n_times"]) -> ConformalInformation:
-    """Return the preconditioner for signatures at these times; `mass` is the inner product of smoothness 0."""
+    """Return the preconditioner for signatures at these times; `mass` is the inner product with ℓ = 0."""
     grid, nodes = unknowns.init.grid, unknowns.nodes.value
     relative = mass.apply(unknowns.start() + 1)
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)
-    # Nodes outside the domain may hold anything; no edge leads there.
+    # Values outside the domain are arbitrary, because no edge leads there.
     metric = jnp.where(grid.inside[..., None, None], unknowns.init.domain_tensors, jnp.eye(grid.dimension))
     inverse = spd.inverse(metric)
     weights, rows = [], jnp.zeros_like(at_nodes)

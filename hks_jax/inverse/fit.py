@@ -38,44 +38,44 @@ def fit_metric(
     progress: Callable[[Step], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> MetricFit:
-    """Find the metric that has a given signature.
+    """Find a metric with a given signature.
 
-    Minimises half the weighted mean square of the differences between predicted and given signature, plus the penalties
-    of the regularisers. The signature does not tell isometric metrics apart, and sees high frequencies faintly: damped
-    steps, smooth ones by default, change first the directions that the data determine.
+    The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
+    penalties of the regularisers. Isometric metrics have the same signature, and high frequencies affect it little. So
+    the steps are damped, and smooth by default, and first change the directions that the data determine.
 
     Args:
-        init: where to start: a grid, for the flat metric, or a field. Properties of the field that the parametrisation
-            does not change stay.
-        target: (n_times, *grid.shape), positive at observed nodes: ``hks(pairs, times)`` of the metric sought. A wave
-            kernel signature is (n_energies, *grid.shape), a heat trace (n_times,); eigenvalues are (m,), ascending,
-            with those that are zero.
-        times: (n_times,); energies of a wave kernel signature; None where the signature has neither.
-        parametrisation: ``"log-euclidean"`` (the whole tensor), ``"cholesky"``, ``"conformal"`` (e^u T₀),
-            ``"eigenvalues"`` (eigenvectors of `init` stay), ``"rotation"`` (its eigenvalues stay), a `Parametrisation`,
-            or `Free` parameters of a function.
-        data: which signature the target is, how differences count, which entries are observed, and their noise.
-        regularisers: of `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
-        k: eigenpairs. By default Weyl's law gives a number that leaves a share of 1e-6 of the heat trace at the
-            smallest time beyond them, at most all; it grows if the fit comes to a field of more volume. For a wave
-            kernel signature, those up to 2σ above the largest energy.
-        boundary: as for `eigenpairs`.
-        solver: eigensolver; ``"auto"`` chooses for many products with one Jacobian.
-        search: how to look for the metric, and when to stop.
-        progress: called with each step; ``print`` will do.
-        checkpoint: a file to write after each step. If it is there already, the fit goes on from it.
+        init: the initial metric: a field, or a grid for the flat metric. The fit keeps properties of the field that the
+            parametrisation does not change.
+        target: ``hks(pairs, times)`` (n_times, *grid.shape) of the unknown metric, positive at observed nodes. A wave
+            kernel signature is (n_energies, *grid.shape), a heat trace (n_times,), and eigenvalues are (m,) in
+            ascending order, including zeros.
+        times: (n_times,) times, or the energies of a wave kernel signature; None if the signature has neither.
+        parametrisation: ``"log-euclidean"`` or ``"cholesky"`` (the whole tensor), ``"conformal"`` (e^u T₀),
+            ``"eigenvalues"`` (with the eigenvectors of `init`), ``"rotation"`` (with its eigenvalues), a
+            `Parametrisation`, or `Free` parameters of a function.
+        data: the kind of signature, the measure of differences, and the weights and noise of entries.
+        regularisers: penalties from `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
+        k: the number of eigenpairs. By default, a share of 1e-6 of the heat trace at the smallest time lies beyond them
+            by Weyl's law, or all are computed. It grows if the fit reaches a field of more volume. For a wave kernel
+            signature they reach to 2σ above the largest energy.
+        boundary: the same as for `eigenpairs`.
+        solver: the eigensolver; ``"auto"`` chooses one for many products with the same Jacobian.
+        search: the settings of the optimisation and its stopping criteria.
+        progress: a function, such as ``print``, that is called with each step.
+        checkpoint: a file that is written after each step. If the file exists, the fit resumes from it.
 
     Returns:
-        The fit. ``fit.result`` says how it ended; nothing is raised when it stalls or is interrupted.
+        The fit. ``fit.result`` states how it ended; a fit that stalls or is interrupted raises no error.
 
     Warns:
-        AccuracyWarning: the misfit is near the truncation error of k pairs: the fit matches its own truncation. Or it
-            stays above the noise: no metric of this parametrisation explains the target.
+        AccuracyWarning: if the misfit is close to the truncation error of k pairs, so that the fit matches its own
+            truncation, or if it stays above the noise, so that no metric found explains the target.
 
     Raises:
-        TypeError: `init` is neither a grid nor a field.
-        ValueError: a target that is NaN, not positive or of the wrong shape; times that the grid cannot resolve; an
-            unknown choice; a checkpoint of another fit.
+        TypeError: if `init` is neither a grid nor a field.
+        ValueError: if the target is NaN, not positive or of the wrong shape, if the grid cannot resolve a time, if an
+            option is unknown, or if the checkpoint belongs to another fit.
     """
     clock = time.perf_counter()
     if isinstance(init, Grid):
@@ -111,16 +111,15 @@ def fit_metric(
     misfit, left = float(outcome.misfit), float(outcome.truncation)
     if truncation_shows(misfit, left):
         warn_of_accuracy(
-            f"k: {problem.k} eigenpairs leave out a misfit of about {left:.1e}, and the fit's is {misfit:.1e}: "
-            f"it has fitted its own truncation. Use k=None, or k={more_pairs(problem, values)} or "
-            f"more; only if the target was itself computed with {problem.k} pairs is nothing wrong"
+            f"k: the truncation to {problem.k} eigenpairs causes a misfit of about {left:.1e}, and the fit's misfit "
+            f"is {misfit:.1e}. So the fit matches its own truncation. Use k=None, or k={more_pairs(problem, values)} "
+            f"or more, unless the target was computed with {problem.k} pairs"
         )
     elif noise is not None and result in ("converged", "stalled") and misfit > noise**2:
         warn_of_accuracy(
-            f"noise: the fit {result} at residuals of {(2 * misfit) ** 0.5:.2g}, of which noise explains {noise:.2g}: "
-            "no metric of this parametrisation that it found explains the target. Use another parametrisation, such as "
-            '"log-euclidean", another init or weaker regularisers; or the noise is larger. What the fit added '
-            "to init may be the misfit's and not the metric's"
+            f"noise: the fit {result} at residuals of {(2 * misfit) ** 0.5:.2g}, of which noise explains {noise:.2g}. "
+            "So no metric that the fit found explains the target, and its changes to init may be artefacts. Use "
+            'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise'
         )
     return MetricFit(
         unknowns.field(values),

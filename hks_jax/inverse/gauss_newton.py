@@ -1,4 +1,4 @@
-"""Gauss–Newton with Levenberg–Marquardt damping, matrix-free: products with J and Jᵀ, and conjugate gradients."""
+"""A matrix-free Gauss–Newton method with Levenberg–Marquardt damping and conjugate gradients."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,33 +20,33 @@ _Options = dict[str, Any]
 _Tags = frozenset[object]
 
 _TIGHTER, _LONGER = 30, 3
-"""The factors of exactness and of the number of products in linear systems of steps that may be the last."""
+"""The factors of the accuracy and of the number of products in the linear systems of steps that may be the last."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
-"""The shares of the promised reduction for which a step is taken, and damping falls; the factor after a worse step."""
+"""The shares of the predicted reduction that accept a step and reduce damping; the step size's factor otherwise."""
 _FREE = 0.01
-"""The largest share of damping in a step's curvature for which the step measures the distance to the solution."""
+"""The largest share of damping in a step's curvature at which the step estimates the distance to the solution."""
 
 
 def remaining_change(last: Array, before: Array) -> Array:
-    """Return the last step, or the sum of the steps to come if it is larger, were the last two a geometric series."""
+    """Return the last step or, if larger, the sum of the future steps in a geometric series with the last two."""
     ratio = jnp.where(before > 0, last / before, jnp.inf)
     return jnp.where(ratio < 1, last * jnp.maximum(1, ratio / (1 - ratio)), jnp.inf)
 
 
 class _State(eqx.Module):
-    """The descent's knowledge at the last accepted unknowns."""
+    """The state of the descent at the last accepted unknowns."""
 
     values: Values  # the unknowns
     gradient: Values  # the gradient
-    promised: Float[Array, ""]  # the change of half the sum of squares by the last step from there, linearised
-    change: Float[Array, ""]  # the size of the step that led there, in tolerances
-    damped: Float[Array, ""]  # B along that step over the curvature that it saw: times μ, the part of damping
+    promised: Float[Array, ""]  # the linearised change of half the sum of squares by the last step
+    change: Float[Array, ""]  # the size of the last accepted step, in tolerances
+    damped: Float[Array, ""]  # xᵀBx of that step over its curvature; times μ, the share of damping
     tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
-    done: Bool[Array, ""]  # whether no step is needed any more
+    done: Bool[Array, ""]  # whether the descent has converged
 
 
 def begun(y: Values) -> _State:
-    """Return the state before any unknowns were accepted."""
+    """Return the state before any unknowns are accepted."""
     far, no = jnp.asarray(jnp.inf, y.dtype), jnp.zeros((), bool)
     return _State(y, jnp.zeros_like(y), jnp.zeros((), y.dtype), far, far, no, no)
 
@@ -54,17 +54,17 @@ def begun(y: Values) -> _State:
 class _Progress(eqx.Module):
     """The state of the solver."""
 
-    first: Bool[Array, ""]  # whether no step was taken yet
-    trial: Values  # the unknowns to be looked at next
+    first: Bool[Array, ""]  # whether no step has been accepted
+    trial: Values  # the unknowns to be evaluated next
     step_size: Float[Array, ""]  # 1/μ, relative to the first
     linearised: Any  # residuals and Jacobian at the last accepted unknowns
-    aux: Any  # the residuals' further output, there
-    descent: _State  # the descent's knowledge, there
-    finite: Bool[Array, ""]  # whether the last step is
+    aux: Any  # the auxiliary output of the residuals there
+    descent: _State  # the state of the descent there
+    finite: Bool[Array, ""]  # whether the last step is finite
 
 
 def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:
-    """Return residuals with the products with their Jacobian, and their further output."""
+    """Return residuals with their linearisation, and their auxiliary output."""
     residual, product, aux = jax.linearize(lambda v: fn(v, args), values, has_aux=True)
     jacobian = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: values))
     return optx.FunctionInfo.ResidualJac(residual, jacobian), aux
@@ -77,21 +77,21 @@ def _empty(structure: Any) -> Any:
 class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     """The default solver of `hks_jax.fit_metric`.
 
-    Its steps δ solve (JᵀJ + μB) δ = −Jᵀr, with B an inner product of the unknowns and μ = damping / step size. The
-    conjugate gradients stop early: far from the solution more digits would be lost on the linearisation. Their result
-    is a descent direction whenever they stop.
+    Its steps δ solve (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the unknowns and μ = damping / step size. The
+    conjugate gradients stop early, because far from the solution the linearisation error exceeds the algebraic error.
+    They return a descent direction whenever they stop.
 
-    Its settings are arrays: steps compiled for some serve all others.
+    The settings are arrays, so a step that is compiled for some values works for all.
 
     Args:
-        tolerance: of the change of the unknowns, relative and absolute (root mean square), at which it stops; see
+        tolerance: the relative and absolute change of the unknowns (root mean square) at which the solver stops; see
             `Search`.
-        damping: μ of the first step, relative to the scale of the data.
-        growth: the divisor of μ after a step that reduces the misfit as far as its linearisation promised.
-        inner_product: B, in which steps are small.
-        inner_tolerance: reduction of the linear residual in each step; steps that may be the last go 30 times further.
-        inner_steps: the most products with JᵀJ in each step; in steps that may be the last three times as many.
-        preconditioner: of the conjugate gradients; B by default.
+        damping: the damping μ of the first step, relative to the scale of the data.
+        growth: the divisor of μ after a step that reduces the misfit as much as its linearisation predicts.
+        inner_product: the inner product B, in whose norm steps are damped.
+        inner_tolerance: the reduction of the linear residual in a step; 30 times smaller if it may be the last.
+        inner_steps: the maximum number of products with JᵀJ in a step; three times larger if it may be the last.
+        preconditioner: the preconditioner of the conjugate gradients; B by default.
     """
 
     rtol: Float[Array, ""]  # type: ignore[assignment]
@@ -126,34 +126,34 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         self.preconditioner = preconditioner or self.inner_product
 
     def accepted(self, y: Values, state: _State) -> _State:
-        """Return the state at new unknowns, from the step that led there; the next step computes their gradient."""
+        """Return the state after an accepted step to new unknowns; the next step computes the gradient there."""
         step = y - state.values
         change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(y))))
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
         damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
         settled = moved & (remaining_change(change, state.change) < 1)
-        # The next step may be the last: if steps go on to shrink like this, it is below the tolerance.
+        # The next step may be the last: it is below the tolerance if the steps keep shrinking at this rate.
         near = moved & jnp.isfinite(state.change) & (change**2 < state.change)
         change = jnp.where(moved, change, jnp.inf)
         tight, done = state.tight | near | settled, state.tight & settled
         return _State(y, state.gradient, state.promised, change, damped, tight, done)
 
     def _done(self, step_size: Array, state: _State) -> Bool[Array, ""]:
-        """Tell whether the unknowns have converged, and not only been held by damping."""
+        """Return whether the unknowns have converged and are not merely held by damping."""
         return state.done & (self.damping / step_size * state.damped < _FREE)
 
-    # With g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
+    # If g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
     #
     #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
     def _next(
         self, step_size: Array, linearised: Any, state: _State, needed: bool | Bool[Array, ""]
     ) -> tuple[Values, _State]:
-        """Return the step δ, zero if none is needed, and the state with the gradient and the promised reduction."""
+        """Return the step δ, or zero after convergence, and the state with the gradient and the predicted reduction."""
         jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape
         adjoint, damping = jacobian.transpose(), self.damping / step_size
 
-        # J and Jᵀ stand in the program once: they take most of the compilation.
+        # The program contains J and Jᵀ only once, because they dominate the compilation time.
         def normal(x: Array, first: Bool[Array, ""]) -> tuple[Array, float]:
             x = x.reshape(shape)
             image = adjoint.mv(jax.lax.cond(first, lambda: residual, lambda: jacobian.mv(x)))
@@ -177,7 +177,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     def init(
         self, fn: Callable, y: Values, args: Any, options: _Options, f_struct: Any, aux_struct: Any, tags: _Tags
     ) -> _Progress:
-        """Return the state before the first step, in which ``y`` is looked at."""
+        """Return the state before the first step, which evaluates ``y``."""
         structure, _ = eqx.filter_eval_shape(_linearise, fn, y, args)
         yes, one = jnp.asarray(True), jnp.ones((), y.dtype)
         return _Progress(yes, y, one, _empty(structure), _empty(aux_struct), begun(y), yes)
@@ -185,13 +185,13 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     def step(
         self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Values, _Progress, Any]:
-        """Take the trial or not, and choose the next; return the unknowns and the residuals' further output.
+        """Accept or reject the trial, and choose the next; return the unknowns and the auxiliary output.
 
-        Computing the next is most of the work. It is left out where the option ``"enough"``, a function of that output,
-        says that the unknowns will do.
+        Choosing the next trial is most of the work. It is skipped if the option ``"enough"``, a function of that
+        output, is true.
         """
         linearised, aux = _linearise(fn, state.trial, args)
-        # Traces are compared by identity: the one of the state stands for all.
+        # Traces are compared by identity, so the trace of the state is used in all states.
         linearised = eqx.combine(
             eqx.filter(linearised, eqx.is_array), eqx.filter(state.linearised, eqx.is_array, inverse=True)
         )
@@ -213,7 +213,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     def terminate(
         self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        """Tell whether the unknowns have converged."""
+        """Return whether the unknowns have converged, and whether the last step is finite."""
         successful, not_finite = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
         return self._done(state.step_size, state.descent), optx.RESULTS.where(state.finite, successful, not_finite)
 
@@ -228,5 +228,5 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         tags: _Tags,
         result: Any,
     ) -> tuple[Values, Any, dict[str, Any]]:
-        """Return the unknowns and the further output as they are."""
+        """Return the unknowns and the auxiliary output unchanged."""
         return y, aux, {}

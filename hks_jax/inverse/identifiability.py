@@ -1,4 +1,4 @@
-"""The information of data about the unknowns of a fit: the spectrum of JᵀJ, resolution, and uncertainty."""
+"""The information of data about the unknowns of a fit: the spectrum of JᵀJ, resolution and uncertainty."""
 
 from typing import Any
 
@@ -16,30 +16,29 @@ from hks_jax.linear import lapack
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 
 _ROUNDS = 4
-"""Rounds of Chebyshev filtering for the weakest directions; each begins with the result of the last."""
+"""The number of rounds of Chebyshev filtering for the weakest directions. Each starts from the previous result."""
 
 
 class Identifiability(eqx.Module):
     """The directions that noisy data determine near a solution, to first order.
 
-    With independent residuals of standard deviation σ the information about the unknowns is JᵀJ/σ². Against a prior of
-    standard deviation τ, a direction v of JᵀJ with eigenvalue s² is determined by s²/(s² + σ²/τ²): near one by the
-    data, near zero by the prior. The prior is white: it expects nothing of neighbours.
+    For independent residuals with standard deviation σ the information about the unknowns is JᵀJ/σ². With a prior of
+    standard deviation τ the data determine the share s²/(s² + σ²/τ²) of an eigenvector of JᵀJ with eigenvalue s², and
+    the prior determines the rest. The prior is white, so it does not couple neighbours.
 
     Attributes:
-        strengths: (n,) the largest eigenvalues s² of JᵀJ, descending; per unit of residual variance.
-        directions: (n, *values) their eigenvectors, of length one.
-        weak_strengths: (n_weak,) estimates from above of the smallest eigenvalues, ascending.
-        weak_directions: (n_weak, *values) directions that the data hardly see.
-        resolution: (nodes,) the share of each node's unknowns that the data determine: 0 … 1. A lower bound, by the n
-            directions alone.
-        deviation: (nodes,) the standard deviation of a node's unknowns (root mean square) that is left, by the n
-            directions alone: an upper bound of that of the exact posterior, to first order, under a white prior
-            (unknowns independent of each other, of standard deviation τ each). Under a prior that expects
-            neighbours to be alike less is left.
+        strengths: (n,) the largest eigenvalues s² of JᵀJ in descending order, for unit residual variance.
+        directions: (n, *values) their eigenvectors, normalised.
+        weak_strengths: (n_weak,) upper estimates of the smallest eigenvalues in ascending order.
+        weak_directions: (n_weak, *values) the directions that the data determine least.
+        resolution: (nodes,) a lower bound from the n directions on the share of each node's unknowns that the data
+            determine.
+        deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
+            directions. To first order it is an upper bound on the exact one under a white prior, which means
+            independent unknowns with standard deviation τ. A prior that couples neighbours reduces it.
         effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
-        noise: σ.
-        prior: τ.
+        noise: the standard deviation σ of the residuals.
+        prior: the standard deviation τ of the prior.
     """
 
     strengths: Float[Array, " n"]
@@ -55,7 +54,7 @@ class Identifiability(eqx.Module):
     def __repr__(self) -> str:
         top, bottom = float(self.strengths[0]), float(self.weak_strengths[0])
         return (
-            f"Identifiability({float(self.effective):.1f} of {self.directions[0].size} unknowns seen by the "
+            f"Identifiability({float(self.effective):.1f} of {self.directions[0].size} unknowns determined by the "
             f"{len(self.strengths)} strongest directions; s² from {top:.2e} to at most {bottom:.2e})"
         )
 
@@ -70,35 +69,35 @@ def identifiability(
     iterations: int = 4,
     seed: int = 0,
 ) -> Identifiability:
-    """Find the directions that the data of a fit determine, by products with J and Jᵀ alone.
+    """Find the directions that the data of a fit determine, from products with J and Jᵀ.
 
-    The strongest directions come from randomised subspace iteration on JᵀJ (Halko, Martinsson and Tropp 2011), the
-    weakest from the same on the complement, by Chebyshev polynomials that damp all that is strong. Isometries that the
-    observation cannot tell are among the weak ones, and so are checkerboards and changes far from observed nodes.
+    The strongest directions result from randomised subspace iteration on JᵀJ (Halko, Martinsson and Tropp 2011). The
+    weakest result from subspace iteration on the complement with Chebyshev polynomials that damp strong directions.
+    Weak directions include isometries that preserve the observation, checkerboards, and changes far from observations.
 
     Args:
-        fit: from `fit_metric`, or its problem.
-        values: where to linearise; by default at the fit's solution.
-        n: how many strong directions.
-        n_weak: how many weak ones.
+        fit: the result of `fit_metric`, or its problem.
+        values: the values at which to linearise, by default the fit's solution.
+        n: the number of strong directions.
+        n_weak: the number of weak directions.
         noise: σ, the standard deviation of each entry's residual before weighting (0.01 for 1 % under ``"log"``).
-        prior: τ, in the units of the parametrisation, of every unknown alone.
-        iterations: of the subspace iteration; each takes n + 8 products with J and with Jᵀ.
-        seed: of the random start.
+        prior: τ, the prior standard deviation of every single unknown, in the units of the parametrisation.
+        iterations: the number of subspace iterations, each with n + 8 products with J and with Jᵀ.
+        seed: the seed of the random initial subspace.
 
     Returns:
-        Spectrum, directions, resolution and uncertainty.
+        The spectrum, directions, resolution and uncertainty.
 
     Raises:
-        ValueError: a problem without values, or n out of range.
+        ValueError: if a problem is given without values, or if n is out of range.
     """
     problem = fit.problem if isinstance(fit, MetricFit) else fit
     values = fit.values if isinstance(fit, MetricFit) and values is None else values
     if values is None:
-        raise ValueError("values: got None; a problem needs the values at which to linearise")
+        raise ValueError("values: got None for a problem; expected the values at which to linearise")
     total = values.size
     if not 1 <= n <= total or not 1 <= n_weak <= total:
-        raise ValueError(f"n, n_weak: got {n}, {n_weak}; expected 1 … {total}, the number of unknowns")
+        raise ValueError(f"n, n_weak: got {n}, {n_weak}; expected 1 to {total}, the number of unknowns")
     require_number("noise", noise)
     require_number("prior", prior)
     require_count("iterations", iterations)
@@ -108,7 +107,7 @@ def identifiability(
     weak_start = jax.random.normal(keys[1], (min(n_weak + 4, total), *values.shape), values.dtype)
     weak, weak_directions = _weakest(problem, values, weak_start, strengths[0], 2 * iterations)
 
-    # The weights add up to one over m entries: a residual of deviation σ has σ²/m after weighting, in the mean.
+    # The weights of m entries add up to one, so weighted residuals have the mean variance σ²/m.
     variance = noise**2 / problem.observation.target.size
     strengths, directions = strengths[:n], directions[:n]
     share = strengths / (strengths + variance / prior**2)
@@ -128,7 +127,7 @@ def identifiability(
 
 
 def _information(problem: Problem, values: Values) -> Any:
-    """Return the product with JᵀJ of the data's residuals, for a batch of directions one after the other."""
+    """Return a function that multiplies each direction of a batch by JᵀJ of the data's residuals."""
 
     def data(values: Values) -> Array:
         return problem.observation.residuals(problem.pairs(values))
@@ -152,7 +151,7 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
 
     def improve(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
         values, block = state
-        # A Chebyshev polynomial: small between the weak eigenvalues found so far and the top, growing below.
+        # The Chebyshev polynomial is small between the current weak eigenvalues and the top, and grows below them.
         cut = jnp.mean(values)
         centre, half = (1.1 * top + cut) / 2, (1.1 * top - cut) / 2
 
@@ -171,7 +170,7 @@ def _orthonormal(block: Float[Array, "n *values"]) -> Float[Array, "n *values"]:
 
 
 def _ritz(block: Array, image: Array) -> tuple[Array, Array]:
-    """Return Ritz values, ascending, and vectors in the span of orthonormal directions."""
+    """Return Ritz values in ascending order and Ritz vectors in the span of orthonormal directions."""
     flat, images = block.reshape(len(block), -1), image.reshape(len(block), -1)
     projected = jnp.matmul(flat, images.T, precision="highest")
     values, mix = lapack.eigh((projected + projected.T) / 2)

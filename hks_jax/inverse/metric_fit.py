@@ -1,4 +1,4 @@
-"""The result of a fit, and its error bars: draws from the posterior that its linearisation has."""
+"""The result of a fit, and its error bars by draws from the linearised posterior."""
 
 import dataclasses
 import math
@@ -17,15 +17,15 @@ from hks_jax.inverse.problem import Problem
 from hks_jax.inverse.unknowns import Values
 
 _TOLERANCE, _STEPS = 1e-6, 1000
-"""Of the residuals of conjugate gradients, relative, and their number at most."""
+"""The relative residual of conjugate gradients, and the maximum number of their steps."""
 
 RESULTS = {
     "converged": "the unknowns no longer change by more than the tolerance",
     "noise level reached": "the misfit is as small as the stated noise",
-    "steps exhausted": "max_steps was reached; allow more",
-    "stalled": "no step improves the loss any more; damping, regularisers or k may need a change",
-    "not finite": "the signature or its derivative is NaN or infinite; see the warnings",
-    "interrupted": "stopped from outside",
+    "steps exhausted": "the number of steps reached max_steps; increase it",
+    "stalled": "no step reduces the loss; change the damping, the regularisers or k",
+    "not finite": "the signature or its derivative is NaN or infinite; check the warnings",
+    "interrupted": "the fit was interrupted",
 }
 
 
@@ -34,15 +34,14 @@ class Step:
     """One step of a fit.
 
     Attributes:
-        step: its number, from 0 for the unknowns before any change. Of solvers of optimistix only steps that were taken
-            are told, not those that were tried.
+        step: its number, where 0 belongs to the initial unknowns. Solvers of optimistix report only accepted steps.
         loss: half the weighted mean square of the residuals, plus the penalties.
-        misfit: the part of the data.
-        gradient: the norm of the loss's gradient; NaN where nobody computed it (least squares solvers of optimistix).
-        accepted: whether the step was taken.
-        seconds: since the start.
-        stage: which part of the continuation.
-        start: which of the starts.
+        misfit: the data's part of the loss.
+        gradient: the norm of the loss's gradient; NaN for least squares solvers of optimistix, which do not compute it.
+        accepted: whether the step was accepted.
+        seconds: the time since the fit began.
+        stage: the number of the stage of the continuation.
+        start: the number of the start.
     """
 
     step: int
@@ -63,13 +62,13 @@ class Step:
 
 
 class Posterior(eqx.Module):
-    """The uncertainty of a fitted metric that noise and prior leave, to first order.
+    """The first-order uncertainty of a fitted metric, given noise and prior.
 
     Attributes:
         values: (*values) the standard deviations of the unknowns, in the parametrisation's units.
         tensors: (*shape, d, d) the standard deviations of the tensors' components.
         unsolved: the largest relative residual of the linear systems of the draws.
-        sampling_error: the relative standard deviation of all of these deviations.
+        sampling_error: the relative standard deviation of these deviations.
     """
 
     values: Float[Array, "*values"]
@@ -85,15 +84,16 @@ class MetricFit:
     Attributes:
         field: the fitted metric.
         loss: half the weighted mean square of the residuals, plus the penalties.
-        misfit: the part of the data.
-        truncation_misfit: an estimate of the misfit that the metric itself would have to a target of all eigenpairs, as
-            k are computed; 0 for signatures that k pairs define.
+        misfit: the data's part of the loss.
+        truncation_misfit: an estimate of the misfit between the signatures of the metric by k and by all eigenpairs; 0
+            for signatures that k pairs define.
         history: one entry for each step.
-        result: one of the keys of `RESULTS`, whose values explain them.
-        values: the unknowns, as the parametrisation has them.
-        problem: the least squares problem, for `identifiability` and for a fit of your own.
+        result: a key of `RESULTS`, whose values explain the keys.
+        values: the unknowns of the parametrisation.
+        problem: the least squares problem, for `identifiability` and for custom fits.
         losses: the loss of each start.
-        noise: the standard deviation of the residuals that was stated, or that of the target made; else None.
+        noise: the stated standard deviation of the residuals, or the one that follows from the target's; otherwise
+            None.
     """
 
     field: TensorField
@@ -109,39 +109,39 @@ class MetricFit:
 
     @property
     def converged(self) -> bool:
-        """Whether it stopped by itself at a solution."""
+        """Whether the fit converged to a solution or to the noise level."""
         return self.result in ("converged", "noise level reached")
 
     @property
     def steps(self) -> int:
-        """How many steps were computed, over all stages and starts."""
-        # Step 0 of a stage, or of a fit resumed, changes nothing.
+        """The number of computed steps in all stages and starts."""
+        # Step 0 of a stage or of a resumed fit changes nothing.
         return sum(step.step > 0 for step in self.history)
 
     @property
     def hks(self) -> Array:
-        """The signature of the fitted metric, of the kind and shape of the target; computed anew each time."""
+        """The signature of the fitted metric, of the kind and shape of the target. Each access computes it again."""
         return self.problem.observation.predict(self.problem.pairs(self.values))
 
     def uncertainty(self, prior: float = 1.0, noise: float | None = None, draws: int = 32, seed: int = 0) -> Posterior:
-        """Compute the error bars of the fitted metric, to first order about it: Laplace's approximation.
+        """Compute first-order error bars of the fitted metric by Laplace's approximation.
 
-        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹: J is the Jacobian of the data, Σ their noise,
-        weighed as in the fit, and R the Hessian of the penalties and of a white prior. Draws from it come of one linear
-        system each, by conjugate gradients.
+        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹: J is the Jacobian of the data, Σ is the noise
+        with the weights of the fit, and R is the Hessian of the penalties and a white prior. Each draw solves one
+        linear system by conjugate gradients.
 
         Args:
-            prior: the standard deviation that every unknown has without data, in the parametrisation's units.
-            noise: of the residuals; None: that of the fit.
-            draws: how many; a deviation is sure to 1/√(2·draws) of itself.
-            seed: of the draws.
+            prior: the standard deviation of every unknown without data, in the parametrisation's units.
+            noise: the standard deviation of the residuals, by default that of the fit.
+            draws: the number of draws; the relative error of a deviation is 1/√(2·draws).
+            seed: the seed of the draws.
 
         Raises:
-            ValueError: a fit without noise, when none is given.
+            ValueError: if neither the fit nor the argument states a noise.
         """
         noise = self.noise if noise is None else noise
         if noise is None:
-            raise ValueError("noise: the fit has none; give the standard deviation of its residuals, or fit with one")
+            raise ValueError("noise: got None for a fit without noise; expected the residuals' standard deviation")
         require_number("noise", noise)
         require_number("prior", prior)
         require_count("draws", draws)
@@ -155,8 +155,8 @@ class MetricFit:
         return f"MetricFit({self.result}: loss {self.loss:.3e} after {self.steps} steps)"
 
 
-# With independent standard normal numbers ξ the right-hand side Aᵀξ + ξ₀/τ has the covariance H = AᵀA + 1/τ², so that
-# H⁻¹ times it has H⁻¹ (Papandreou and Yuille 2010).
+# For independent standard normal ξ and ξ₀ the right-hand side Aᵀξ + ξ₀/τ has the covariance H = AᵀA + 1/τ². So the
+# solution with the matrix H has the covariance H⁻¹ (Papandreou and Yuille 2010).
 @jit_quickly(eqx.filter_jit)
 def _deviations(
     problem: Problem, values: Values, scale: Float[Array, ""], prior: Float[Array, ""], keys: Array

@@ -1,4 +1,4 @@
-"""Observations: a target signature, its nodes and times, and the comparison of a prediction with it."""
+"""Observations of a target signature at nodes and times, and their comparison with predictions."""
 
 import dataclasses
 import math
@@ -34,20 +34,20 @@ class Data:
     """The kind of the target of `hks_jax.fit_metric`, and its weights and noise.
 
     Attributes:
-        signature: ``"hks"``; ``"heat-trace"``; ``"eigenvalues"``, the lowest; `wave_kernel` (σ); or a function of
-            `Eigenpairs` to an array of the target's shape.
-        loss: ``"log"`` (differences of logarithms), ``"relative"``, ``"absolute"``, or a function of predicted and
-            target values, flat, to residuals.
-        weights: ≥ 0, broadcast to the target's shape; 0 where nothing is observed (the target may be NaN there).
-        noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``): the fit stops where the misfit
-            reaches it (discrepancy principle), which regularises it.
-        deviation: the standard deviation of the target's noise, in its unit, broadcast to its shape, as
-            `hks_jax.uncertainty` gives it. Residuals are weighed by its inverse square, besides by `weights`, and
-            `noise` follows from it unless it is given. Correlations of the noise are not heeded.
+        signature: ``"hks"``, ``"heat-trace"``, ``"eigenvalues"`` (the lowest), the result of `wave_kernel`, or a
+            function that maps `Eigenpairs` to an array of the target's shape.
+        loss: ``"log"`` (differences of logarithms), ``"relative"``, ``"absolute"``, or a function that maps flat
+            predicted and target values to residuals.
+        weights: numbers ≥ 0 that broadcast to the target's shape; 0 at unobserved entries, where the target may be NaN.
+        noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``). The fit stops when the misfit
+            reaches this level (the discrepancy principle), which regularises it.
+        deviation: the standard deviation of the target's noise in the target's unit, broadcast to its shape, for
+            example from `hks_jax.uncertainty`. The weights are multiplied by its inverse square, and by default `noise`
+            follows from it. Correlations of the noise are ignored.
 
     Raises:
-        ValueError: an unknown signature or loss; a noise that is not positive; a deviation with a loss that is a
-            function.
+        ValueError: if the signature or loss is unknown, if the noise is not positive, or if a function as loss has a
+            deviation.
     """
 
     signature: str | Signature | Callable[[Eigenpairs], Array] = "hks"
@@ -57,13 +57,13 @@ class Data:
     deviation: Any = None
 
     def __post_init__(self) -> None:
-        """Check the settings, as far as that needs no target."""
+        """Check the settings that do not depend on the target."""
         if not callable(self.signature) and not isinstance(self.signature, Signature):
             named("signature", self.signature, SIGNATURES, "wave_kernel(sigma), or a function of eigenpairs")
         if not callable(self.loss):
             named("loss", self.loss, LOSSES, "or a function of predicted and target values")
         elif self.deviation is not None:
-            raise ValueError("deviation: it cannot be taken through a loss that is a function; give weights and noise")
+            raise ValueError("deviation: got a value with a function as loss; use weights and noise instead")
         if self.noise is not None:
             require_number("noise", self.noise)
         for name in ("weights", "deviation"):
@@ -73,18 +73,18 @@ class Data:
 class Observation(eqx.Module):
     """The observed entries of a target."""
 
-    target: Float[Array, " m"]  # their values
+    target: Float[Array, " m"]  # the observed values
     root_weights: Float[Array, " m"]  # the square roots of their weights, which add up to one
     times: Float[Array, " n_times"] | None  # the times, energies, or None
-    signature: Signature  # its kind
-    shape: tuple[int, ...] = eqx.field(static=True)  # of the whole target
-    entries: StaticArray = eqx.field(static=True)  # which of the flat target's entries they are
-    loss: Loss = eqx.field(static=True)  # of predicted and target values to residuals
+    signature: Signature  # the kind of signature
+    shape: tuple[int, ...] = eqx.field(static=True)  # the shape of the whole target
+    entries: StaticArray = eqx.field(static=True)  # the indices of the observed entries in the flat target
+    loss: Loss = eqx.field(static=True)  # maps predicted and target values to residuals
 
     def predict(self, pairs: Eigenpairs) -> Array:
         """Return the whole signature."""
         values = self.signature.predict(pairs, self.times)
-        return values[: self.shape[0]] if self.signature.lowest else values  # there may be spare pairs
+        return values[: self.shape[0]] if self.signature.lowest else values  # there may be more pairs
 
     def pairs_needed(self, k: int | None, pencil: AnyPencil, field: TensorField) -> int:
         """Return the number of eigenpairs to compute: k, or enough for the observed times."""
@@ -94,7 +94,7 @@ class Observation(eqx.Module):
         return self.signature.pairs_needed(k, times, pencil, field)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
-        """Return the residuals, half of whose sum of squares is the misfit."""
+        """Return the residuals. The misfit is half their sum of squares."""
         return self.compare(self.predict(pairs))
 
     def compare(self, predicted: Array) -> Float[Array, " m"]:
@@ -102,9 +102,9 @@ class Observation(eqx.Module):
         return self.root_weights * self.loss(predicted.reshape(-1)[self.entries.value], self.target)
 
     def truncation_misfit(self, pairs: Eigenpairs) -> Float[Array, ""]:
-        """Estimate the misfit that the metric itself would have to a target of all pairs, as k are computed.
+        """Estimate the misfit between the signatures of the metric by k and by all pairs.
 
-        It is half the weighted sum of squares of the changes that the missing pairs make to the residuals: zero for
+        It is half the weighted sum of squares of the missing pairs' contributions to the residuals, and zero for
         signatures that k pairs define.
         """
         if self.signature.left_out is None:
@@ -120,7 +120,7 @@ class Observation(eqx.Module):
         return np.asarray(self.times)[self.entries.value // math.prod(self.shape[1:])]
 
     def stages(self, count: int) -> list["Observation"]:
-        """Return the observation of each of several stages: the largest times first, all of them in the last."""
+        """Return the observations of successive stages, which start with the largest times and end with all times."""
         if self.signature.left_out is None:
             return [self]
         times, stages = self.observed_times, []
@@ -134,7 +134,7 @@ class Observation(eqx.Module):
 
 
 def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: Any) -> tuple[Observation, float | None]:
-    """Check the target; return the observation, and the standard deviation of the residuals where it is known."""
+    """Check the target; return the observation and, if known, the standard deviation of the residuals."""
     signature: Any = data.signature
     if not isinstance(signature, Signature):
         signature = SIGNATURES[signature] if isinstance(signature, str) else Signature(signature)
@@ -157,10 +157,10 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
     weights, noise = _weights(values, data)
     weights = weights * (space.free if signature.at_nodes else 1)
     if signature.lowest:
-        weights = weights * (np.arange(values.size) >= space.n_null)  # zero whatever the metric is
+        weights = weights * (np.arange(values.size) >= space.n_null)  # zero for every metric
     used = weights > 0
     if not used.any():
-        raise ValueError("weights: all are zero inside the domain; expected some observed entries")
+        raise ValueError("weights: got only zeros inside the domain; expected a positive weight at some entry")
     remedy = "Give them the weight 0, take their nodes out of the mask, or correct them"
     _refuse("target", values, used & ~np.isfinite(values), used, "NaN or infinite", remedy)
     if data.loss in ("log", "relative"):
@@ -180,15 +180,15 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
 
 
 def _weights(values: np.ndarray, data: Data) -> tuple[np.ndarray, float | None]:
-    """Return the weights, those that a deviation makes included, and the deviation of a residual in their mean."""
+    """Return the weights, including factors from the deviation, and the mean deviation of a residual."""
     given = np.ones(values.shape) if data.weights is None else _broadcast("weights", data.weights, values.shape)
     if not (np.isfinite(given) & (given >= 0)).all():
-        raise ValueError("weights: got negative, infinite or NaN ones; expected numbers ≥ 0 (0: not observed)")
+        raise ValueError("weights: got negative, infinite or NaN weights; expected numbers ≥ 0 (0: not observed)")
     if data.deviation is None:
         return given, data.noise
     size = _broadcast("deviation", data.deviation, values.shape)
     used = (given > 0) & np.isfinite(values)
-    remedy = "Expected one for every observed value; give others the weight 0"
+    remedy = "Expected a positive number for every observed value; set the weight of others to 0"
     _refuse("deviation", size, used & ~(np.isfinite(size) & (size > 0)), used, "not positive numbers", remedy)
     of_residuals = np.where(used, size if data.loss == "absolute" else size / np.abs(values), 1.0)
     weighed = np.where(used, given / of_residuals**2, 0.0)
@@ -201,16 +201,16 @@ def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
         return np.broadcast_to(np.asarray(values, np.float64), shape)
     except ValueError:
         raise ValueError(
-            f"{name}: got shape {np.shape(values)}; expected one that broadcasts to the target's {shape}, such as "
+            f"{name}: got shape {np.shape(values)}; expected a shape that broadcasts to the target's {shape}, such as "
             "(*grid.shape) for nodes or (n_times, 1, 1) for times"
         ) from None
 
 
 def _refuse(name: str, values: np.ndarray, bad: np.ndarray, used: np.ndarray, what: str, remedy: str) -> None:
-    """Raise ValueError if some of the observed values are bad."""
+    """Raise ValueError if observed values are invalid."""
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"{name}: {int(bad.sum())} of {int(used.sum())} observed values are {what} (the first at {first}: "
-            f"{values[first]:.4g}). {remedy}"
+            f"{name}: got {int(bad.sum())} of {int(used.sum())} observed values that are {what} (the first is "
+            f"{values[first]:.4g} at {first}). {remedy}"
         )

@@ -1,4 +1,4 @@
-"""The loop of a fit: compiled steps of an optimistix solver, and decisions between them in Python."""
+"""The loop of a fit, with compiled steps of an optimistix solver and decisions in Python between steps."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,11 +17,11 @@ from hks_jax.inverse.unknowns import Values
 
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 _REJECTIONS = 12
-"""Rejected steps in a row after which a fit counts as stalled."""
+"""The number of consecutive rejected steps after which a fit counts as stalled."""
 
 
 class _Told(eqx.Module):
-    """The further output of residuals and objective, with the unknowns to which it belongs."""
+    """The auxiliary output of residuals and objective, and the unknowns to which it belongs."""
 
     values: Values  # the unknowns
     outcome: Outcome  # loss and misfit there
@@ -29,9 +29,9 @@ class _Told(eqx.Module):
 
 
 def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
-    """Return residuals and their further output.
+    """Return residuals and their auxiliary output.
 
-    They are scaled by the number of nodes, so that a step's curvature is of order one whatever the grid.
+    The number of nodes scales the residuals, so that a step's curvature is of order one on every grid.
     """
     data, penalties, outcome = problem.evaluate(values)
     everything = jnp.sqrt(len(values)) * jnp.concatenate([data, penalties])
@@ -48,7 +48,7 @@ _objective = eqx.filter_custom_jvp(_half_squares)
 
 @_objective.def_jvp
 def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Compute the gradient with the value, so that it can be told: whoever differentiates needs it anyway."""
+    """Compute the gradient with the value in order to report it; every solver that differentiates needs it."""
     (values, problem), (direction, _) = primals, tangents
     (value, told), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
     told = _Told(told.values, told.outcome, jnp.linalg.norm(jnp.ravel(gradient)))
@@ -56,8 +56,8 @@ def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
     return (value, told), (jnp.sum(gradient * direction), constant)
 
 
-# A solver's state holds the residuals' trace, and the same one, out of this function's cache, for every fit of the same
-# shapes: `_advance` tells traces apart.
+# A solver's state contains the trace of the residuals, and `_advance` is compiled again for another trace. The cache of
+# this function returns the same trace for all fits with the same shapes.
 @jit_quickly(eqx.filter_jit)
 def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem) -> Any:
     """Return the solver's state before the first step."""
@@ -69,7 +69,7 @@ def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem)
 def _advance(
     optimiser: Optimiser, fn: Callable, values: Values, problem: Problem, state: Any, sufficient: Float[Array, ""]
 ) -> tuple:
-    """Take a step; where the misfit is sufficient, Gauss–Newton does not choose the next one in it."""
+    """Take a step. Gauss–Newton does not choose the next step if the misfit is small enough."""
 
     def enough(told: _Told) -> Bool[Array, ""]:
         return told.outcome.misfit <= sufficient
@@ -85,7 +85,7 @@ def _advance(
 
 
 def _strongly_typed(state: Any) -> Any:
-    """Return the state without weak types, for which the second step would be compiled anew."""
+    """Return the state without weak types, which would cause a second compilation of the step."""
     return jax.tree.map(lambda x: x.astype(x.dtype) if eqx.is_array(x) else x, state)
 
 
@@ -98,21 +98,21 @@ class Reached(NamedTuple):
 
     @property
     def stopped(self) -> bool:
-        """Whether there is nothing to go on with."""
+        """Whether the search cannot continue."""
         return self.result in ("interrupted", "not finite")
 
 
 def optimise(
     problem: Problem, values: Values, optimiser: Optimiser, noise: float | None, max_steps: int, log: Callable
 ) -> Reached:
-    """Run until the solver, the noise level or the number of steps says stop; return the best unknowns seen."""
+    """Run until convergence, the noise level or the number of steps stops the fit; return the best unknowns."""
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
     best, least, seen = Reached(values, None, ""), np.inf, None
     rejected, number, end = 0, 0, ""
-    explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # as rounded in `_advance`
+    explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # rounded as in `_advance`
     try:
         state = _begin(optimiser, fn, values, problem)
-        # One step more than asked for: many solvers tell of their unknowns one step later.
+        # Take one step more than `max_steps`, because many solvers report their unknowns one step later.
         for count in range(max_steps + 2):
             before = values
             sufficient = jnp.asarray(jnp.inf if count >= max_steps else explained, values.dtype)

@@ -1,4 +1,4 @@
-"""The least squares problem of a fit: from unknowns to a field, its eigenpairs, its signature, and the residuals."""
+"""The least squares problem of a fit, which maps unknowns to a field, eigenpairs, a signature and residuals."""
 
 import math
 from typing import Any, NamedTuple
@@ -22,17 +22,17 @@ from hks_jax.inverse.unknowns import Unknowns, Values
 from hks_jax.signatures.truncation import resolving
 
 _NEAR = 0.1
-"""The share of truncation in a misfit from which on it is told: a third of the residuals."""
+"""The share of truncation in a misfit above which a warning is issued; it is a third of the residuals."""
 _ENOUGH = 1e-5
-"""The accuracy of the solver's derivative for which single precision will do. Measured at 64² nodes, it costs 1e-6 in J
-and 1e-5 to 3e-5 in Jᵀ; solves to this tolerance cost 5e-6 and 5e-5, where nothing is smooth."""
+"""The tolerance of the solver's derivative from which single precision suffices. On 64² nodes single
+precision has errors of 1e-6 in J and 1e-5 to 3e-5 in Jᵀ; this tolerance has 5e-6 and 5e-5 for nonsmooth fields."""
 
 
 class Outcome(NamedTuple):
     """Loss, misfit and eigenpairs at some unknowns."""
 
     loss: Float[Array, ""]  # half the weighted mean square of the residuals, plus the penalties
-    misfit: Float[Array, ""]  # the part of the data
+    misfit: Float[Array, ""]  # the data's part of the loss
     truncation: Float[Array, ""]  # see `Observation.truncation_misfit`
     pairs: Eigenpairs  # the eigenpairs, without their arrays at nodes and without their pencil
 
@@ -48,11 +48,11 @@ class Problem(eqx.Module):
     solver: str | Eigensolver = eqx.field(static=True)  # eigensolver
 
     def pairs(self, values: Values) -> Eigenpairs:
-        """Return the eigenpairs of the field that the values stand for."""
+        """Return the eigenpairs of the field with these values."""
         return self._pairs_of(self.unknowns.field(values))
 
     def _pairs_of(self, field: TensorField) -> Eigenpairs:
-        # Of a multiplet that k cuts, the derivative exists only with all of its copies, or none.
+        # The derivative exists only if a multiplet at k is included completely or not at all.
         return eigenpairs(field, self.k, self.boundary, self.solver, multiplet="complete")
 
     def evaluate(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
@@ -73,10 +73,10 @@ class Problem(eqx.Module):
         return self.evaluate(values)[:2]
 
 
-# A heat signature is not below that of the constants. Others, and those where the constants are no eigenfunctions, may
-# be less than any number in single precision, which their logarithms are divided by.
+# A heat signature is at least that of the constants. Other signatures, and heat signatures without constant
+# eigenfunctions, may underflow in single precision, and derivatives of logarithms divide by them.
 def _residuals_of(observation: Observation, pairs: Eigenpairs, solver: str | Eigensolver) -> Float[Array, " m"]:
-    """Return the residuals, whose derivative is in single precision where the solver's derivative needs no more."""
+    """Return the residuals. Their derivative is in single precision if the solver's derivative is no more accurate."""
     rough = isinstance(solver, Eigensolver) and solver.adjoint.tolerance >= _ENOUGH
     bounded = observation.signature.left_out is not None and pairs.n_null > 0
     return (_rough if rough and bounded else Observation.residuals)(observation, pairs)
@@ -105,12 +105,12 @@ def outcome_of(problem: Problem, values: Values) -> Outcome:
 
 
 def truncation_shows(misfit: float, left: float) -> bool:
-    """Tell whether truncation makes a large share of a misfit, and is itself more than `TAIL`."""
+    """Return whether truncation causes a large share of a misfit and exceeds `TAIL`."""
     return left > (2 * TAIL) ** 2 / 2 and left > _NEAR * misfit
 
 
 def more_pairs(problem: Problem, values: Values) -> int:
-    """Return a larger number of pairs, for a field that the pairs of a problem are too few for."""
+    """Return a larger number of pairs, for a field for which the pairs of a problem are too few."""
     field = problem.unknowns.field(values)
     pencil = assemble(field, problem.boundary)
     smallest = float(np.min(problem.observation.observed_times))

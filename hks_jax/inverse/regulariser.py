@@ -1,6 +1,6 @@
-"""Regularisers: the preferences of a fit where the data leave a choice.
+"""Regularisers, which select a solution of a fit that the data do not determine.
 
-Each is half a weighted mean of squares over the domain, given by its residuals: least squares solvers need these.
+Each penalty is half a weighted mean of squares over the domain. Its residuals serve least squares solvers.
 """
 
 from abc import abstractmethod
@@ -29,17 +29,17 @@ class Regulariser(eqx.Module):
         require_number("weight", self.weight, inclusive=True)
 
     def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
-        """Return residuals, half of whose sum of squares is the penalty."""
+        """Return the residuals. The penalty is half their sum of squares."""
         deviations = self.deviations(unknowns, values, field)
         return jnp.sqrt(self.weight / int(field.grid.inside.sum())) * deviations.ravel()
 
     @abstractmethod
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
-        """Return the numbers that the penalty keeps small."""
+        """Return the quantities whose squares the penalty adds up."""
 
 
 class H1(Regulariser):
-    """½ weight · mean |∇p|² of the parameters p (the logarithm of the tensor, say), in coordinate units."""
+    """The penalty ½ weight · mean |∇p|² of the parameters p, such as the tensor's logarithm, in coordinate units."""
 
     weight: float
 
@@ -49,11 +49,11 @@ class H1(Regulariser):
 
 
 class TotalVariation(Regulariser):
-    """weight · mean (√(|∇p|² + ε²) − ε): edges in the parameters p stay sharp.
+    """The penalty weight · mean (√(|∇p|² + ε²) − ε), which preserves sharp edges in the parameters p.
 
     Attributes:
         weight: the factor of the penalty.
-        epsilon: slopes below it, per coordinate unit, count as smooth.
+        epsilon: the slope ε per coordinate unit below which parameters count as smooth.
     """
 
     weight: float
@@ -66,7 +66,7 @@ class TotalVariation(Regulariser):
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
         """Return gradients at the nodes, scaled so that half their square is the penalty."""
         d = field.grid.dimension
-        # Differences to the next node along each axis; none beyond the last.
+        # Differences to the next node along each axis are zero at the last node.
         gradient = jnp.stack(
             [
                 jnp.pad(slopes, [(0, 0)] + [(0, int(axis == along)) for axis in range(d)])
@@ -74,12 +74,12 @@ class TotalVariation(Regulariser):
             ]
         )
         square = jnp.sum(gradient**2, axis=(0, 1))
-        # 2(√(s² + ε²) − ε)/s², without cancellation.
+        # This factor is 2(√(s² + ε²) − ε)/s² without cancellation.
         return gradient * jnp.sqrt(2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon))
 
 
 class LogDeterminant(Regulariser):
-    """½ weight · mean (log |T| − log |T₀|)²: the area, or volume, stays."""
+    """The penalty ½ weight · mean (log |T| − log |T₀|)², which preserves the area or volume element."""
 
     weight: float
     prior: TensorField
@@ -90,7 +90,7 @@ class LogDeterminant(Regulariser):
 
 
 class Prior(Regulariser):
-    """½ weight · mean ‖log T − log T₀‖²: the log-Euclidean distance to another field."""
+    """The penalty ½ weight · mean ‖log T − log T₀‖² on the log-Euclidean distance to another field."""
 
     weight: float
     prior: TensorField

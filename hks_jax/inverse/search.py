@@ -1,4 +1,4 @@
-"""The search for unknowns: its methods and starts, stage by stage, with more eigenpairs where they are too few."""
+"""The search for the unknowns of a fit: its methods, starts, stages and number of eigenpairs."""
 
 import dataclasses
 import os
@@ -26,26 +26,26 @@ OPTIMISERS: dict[str, Any] = {"gauss-newton": GaussNewton, "lbfgs": optx.LBFGS, 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """How `hks_jax.fit_metric` looks for the metric, and when it stops.
+    """The settings of the optimisation in `hks_jax.fit_metric` and its stopping criteria.
 
     Attributes:
         optimiser: ``"gauss-newton"`` (damped, matrix-free), ``"lbfgs"``, ``"bfgs"``, or a solver of optimistix.
-        smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth; 0 for no preference; by
-            default a tenth of the domain, and 0 for ``"conformal"`` without noise.
-        tolerance: a fit has converged when the unknowns u change by less than it, relative to 1 + |u| (root mean square
-            over all of them). Both the last step and the sum of the steps to come, if the last two begin a geometric
-            series, must be below it. The linear systems of steps that may be the last are solved 30 times more exactly,
-            with three times as many products. Directions that the products do not find are left out:
-            `identifiability` shows them. (Solvers of optimistix: the last step alone.)
-        max_steps: steps per stage.
-        continuation: stages: the first fits the largest times alone, the last all of them.
-        starts: how often to start, the first time from the initial field, then from random smooth changes of it; the
-            best wins.
-        spread: their root mean square, in the parameters' units.
-        seed: their seed.
+        smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth, or 0 for steps without
+            smoothing. The default is a tenth of the domain, and 0 for ``"conformal"`` without noise.
+        tolerance: a fit has converged when the unknowns u change by less than this, relative to 1 + |u| (root mean
+            square). This holds for the last step and for the sum of future steps in a geometric series with the last
+            two. Linear systems of steps that may be the last are solved 30 times more exactly with three times as many
+            products. Directions that the products do not reach are ignored; `identifiability` finds them. Solvers of
+            optimistix test only the last step.
+        max_steps: the maximum number of steps in each stage.
+        continuation: the number of stages. The first fits only the largest times, the last fits all times.
+        starts: the number of starts, first from the initial field and then from random smooth changes of it. The best
+            is returned.
+        spread: the root mean square of the random changes, in the parameters' units.
+        seed: the seed of the random changes.
 
     Raises:
-        ValueError: an unknown optimiser; a number out of range.
+        ValueError: if the optimiser is unknown or a number is out of range.
     """
 
     optimiser: str | Optimiser = "gauss-newton"
@@ -71,7 +71,7 @@ class Search:
 
 
 def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: float | None) -> InnerProduct:
-    """Return the inner product in which steps are small, for a smoothness; see `Search` for its default."""
+    """Return the inner product for the damping of steps. `Search` documents the default smoothness."""
     if not isinstance(unknowns, Nodal):
         return InnerProduct()
     grid = unknowns.init.grid
@@ -82,27 +82,27 @@ def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: fl
 
 
 _EARLY = 100.0
-"""How many tolerances will do in the stages before the last, which need no last digits."""
+"""The factor of the tolerance in stages before the last, which need less accuracy."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One search, from the unknowns `first` on."""
+    """One search that starts from the unknowns `first`."""
 
-    search: Search  # its settings
+    search: Search  # the settings
     first: Values  # the unknowns of the initial field
-    noise: float | None  # the standard deviation of the residuals that noise explains
-    inner_product: InnerProduct  # in which steps are small
-    now: Checkpoint  # where the fit stands
+    noise: float | None  # the standard deviation of the residuals due to noise
+    inner_product: InnerProduct  # the inner product for the damping of steps
+    now: Checkpoint  # the state of the fit
     progress: Callable[[Step], None] | None  # called with each step
-    path: str | os.PathLike[str] | None  # of the checkpoint
+    path: str | os.PathLike[str] | None  # the path of the checkpoint
     mark: str  # a hash of data and settings
-    clock: float  # when the fit began, by `time.perf_counter`
+    clock: float  # the time when the fit began, by `time.perf_counter`
 
     def told(
         self, number: int, told: tuple[float, float, float], accepted: bool, values: Values, step_size: float
     ) -> None:
-        """Take up a step by its number within the stage: loss, misfit and gradient, and whether it was taken."""
+        """Record and report a step of a stage with its number, loss, misfit, gradient and acceptance."""
         now, seconds = self.now, time.perf_counter() - self.clock
         now.values, now.step_size = values, step_size
         now.history.append(Step(number, *told, accepted, seconds, now.stage, now.start))
@@ -114,26 +114,26 @@ class Run:
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
         """Solve one problem from given unknowns; the tolerances are multiplied by a factor."""
         method = self._optimiser(problem, tolerances * self.search.tolerance, step_size)
-        with jax.debug_nans(False):  # numbers that were not computed are NaN
+        with jax.debug_nans(False):  # values that were not computed are NaN
             return optimise(problem, values, method, self.noise, self.search.max_steps, self.told)
 
     def _optimiser(self, problem: Problem, tolerance: float, step_size: float) -> Optimiser:
-        """Return the solver; a step size below 1 begins with as much more damping."""
+        """Return the solver. The initial damping is divided by the step size."""
         given = self.search.optimiser
         if not isinstance(given, str):
             return given
         if given == "gauss-newton":
-            # Small steps against noise: the misfit must not fall far below it.
+            # Noise requires small steps, because the misfit must not fall far below it.
             damping, growth = (1e-4, 10.0) if self.noise is None else (1e-2, 3.0)
             preconditioner = self._preconditioner(problem)
             return GaussNewton(
                 tolerance, damping / step_size, growth, self.inner_product, preconditioner=preconditioner
             )
-        traced = jnp.asarray(tolerance)  # a static one would compile every stage anew
+        traced = jnp.asarray(tolerance)  # a static value would cause a compilation for every stage
         return OPTIMISERS[given](traced, traced, optx.rms_norm)
 
     def _preconditioner(self, problem: Problem) -> Preconditioner:
-        """Return an approximation of JᵀJ where one is known, else the inner product."""
+        """Return an approximation of JᵀJ if one is known, otherwise the inner product."""
         unknowns, observation = problem.unknowns, problem.observation
         if isinstance(unknowns, Nodal) and unknowns.parametrisation == PARAMETRISATIONS["conformal"]:
             rough = getattr(self.inner_product, "factor", None) is None
@@ -143,7 +143,7 @@ class Run:
         return self.inner_product
 
     def through_stages(self, problems: Sequence[Problem], values: Values, first: int, step_size: float) -> Reached:
-        """Solve the problems from the first on, one after another; the outcome is that of the last of them."""
+        """Solve the problems in order, beginning with number `first`; return the outcome of the last."""
         reached, last = Reached(values, None, "interrupted"), len(problems) - 1
         now = self.now
         for now.stage in range(first, len(problems)):
@@ -157,10 +157,10 @@ class Run:
         return reached
 
     def from_starts(self, problems: Sequence[Problem]) -> Reached:
-        """Return the best of several starts: where the log stands, then at random changes of the first unknowns."""
+        """Return the best of several starts, from the recorded state and from random changes of the first unknowns."""
         now, start = self.now, self.now.start
         where = jnp.asarray(now.values), now.stage, now.step_size
-        if now.stage == len(problems):  # with more eigenpairs; no start is open any more
+        if now.stage == len(problems):  # the fit already uses more eigenpairs, so all starts are complete
             return Reached(where[0], None, "converged")
         best = Reached(jnp.asarray(now.best), None, "interrupted")
         for now.start in range(start, self.search.starts):
@@ -178,7 +178,7 @@ class Run:
         return best
 
     def _moved(self, start: int) -> Values:
-        """Return the values to begin a further start with, the first ones with smooth noise."""
+        """Return the initial values of a further start, which are the first values plus smooth noise."""
         key = jax.random.fold_in(jax.random.key(self.search.seed), start)
         noise = self.inner_product.solve(jax.random.normal(key, self.first.shape, self.first.dtype))
         return self.first + self.search.spread * noise / jnp.sqrt(jnp.mean(noise**2))
@@ -186,9 +186,9 @@ class Run:
     def with_enough_pairs(
         self, reached: Reached, problem: Problem, renewed: Callable[[int], Problem] | None
     ) -> tuple[Reached, Problem]:
-        """Go on with more eigenpairs while their truncation shows: they were chosen for the volume of the start.
+        """Continue with more eigenpairs while truncation affects the fit, because k was chosen for the initial volume.
 
-        `renewed` makes the problem of their number; None leaves it as it is.
+        `renewed` returns the problem with a given number of eigenpairs; None keeps the number.
         """
         while True:
             outcome = reached.outcome or outcome_of(problem, reached.values)

@@ -1,4 +1,4 @@
-"""The signatures that a fit can match: their values for given eigenpairs, and how many eigenpairs they take."""
+"""The signatures that a fit can match: their values and the number of eigenpairs they need."""
 
 import math
 from collections.abc import Callable
@@ -22,19 +22,19 @@ from hks_jax.signatures.truncation import resolving, truncation, truncation_map
 TAIL = 1e-6
 """The share of the heat trace at the smallest time that may lie beyond the computed pairs."""
 _LOST = 0.05
-"""The share beyond all useful pairs that makes a time unresolvable."""
+"""The share of the heat trace beyond all useful pairs at which a time counts as unresolvable."""
 
 
 class Signature(eqx.Module):
     """A function of eigenpairs that a fit can match.
 
     Attributes:
-        function: of the eigenpairs, then of the times or energies and of sigma where there are any.
+        function: a function of the eigenpairs and, if the signature has them, of times or energies and sigma.
         symbol: the symbol of a further argument: ``"t"`` for times, ``"e"`` for energies, empty for none.
-        at_nodes: whether it has a value for each node.
-        left_out: estimates the share of it that lies beyond the eigenpairs, from these and the times; None: the pairs
-            that are computed define it.
-        lowest: whether it is the lowest eigenvalues, as many as the target has.
+        at_nodes: whether the signature has a value at each node.
+        left_out: a function of eigenpairs and times that estimates the share beyond the eigenpairs, or None if the
+            computed pairs define the signature.
+        lowest: whether the signature consists of the lowest eigenvalues, as many as in the target.
         sigma: the width of wave kernels.
     """
 
@@ -51,14 +51,14 @@ class Signature(eqx.Module):
         return self.function(pairs, *(given for given in (times, sigma) if given is not None))
 
     def pairs_needed(self, k: int | None, times: np.ndarray | None, pencil: AnyPencil, field: TensorField) -> int:
-        """Return how many eigenpairs to compute: k, or enough for the times at which something is observed."""
+        """Return the number of eigenpairs to compute: k or, by default, enough for the observed times."""
         if self.left_out is not None:
-            enough = pairs_for(times, pencil, field)  # times too small for the grid are refused whatever k is
+            enough = pairs_for(times, pencil, field)  # raises if times are too small for the grid
             return enough if k is None else k
         if k is not None:
             return k
         if self.sigma is None or times is None:
-            raise ValueError("k: got None; a signature of your own needs the number of eigenpairs")
+            raise ValueError("k: got None; expected the number of eigenpairs, which a custom signature needs")
         largest = float(np.max(times))
         wanted = pairs_below(math.exp(largest + 2 * float(self.sigma)), pencil, field)
         _require_resolved(wanted, unknowns_of(pencil), f"energies up to {largest:.4g}, which take", "lower energies")
@@ -72,7 +72,7 @@ def wave_kernel(sigma: float | Float[Array, ""]) -> Signature:
         sigma: the width of the kernels, as for `hks_jax.wks`.
 
     Raises:
-        ValueError: a width that is not positive.
+        ValueError: if the width is not positive.
     """
     require_number("sigma", sigma)
     return Signature(wks, "e", at_nodes=True, sigma=jnp.asarray(sigma))
@@ -86,12 +86,12 @@ SIGNATURES = {
 
 
 def pairs_below(eigenvalue: float, pencil: AnyPencil, field: TensorField) -> int:
-    """Return about how many eigenvalues lie below one, by Weyl's law, and some more."""
+    """Return a generous estimate of the number of eigenvalues below a bound, by Weyl's law."""
     return math.ceil(1.1 * float(weyl_count(pencil, [eigenvalue], field)[0])) + 4
 
 
 def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
-    """Return how many pairs resolve the smallest time to `TAIL`: all, if that many are needed."""
+    """Return the number of pairs that resolve the smallest time to `TAIL`, at most all pairs."""
     smallest, n_dof, d = float(np.min(np.asarray(times))), unknowns_of(pencil), pencil.space.dimension
 
     def count(tail: float) -> int:
@@ -105,21 +105,21 @@ def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
 
 
 def unknowns_of(pencil: AnyPencil) -> int:
-    """Return how many eigenpairs there are."""
+    """Return the number of eigenpairs of a pencil."""
     return sum(part.space.n_dof for part in pencil.parts)
 
 
 def _require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
-    """Warn where more eigenpairs are wanted than are near to those of the manifold; refuse more than twice as many.
+    """Warn if more eigenpairs are needed than approximate those of the manifold; raise an error beyond twice as many.
 
-    A fit may come to a metric of more volume, which takes more of them, and must be able to begin there.
+    The margin exists because a fit must be able to start from a metric of more volume, which needs more eigenpairs.
     """
     most = _most_pairs(n_dof)
     if wanted <= most:
         return
     message = (
-        f"times: got {what} about {wanted} eigenpairs; with {n_dof} unknowns {most} are near enough to those of the "
-        f"manifold to be fitted. Use {remedy}"
+        f"times: got {what} about {wanted} eigenpairs, but with {n_dof} unknowns only {most} are accurate enough for "
+        f"a fit. Use {remedy}"
     )
     if wanted > min(2 * most, n_dof):
         raise ValueError(message)

@@ -1,4 +1,4 @@
-"""The unknowns of a fit: which metrics it searches among, and by which numbers."""
+"""The unknowns of a fit: the set of metrics and their parameters."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -25,25 +25,24 @@ Parameters = Float[Array, "n c"]
 
 
 def named(argument: str, given: Any, table: Mapping[str, Any], others: str) -> Any:
-    """Return a table's entry by its name; raise ValueError, with the names and the alternatives, for another."""
+    """Return a table's entry by its name; raise ValueError with the names and the alternatives for an unknown name."""
     if isinstance(given, str) and given in table:
         return table[given]
     raise ValueError(f"{argument}: got {given!r}; expected {', '.join(map(repr, table))}, {others}")
 
 
 def flat_field(grid: Grid, dtype: Any = float) -> TensorField:
-    """Return the flat metric: the identity everywhere."""
+    """Return the flat metric, which is the identity at all nodes."""
     d = grid.dimension
     return TensorField(grid, np.broadcast_to(np.eye(d, dtype=dtype), (*grid.shape, d, d)))
 
 
 class Parametrisation(eqx.Module):
-    """A few numbers at each node that stand for a tensor, given the tensor of the initial field there.
+    """A map from a few parameters at each node, and the initial tensor there, to a tensor.
 
     Attributes:
         start: maps the initial tensors (n, d, d) to their parameters (n, c).
-        tensors: maps parameters (n, c) and the initial tensors to those that the parameters stand for; they must be
-            symmetric positive definite for any parameters.
+        tensors: maps parameters (n, c) and the initial tensors to tensors that are always symmetric positive definite.
         smooth: whether the data determine high frequencies so weakly that steps should be smooth.
     """
 
@@ -53,7 +52,7 @@ class Parametrisation(eqx.Module):
 
 
 def _logarithm(base: Tensors) -> Parameters:
-    """Return the diagonal of log T, then √2 times what is below it: their Euclidean norm is the Frobenius norm."""
+    """Return the diagonal of log T and √2 times the entries below it, whose Euclidean norm is the Frobenius norm."""
     logarithm = spd.log(base)
     rows, columns = np.tril_indices(base.shape[-1], -1)
     diagonal = jnp.diagonal(logarithm, axis1=1, axis2=2)
@@ -69,7 +68,7 @@ def _exponential(parameters: Parameters, base: Tensors) -> Tensors:
 
 
 def _cholesky(base: Tensors) -> Parameters:
-    """Return the logarithms of the diagonal of L, T = LLᵀ, then what is below it."""
+    """Return the logarithms of the diagonal of L in T = LLᵀ, and the entries below the diagonal."""
     factor, d = spd.cholesky(base), base.shape[-1]
     rows, columns = np.tril_indices(d, -1)
     diagonal = jnp.diagonal(factor, axis1=1, axis2=2)
@@ -95,13 +94,13 @@ def _stretched(parameters: Parameters, base: Tensors) -> Tensors:
 
 def _turned(parameters: Parameters, base: Tensors) -> Tensors:
     d = base.shape[-1]
-    vectors = parameters if d == 3 else jnp.pad(parameters, ((0, 0), (2, 0)))  # across the plane
+    vectors = parameters if d == 3 else jnp.pad(parameters, ((0, 0), (2, 0)))  # perpendicular to the plane
     rotation = _rotation(vectors)[:, :d, :d]
     return jnp.einsum("nia,nab,njb->nij", rotation, base, rotation, precision="highest")
 
 
 def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
-    """Return rotations by Rodrigues' formula, in functions of the squared angle that are smooth at zero."""
+    """Return rotations by Rodrigues' formula with functions of the squared angle, which are smooth at zero."""
     square = jnp.sum(vector**2, axis=1)
     small = square < 1e-4
     angle = jnp.sqrt(jnp.where(small, 1, square))
@@ -115,12 +114,12 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
 
 
 def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
-    """Return a function from initial tensors to zeros, whose number depends on the dimension."""
+    """Return a function that maps initial tensors to zeros, whose number depends on the dimension."""
     return lambda base: jnp.zeros((len(base), count(base.shape[-1])), base.dtype)
 
 
 PARAMETRISATIONS = {
-    # T = exp S, T = LLᵀ, T = e^u T₀, T = V diag(e^uᵢ λᵢ) Vᵀ with the eigenvectors of T₀, and T = R T₀ Rᵀ.
+    # The tensors are exp S, LLᵀ, e^u T₀, V diag(e^uᵢ λᵢ) Vᵀ with the eigenvectors V of T₀, and R T₀ Rᵀ.
     "log-euclidean": Parametrisation(_logarithm, _exponential),
     "cholesky": Parametrisation(_cholesky, _from_cholesky),
     "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),
@@ -138,19 +137,19 @@ class Unknowns(eqx.Module):
 
     @abstractmethod
     def field(self, values: Values) -> TensorField:
-        """Return the field that the values stand for."""
+        """Return the field with these values."""
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the values' slopes along the grid's edges, axis by axis; zero where an end is outside the domain."""
-        raise ValueError("regularisers: parameters of a function have no neighbours; use Prior or LogDeterminant")
+        """Return the slopes of the values along the grid's edges for each axis; 0 if an end is outside the domain."""
+        raise ValueError("regularisers: got a slope penalty on function parameters; expected Prior or LogDeterminant")
 
 
 class Nodal(Unknowns):
-    """A few numbers at each node of the domain."""
+    """Parameters at each node of the domain."""
 
-    parametrisation: Parametrisation  # from them to tensors
-    init: TensorField  # the initial field, which stays as it is outside the domain
-    # The flat indices of the domain's nodes, made of the domain (*shape).
+    parametrisation: Parametrisation  # the map from parameters to tensors
+    init: TensorField  # the initial field, which does not change outside the domain
+    # The flat indices of the domain's nodes, converted from the domain (*shape).
     nodes: Any = eqx.field(static=True, converter=lambda domain: StaticArray(np.flatnonzero(domain)))
 
     @property
@@ -171,7 +170,7 @@ class Nodal(Unknowns):
         return TensorField(grid, full.reshape(self.init.domain_tensors.shape), self.init.interpolation)
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the parameters' slopes along the grid's edges, axis by axis; zero where an end is outside."""
+        """Return the slopes of the parameters along the grid's edges for each axis; 0 if an end is outside."""
         grid = self.init.grid
         domain = np.zeros(grid.size, dtype=bool)
         domain[self.nodes.value] = True
@@ -185,12 +184,12 @@ class Nodal(Unknowns):
 
 
 class Free(Unknowns):
-    """Parameters of a function, as the parametrisation of `hks_jax.fit_metric`.
+    """Parameters of a function that serves as the parametrisation of `hks_jax.fit_metric`.
 
     Attributes:
         function: maps the parameters to a `TensorField`, or to tensors on the grid of the initial field.
-        parameters: where to start, any pytree of floating point arrays.
-        init: the initial field, for its grid and interpolation; the fit gives it.
+        parameters: the initial parameters, any pytree of floating point arrays.
+        init: the initial field with grid and interpolation, which the fit sets.
     """
 
     function: Callable[[Any], Any] = eqx.field(static=True)
@@ -202,7 +201,7 @@ class Free(Unknowns):
         require_real("parameters", self.parameters)
 
     def start(self) -> Values:
-        """Return the initial parameters, flat."""
+        """Return the flattened initial parameters."""
         return ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[0]
 
     def field(self, values: Values) -> TensorField:

@@ -144,13 +144,13 @@ def fit_dwi(
     return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
-# With the logarithms y of the signals, weights w (the signals that an unweighted fit predicts), and the rows X of the
-# design, least squares minimise Σ w²(y − Xβ)². A logarithm has the variance σ²/w² to first order, so that β has the
-# covariance σ²(XᵀW²X)⁻¹, and σ² is the signals' sum of squared residuals over as many as there are more images than
-# unknowns (Koay, Chang, Pierpaoli and Basser 2007).
-# Image n alone changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ, its residual r being that of a signal. A residual has the variance
-# σ²(1 − h), h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so that rₙ/√(1 − h) has that of the noise (MacKinnon and White 1985, HC2). Random
-# signs of whole images keep what voxels share of them.
+# Let y be the log signals, X the design matrix, and w the signals predicted by an unweighted fit. Weighted least
+# squares minimise Σ w²(y − Xβ)². To first order, a log signal has the variance σ²/w², so β has the covariance
+# σ²(XᵀW²X)⁻¹. The estimate of σ² is the sum of squared residuals of the signals, divided by the number of images minus
+# the number of unknowns (Koay, Chang, Pierpaoli and Basser 2007).
+# The residual rₙ of the signal of image n changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ. It has the variance σ²(1 − h), where
+# h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2). Random signs of
+# whole images preserve the noise that voxels share.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],

@@ -158,7 +158,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             if known is not None:
                 noise[name] = known.copy()
                 noise[name][bad] = known[source]
-    notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}: {done}")
+    notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
     return replace(volume, tensors=tensors, mask=mask, **noise, repair=report, notes=notes)
 
 

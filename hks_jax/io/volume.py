@@ -46,22 +46,23 @@ class TensorVolume:
         spacing: the distance between voxels along each axis.
         origin: the coordinates of voxel (0, …, 0) on the grid; the affine gives its position in space.
         mask: bool (*shape), or None for all voxels.
-        affine: (4, 4) voxel indices to world coordinates, or None; for a slice, those of a volume one voxel thick.
-        slice_axis: for a slice, the axis of the volume that it cuts; None for a volume.
-        order: the order of components in the file, ``"matrix"`` if they were whole matrices.
-        frame: the axes along which the file's components were.
-        notes: the reader's decisions, in sentences.
-        source: the file.
-        digest: the SHA-256 of the file; empty where the data are in more than one.
-        repair: how tensors that are not positive definite were changed, for reports; empty if none were.
-        invalid_by_order: how many tensors of the file are not positive definite under each order of components, where
-            many are under the one in which they were read; else None.
-        length_unit: ``"mm"``, which the lengths of a file that has a unit are converted to; empty where it has none.
-        unit: ``"mm²/s"`` where the tensors' unit is known, because it was told, or they were fitted; else empty.
-        covariance: (*shape, m, m) of the components xx xy yy (xz yz zz) along the voxel axes, in the squared unit of
-            the tensors, where it is known (`fit_dwi`); else None.
-        modes: (*shape, n, m), the part of each of the n images in the noise of these components, where residuals tell
-            it (`fit_dwi`, in float32); else None. What voxels share of an image's noise is in them.
+        affine: (4, 4), the map from voxel indices to world coordinates, or None. The affine of a slice belongs to a
+            volume one voxel thick.
+        slice_axis: for a slice, the axis of the volume perpendicular to it; None for a volume.
+        order: the order of components in the file, or ``"matrix"`` for whole matrices.
+        frame: the axes of the components in the file.
+        notes: sentences about decisions of the reader.
+        source: the path of the file.
+        digest: the SHA-256 of the file; empty if the data are in several files.
+        repair: a report of the repair of tensors that are not positive definite; empty without repair.
+        invalid_by_order: for each order of components, the number of tensors that would not be positive definite; None
+            if few are in `order`.
+        length_unit: ``"mm"`` if the file declares a unit, from which lengths are converted; otherwise empty.
+        unit: ``"mm²/s"`` if the tensors' unit is known, as an argument or from a fit; otherwise empty.
+        covariance: (*shape, m, m), the covariance of the components xx xy yy (xz yz zz) along the voxel axes, in the
+            squared unit of the tensors, if known (`fit_dwi`); otherwise None.
+        modes: (*shape, n, m), the contribution of each of the n images to the noise of these components, if the noise
+            was estimated from residuals (`fit_dwi`, in float32); otherwise None. They hold the noise that voxels share.
 
     Raises:
         ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
@@ -184,21 +185,21 @@ class TensorVolume:
             slice_axis=a,
             covariance=covariance,
             modes=modes,
-            notes=(*self.notes, f"slice {AXES[a]} = {index}: the in-plane block of each tensor"),
+            notes=(*self.notes, f"slice {AXES[a]} = {index}: its tensors are the in-plane blocks"),
         )
 
     def noise(self, grid: Grid) -> TensorNoise:
-        """Return the noise that the fit of the tensors has told (`fit_dwi`): of images, if residuals have.
+        """Return the noise that the fit of the tensors estimated (`fit_dwi`), by images if `modes` are known.
 
         Raises:
-            ValueError: nothing is known of it.
+            ValueError: the fit did not estimate the noise.
         """
         if self.modes is not None:
             return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # of a fit, a signal without weighting included
         if self.covariance is None:
             raise ValueError(
-                "noise: nothing is known of it; fit the tensors by `fit_dwi` with noise=, or state it by "
-                "`TensorNoise.relative`"
+                "noise: got a volume without an estimate of its noise; fit the tensors by `fit_dwi` with noise=, or "
+                "give the noise by `TensorNoise.relative`"
             )
         return TensorNoise(self.covariance, grid)
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-from hks_jax.traced import is_traced
+from hks_jax.traced import is_staged, is_traced
 
 State = TypeVar("State")
 
@@ -51,9 +51,8 @@ def one_by_one(function: Callable[..., Any], settings: tuple[Hashable, ...], *ar
     object in every call, so that it is compiled once. Settings are static.
     """
     if not is_traced(args):
-        # Of a derivative taken plainly, JAX would compile the known part anew. Where an operation on constants gives a
-        # tracer, all of it belongs to a computation to come.
-        with contextlib.nullcontext() if is_traced(jnp.zeros(())) else jax.core.eval_context():
+        # Of a derivative taken plainly, JAX would compile the known part anew.
+        with contextlib.nullcontext() if is_staged() else jax.core.eval_context():
             return function(*settings, *args)
     # `custom_vmap` supports no static arguments, so that each call defines a rule; its body is compiled only once.
     problem = jax.custom_batching.custom_vmap(partial(function, *settings))

@@ -19,6 +19,8 @@ from hks_jax.linear.products import aligned, of_each_row
 Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 
+_PLACES = 1 << 12
+"""Places whose products are computed together: what is gathered for them stays in the cache."""
 ROUNDING = 1000
 """By how many units of rounding of the largest entry a matrix may differ from its transpose."""
 
@@ -42,6 +44,10 @@ class Operator(eqx.Module):
     @abstractmethod
     def triplets(self) -> tuple[Float[Array, " nnz"], Places]:
         """Return the entries and their static (rows, columns)."""
+
+    @abstractmethod
+    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "Operator":
+        """Return pxᵀ where the matrix has entries, by NumPy: the derivative of Σ p·Ax by A."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -96,6 +102,15 @@ class PatternedOperator(Operator):
     @abstractmethod
     def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
         """Return the matrix with other entries at the same places."""
+
+    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "PatternedOperator":
+        """Return pxᵀ where the matrix has entries, by NumPy."""
+        where, rows, cols = self.pattern.places()
+        entries = np.zeros(self.pattern.n_entries, x.dtype)
+        for start in range(0, where.size, _PLACES):
+            some = slice(start, start + _PLACES)
+            entries[where[some]] = np.einsum("ib,ib->i", p[rows[some]], x[cols[some]])
+        return self.with_flat(jax.device_put(entries))
 
     def plus(self, diagonal: Float[Array | np.ndarray, " n"]) -> "PatternedOperator":
         """Return the sum with a diagonal matrix, given as an array (n_dof,)."""
@@ -184,6 +199,10 @@ class DiagonalOperator(Operator):
     def size(self) -> int:
         """The number of rows, n_dof."""
         return self.entries.shape[0]
+
+    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "DiagonalOperator":
+        """Return the diagonal of pxᵀ, by NumPy."""
+        return DiagonalOperator(jax.device_put(np.einsum("ib,ib->i", p, x)))
 
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""

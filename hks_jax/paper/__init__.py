@@ -1,4 +1,4 @@
-"""The paper, reproduced: Table 1, Figures 1 to 6, and its remark on triangles counted.
+"""A reproduction of the paper: Table 1, Figures 1 to 6, and its remark on the triangle inequality.
 
 V. Zobel, J. Reininghaus, I. Hotz: “Visualization of Two-Dimensional Symmetric Positive Definite Tensor Fields Using the
 Heat Kernel Signature”, Topological Methods in Data Analysis and Visualization III, 2014.
@@ -26,25 +26,25 @@ ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
     "figure6": figure6.make,
     "triangles": triangles.make,
 }
-"""A function for each, which returns a picture, or texts by the names of their files."""
+"""The functions of all items, each of which returns a figure, or texts by file name."""
 
 
 def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:
-    """Write the paper's table and figures, and a check of a remark, to a directory; return the files written.
+    """Write the paper's table and figures, and a check of a remark, to a directory; return the written files.
 
     Args:
-        output: the directory; made if it does not exist.
-        full: the paper's sizes (many minutes) instead of quick ones (a minute or two).
-        only: some of ``"table1"``, ``"figure1"`` … ``"figure6"``, ``"triangles"``; None: all.
-        echo: called with a line of text as each step begins, and as each item is written.
+        output: the directory, which is created if necessary.
+        full: whether to use the paper's sizes (many minutes) instead of small sizes (a minute or two).
+        only: a selection of ``"table1"``, ``"figure1"`` … ``"figure6"``, ``"triangles"``; by default all.
+        echo: a function that is called with a line of text at the start of each step and after each item.
 
     Raises:
-        ValueError: a name in `only` that does not exist.
+        ValueError: if a name in `only` is unknown.
     """
     names = list(ITEMS) if only is None else list(only)
     unknown = [name for name in names if name not in ITEMS]
     if unknown:
-        raise ValueError(f"only: got {', '.join(map(repr, unknown))}; expected some of {', '.join(ITEMS)}")
+        raise ValueError(f"only: got {', '.join(map(repr, unknown))}; expected names from {', '.join(ITEMS)}")
     output = Path(output)
     output.mkdir(parents=True, exist_ok=True)
     written = []

@@ -1,4 +1,4 @@
-"""Figure 6: a slice of a brain at several t, each image with its own colours."""
+"""Figure 6: a slice of a brain at several times, with separate colours for each image."""
 
 from collections.abc import Callable
 
@@ -16,12 +16,12 @@ from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
 from hks_jax.paper.signature import enough_pairs, signature
 from hks_jax.plot.signature import bounding_box, placed
 
-LENGTHS = (5.0, 10.0, 20.0, 40.0)  # mm: how far heat goes, √(t / mean diffusivity or its inverse)
+LENGTHS = (5.0, 10.0, 20.0, 40.0)  # distances of heat flow in mm, √(t / mean diffusivity or its inverse)
 SLICE = 0
 
 
 def make(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return the figure: of the brain in the PyPI wheel ``mdt`` where that is installed, else of a phantom."""
+    """Return the figure of the brain in the PyPI wheel ``mdt`` if it is installed, otherwise of a phantom."""
     volume, name = _brain(echo), "brain"
     if volume is None:
         tensors, mask, spacing = phantom()
@@ -55,7 +55,7 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
         echo(f"{name}, {label}, {int(grid.inside.sum())} nodes, {k} eigenpairs")
         values = signature(field, times, k)
         for ax, image, t, length in zip(row[1:], values, times, LENGTHS, strict=True):
-            # The natural boundary raises the HKS at the rim up to fourfold: let the tissue have the colours.
+            # The Neumann boundary raises the HKS near it up to fourfold, so the values in the tissue set the colours.
             tissue = depth > min(2 * length, 0.3 * depth.max())
             low, high = np.quantile(image[tissue], (0.01, 0.99)).tolist()
             plot.scalar_image(ax, image, grid, cmap=colours, vmin=low, vmax=high, orientation=orientation)
@@ -72,7 +72,7 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
 def _brain(echo: Callable[[str], None]) -> TensorVolume | None:
     brain = find_example_brain()
     if brain is None:
-        echo("no brain here (the wheel mdt==1.2.7 carries one); drawing a phantom")
+        echo("no brain is installed (the wheel mdt==1.2.7 contains one), so a phantom is drawn")
         return None
     try:
         volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=1100)

@@ -1,4 +1,4 @@
-"""Figures 1 to 5: the HKS of a surface, at boundaries, and of fields of tensors drawn as ellipses or integral lines."""
+"""Figures 1 to 5: the HKS of a surface, near boundaries, and of tensor fields drawn as ellipses or integral lines."""
 
 import math
 from collections.abc import Callable
@@ -32,10 +32,10 @@ SIZES: dict[str, tuple] = {
     "figure4": (47, 201),
     "figure5": (41, 201),
 }
-"""Nodes per axis, quick and full; for Figure 1 with the number of eigenpairs."""
+"""The nodes per axis of quick and full runs, and for Figure 1 the number of eigenpairs."""
 TIMES = {"figure1": 1.0, "figure2": 0.01, "figure3": 1.0, "figure4": 0.01, "figure5": 0.25}
 DRAWN = 200
-"""Vertices per axis of the surface that Figure 1 shows."""
+"""The vertices per axis of the drawn surface in Figure 1."""
 ANGLES = ("0", "π/4", "π/2", "3π/4", "π", "5π/4", "3π/2")
 BOUNDARIES = ("natural boundary", "reflected strip", "reflected strip, cropped", "mirror", "along $u_2 = 1/2$")
 INDICES = tuple(Fraction(n, 2) for n in (-4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
@@ -49,7 +49,7 @@ TITLES = (
 
 
 def figure1(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 1: a surface and the metric that it induces on its parameter domain have the same HKS."""
+    """Return Figure 1, in which a surface and its induced metric on the parameter domain have the same HKS."""
     (n, k), time = SIZES["figure1"][full], TIMES["figure1"]
     field, mesh = bumpy_torus_field(n), bumpy_torus_mesh(n)
     echo(f"{k} eigenpairs of the surface with {n}² vertices, and of its metric")
@@ -99,13 +99,13 @@ def _flat(x: Float[Array, " 2"]) -> Float[Array, "2 2"]:
 
 
 def _bump(x: Float[Array, " 2"]) -> Float[Array, "2 2"]:
-    """Return a conformal metric with a bump in the middle and one on a side."""
+    """Return a conformal metric with one bump in the middle and one on a side."""
     distances = jnp.sum((x - jnp.array([[0.55, 0.5], [1.0, 0.5]])) ** 2, axis=1)
     return (1 + jnp.sum(jnp.exp(-distances / 0.02))) * jnp.eye(2)
 
 
 def figure2(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 2: what a boundary does to the HKS, and how a mirror undoes it."""
+    """Return Figure 2, which shows the effect of a boundary on the HKS and its removal by a mirror."""
     n = SIZES["figure2"][full]
     grid = Grid.from_bounds(0.0, 1.0, (n, n))
     fig = plot.new_figure(18, 6.8)
@@ -121,7 +121,7 @@ def figure2(full: bool, echo: Callable[[str], None]) -> Figure:
 
 def _row(panels: np.ndarray, field: TensorField, name: str) -> None:
     grid, time = field.grid, TIMES["figure2"]
-    # Over three diffusion lengths, heat falls to exp(−9).
+    # Over three diffusion lengths heat decays to exp(−9).
     wide = reflect(field, round(3 * math.sqrt(time) / grid.spacing[0]))
     before = flat_signature(wide, time)
     images = {
@@ -145,7 +145,7 @@ def _row(panels: np.ndarray, field: TensorField, name: str) -> None:
 
 
 def figure3(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 3: four fields of diagonal tensors, and what the HKS sees of them."""
+    """Return Figure 3, with four fields of diagonal tensors and their HKS."""
     n, time = SIZES["figure3"][full], TIMES["figure3"]
     fields, images = list(figure3_fields(n).values()), []
     for number, field in enumerate(fields, 1):
@@ -166,9 +166,9 @@ def figure3(full: bool, echo: Callable[[str], None]) -> Figure:
 
 
 def figure4(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 4: constant eigenvalues, varying eigenvectors: the HKS sees how the integral lines bend."""
+    """Return Figure 4, with constant eigenvalues and varying eigenvectors, where the HKS depends on how lines bend."""
     n, time = SIZES["figure4"][full], TIMES["figure4"]
-    strip = 0.28  # heat falls to exp(−strip²/t) = exp(−8); the circles' and spirals' centre is further out
+    strip = 0.28  # heat decays to exp(−strip²/t) = exp(−8); the centre of circles and spirals is further out
     fields = figure4_fields(n)
     fig = plot.new_figure(3.6 * len(fields) + 0.6, 7.2)
     tops, bottoms = fig.subplots(2, len(fields), sharex=True, sharey=True)
@@ -188,9 +188,9 @@ def figure4(full: bool, echo: Callable[[str], None]) -> Figure:
 
 
 def figure5(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 5: isolated degenerate points of index −2 … 3."""
+    """Return Figure 5, with isolated degenerate points of index −2 to 3."""
     n, time = SIZES["figure5"][full], TIMES["figure5"]
-    strip = 0.7  # at least 1.6 in metric length: heat falls to exp(−1.6²/t) and less
+    strip = 0.7  # at least 1.6 in metric length, where heat decays to at most exp(−1.6²/t)
     fields, images = [degenerate_point_field(float(index), n) for index in INDICES], []
     for index, field in zip(INDICES, fields, strict=True):
         echo(f"index {index}, {n}² nodes")

@@ -18,7 +18,7 @@ from hks_jax.signatures.hks import Normalisation, hks
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
 
 SMALL = 10_000
-"""Nodes up to which the signature at one time takes less by selected inversion than the eigenpairs that it needs."""
+"""The number of nodes up to which selected inversion at one time is faster than computing the needed eigenpairs."""
 
 
 def signature(
@@ -28,10 +28,10 @@ def signature(
     boundary: BoundarySpec = "neumann",
     normalisation: Normalisation = "raw",
 ) -> Float[np.ndarray, "n_times *shape"]:
-    """Return the HKS of k eigenpairs at the given times."""
+    """Return the HKS from k eigenpairs at the given times."""
     with warnings.catch_warnings():
-        # These domains are symmetric, and some multiple eigenvalue is always cut. All times here are such that
-        # exp(−λₖt) makes the last pairs invisible.
+        # These domains are symmetric, so k often cuts a multiple eigenvalue. The last pairs are negligible at all times
+        # here.
         warnings.filterwarnings("ignore", "k = .* cuts a multiple eigenvalue", AccuracyWarning)
         pairs = eigenpairs(domain, k, boundary)
     return np.asarray(hks(pairs, np.asarray(times), normalisation))
@@ -40,7 +40,7 @@ def signature(
 def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0) -> int:
     """Return k such that exp(−λₖt) is about exp(−exponent), by Weyl's law for a square.
 
-    A mirror has four times the area, and no sides.
+    A mirror has four times the area and no boundary.
     """
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors)))
     area = float(np.sum(density[field.grid.inside]) * np.prod(field.grid.spacing))
@@ -51,9 +51,9 @@ def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exp
 def flat_signature(
     field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0
 ) -> Float[np.ndarray, "*shape"]:
-    """Return 4πt·HKS, which is 1 where a metric is flat and its sides are far.
+    """Return 4πt·HKS, which is 1 where a metric is flat and its boundary is far.
 
-    On small grids that of the whole spectrum; on large ones that of the eigenpairs up to exp(−λₖt) ≈ exp(−exponent).
+    It uses the whole spectrum on small grids, and the eigenpairs up to exp(−λₖt) ≈ exp(−exponent) on large grids.
     """
     if math.prod(field.grid.shape) > SMALL:
         return signature(field, [time], enough_pairs(field, time, boundary, exponent), boundary, "flat")[0]
@@ -62,10 +62,10 @@ def flat_signature(
 
 
 def continued_signature(field: TensorField, time: float, distance: float) -> Float[np.ndarray, "*shape"]:
-    """Return 4πt·HKS of a metric given by a function, without boundary effect: continued beyond its grid.
+    """Return 4πt·HKS of a metric that is given by a function, without the effect of its boundary.
 
-    The function's formula is evaluated over a strip of the given width (coordinates) around the grid; what the sides
-    of the wide grid do to the HKS is cut off with the strip.
+    The grid is extended by a strip of the given width in coordinates, on which the function is evaluated. The effect of
+    the new boundary is confined to the strip, which is then removed.
     """
     grid = field.grid
     width = math.ceil(distance / min(grid.spacing))

@@ -1,4 +1,4 @@
-"""Table 1: the HKS of a bumpy torus, from its pulled-back metric and from its surface."""
+"""Table 1: the HKS of a bumpy torus from its pulled-back metric and from its surface."""
 
 import io
 import math
@@ -17,10 +17,10 @@ from hks_jax.paper.signature import signature
 TIME = 1.0
 REFERENCE_SIZE = 400
 REFERENCE_PAIRS = 300
-# At t = 1, 200 pairs leave out exp(−λ₂₀₀) < 1e-5 of the signature; the smallest difference of the quick table is 5e-3.
+# At t = 1 the share beyond 200 pairs is exp(−λ₂₀₀) < 1e-5; the smallest difference in the quick table is 5e-3.
 QUICK_PAIRS = 200
 STORED = "bumpy_torus_p1_400x400_k300_t1.npy"
-SYMMETRY = 10  # cos 10u: ten times the same around the torus
+SYMMETRY = 10  # cos 10u has ten periods around the torus
 
 PAPER = {50: 0.384, 100: 0.0760, 200: 0.00920, 400: 0.00075}
 INDEPENDENT = {50: 0.0580, 100: 0.0223, 200: 0.0056, 400: 0.00085}
@@ -38,7 +38,7 @@ class Row(NamedTuple):
 
 
 def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
-    """Return the table as Markdown and as comma-separated values, by the names of their files."""
+    """Return the table as Markdown and as comma-separated values by file name."""
     k = REFERENCE_PAIRS if full else QUICK_PAIRS
     if full:
         echo(f"{REFERENCE_PAIRS} eigenpairs of the surface with {REFERENCE_SIZE}² vertices")
@@ -54,7 +54,7 @@ def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
 
 
 def row(n: int, k: int, reference: Float[np.ndarray, "m m"]) -> Row:
-    """Compare the HKS of the metric on n² nodes with a reference on m² nodes, n a divisor of m."""
+    """Compare the HKS of the metric on n² nodes with a reference on m² nodes, where n divides m."""
     (values,) = signature(bumpy_torus_field(n), [TIME], k, boundary="periodic")
     fine = interpolate_periodic(values, len(reference) // n)
     area = area_element(len(reference))
@@ -76,7 +76,7 @@ def relative_difference(
 
 
 def interpolate_periodic(values: Float[np.ndarray, "n n"], factor: int) -> Float[np.ndarray, "m m"]:
-    """Return the bilinear interpolant of periodic node values on a grid `factor` times as fine."""
+    """Return the bilinear interpolant of periodic nodal values on a grid that is `factor` times as fine."""
     weight = np.arange(factor) / factor
     for axis in (0, 1):
         coarse = np.moveaxis(values, axis, 0)[:, None]
@@ -87,13 +87,13 @@ def interpolate_periodic(values: Float[np.ndarray, "n n"], factor: int) -> Float
 
 
 def computed_reference(k: int = REFERENCE_PAIRS) -> Float[np.ndarray, "400 400"]:
-    """Compute the HKS of the triangulated surface at the nodes of the 400² grid: minutes."""
+    """Compute the HKS of the triangulated surface at the nodes of the 400² grid, which takes minutes."""
     (values,) = signature(bumpy_torus_mesh(REFERENCE_SIZE), [TIME], k)
     return values.reshape(REFERENCE_SIZE, REFERENCE_SIZE)
 
 
 def stored_reference() -> Float[np.ndarray, "400 400"]:
-    """Read what `computed_reference` gave, to float32. `store_reference` writes it anew."""
+    """Read a stored result of `computed_reference` in float32, which `store_reference` writes."""
     with resources.files(__package__).joinpath(STORED).open("rb") as file:
         sector = np.load(io.BytesIO(file.read()))
     return np.tile(sector.astype(np.float64), (SYMMETRY, 1))

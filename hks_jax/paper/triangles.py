@@ -1,6 +1,6 @@
-"""Whether edge lengths in the metric violate the triangle inequality, as the paper says of discrete exterior calculus.
+"""Violations of the triangle inequality by edge lengths in the metric, a remark of the paper.
 
-The grid's cells are cut by their diagonals, and every edge has a length in the metric by one of the rules `LENGTHS`.
+The remark concerns discrete exterior calculus. Diagonals cut the grid's cells, and `LENGTHS` gives rules for lengths.
 """
 
 from collections.abc import Callable
@@ -44,14 +44,14 @@ LENGTHS: dict[str, Callable[[Tensors, Tensors, Vectors], Float[np.ndarray, " n"]
 class Count(NamedTuple):
     """The faults of the edge lengths of a triangulated grid."""
 
-    triangles: int  # how many triangles there are
-    violating: int  # how many have a side longer than the other two together
-    vertices: int  # how many vertices there are
-    no_area: int  # how many have a dual cell, by circumcentres, of no positive area; violating triangles left out
+    triangles: int  # the number of triangles
+    violating: int  # the triangles with a side longer than the sum of the other two
+    vertices: int  # the number of vertices
+    no_area: int  # the vertices whose circumcentric dual cell, without violating triangles, has no positive area
 
 
 def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
-    """Triangulate the grid of a field, measure all edges by a rule, and count what is wrong."""
+    """Triangulate the grid of a field, measure all edges by a rule, and count violations."""
     grid, (faces, places) = field.grid, _triangles(field.grid, periodic)
     tensors = np.asarray(field.tensors, dtype=np.float64).reshape(-1, 2, 2)
     sides = []
@@ -62,7 +62,7 @@ def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
     violating = 2 * lengths.max(axis=1) > lengths.sum(axis=1)
     squared, half = lengths[~violating] ** 2, lengths[~violating].sum(axis=1, keepdims=True) / 2
     area = np.sqrt(half[:, 0] * np.prod(half - lengths[~violating], axis=1))
-    # The dual cell has (b² cot B + c² cot C)/8 of a triangle at corner A, and cot A = (b² + c² − a²)/4·area.
+    # A triangle adds (b² cot B + c² cot C)/8 to the dual cell of its corner A, where cot A = (b² + c² − a²)/4·area.
     weighted = squared * (squared.sum(axis=1, keepdims=True) - 2 * squared) / (4 * area[:, None])
     cells = np.zeros(len(tensors))
     np.add.at(cells, faces[~violating], (weighted.sum(axis=1, keepdims=True) - weighted) / 8)
@@ -71,7 +71,7 @@ def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
 
 
 def _triangles(grid: Grid, periodic: bool) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3 2"]]:
-    """Return the corners' nodes and places: two triangles for each cell whose nodes are all inside."""
+    """Return the nodes and positions of the corners of two triangles for each cell whose nodes are all inside."""
     cells = np.argwhere(active_elements(grid.inside, (periodic,) * 2))
     steps = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
     corners = cells[:, None, None] + steps
@@ -80,7 +80,7 @@ def _triangles(grid: Grid, periodic: bool) -> tuple[Int[np.ndarray, "n 3"], Floa
 
 
 def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
-    """Return the paper's fields, and a phantom of a brain, with their names and whether they are periodic."""
+    """Return the paper's fields and a phantom of a brain, with their names and periodicity."""
     of_figures, of_torus = FULL if full else QUICK
     cases: list[tuple[str, TensorField, bool]] = []
     for n in (COARSE, *of_figures):
@@ -97,7 +97,7 @@ def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
 
 
 def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
-    """Return a table in Markdown, by the name of its file."""
+    """Return a table in Markdown by its file name."""
     echo("edge lengths in the metric, on the paper's fields")
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",

@@ -1,7 +1,7 @@
-"""Pictures of tensor fields and their heat kernel signatures, on matplotlib's object-oriented interface.
+"""Figures of tensor fields and their heat kernel signatures with matplotlib's object-oriented interface.
 
-Every function draws on the axes that it is given, so that pictures compose: integral lines over an image of
-the HKS, ellipses beside a surface. No function touches pyplot, a backend or rcParams.
+Every function draws on given axes, so figures can be combined, such as integral lines over an image of the HKS. No
+function uses pyplot or changes a backend or rcParams.
 """
 
 from hks_jax.plot.convolution import lic_texture as lic_texture

@@ -1,4 +1,4 @@
-"""Line integral convolution: noise smeared along the eigenvector field, which shows every direction at once."""
+"""Line integral convolution, which averages noise along an eigenvector field to show its directions everywhere."""
 
 from typing import Any
 
@@ -16,10 +16,10 @@ from hks_jax.plot.images import scalar_image
 from hks_jax.plot.tracing import LEAST_COSINE, DirectionField, Which
 
 PIXELS_PER_INCH = 110
-"""Grains of about this size are seen, and not lost, in print and on screens."""
+"""The texture's resolution, at which single grains are visible in print and on screens."""
 
 FRAME = 3
-"""Pixels: more than a step can go."""
+"""The width of the frame in pixels, which exceeds the length of a step."""
 
 
 def lic_texture(
@@ -27,27 +27,27 @@ def lic_texture(
 ) -> Float[np.ndarray, "px py"]:
     """Return white noise averaged along the integral lines of an eigenvector field (Cabral and Leedom 1993).
 
-    An eigenvector has no sign: each step takes the one that goes on. The average is weighted by a bell; divided by the
-    deviation that it would have, and taken through the normal distribution, it is uniform in (0, 1) whatever the number
-    of pixels in it: contrast does not fade or grow where lines end, at degenerate points, sides and rims.
+    An eigenvector has no sign, so each step takes the sign that continues the line. The average has bell-shaped
+    weights. It is divided by its standard deviation and mapped by the normal distribution function, so it is uniform in
+    (0, 1) for any number of pixels. So the contrast is the same where lines end, at degenerate points and boundaries.
 
     Args:
         field: a 2D field.
         which: ``"major"``, the eigenvector of the larger eigenvalue of T, or ``"minor"``.
-        pixels: how many along the longer side of the grid.
-        length: of the smear to either side, in pixels.
-        seed: of the noise.
+        pixels: the number of pixels along the longer side of the grid.
+        length: the length of the average in each direction, in pixels.
+        seed: the seed of the noise.
 
     Returns:
-        (px, py) over the rectangle of the nodes, `field.grid.extent`, array axis 0 horizontal; NaN in cells that are
-        not inside the mask. Where eigenvalues are equal the noise is as it was.
+        (px, py) over the rectangle of the nodes, `field.grid.extent`, with array axis 0 horizontal; NaN in cells
+        outside the mask. Where eigenvalues are equal the noise is not averaged.
 
     Raises:
-        ValueError: a 3D field; an unknown `which`; fewer than 2 pixels; a length below 1.
+        ValueError: if the field is 3D, `which` is unknown, there are fewer than 2 pixels, or the length is below 1.
     """
     direction = DirectionField(field, which)
     if pixels < 2 or length < 1:
-        raise ValueError(f"pixels, length: got {pixels}, {length}; expected at least 2 pixels and a length from 1")
+        raise ValueError(f"pixels, length: got {pixels}, {length}; expected at least 2 pixels and a length ≥ 1")
     x0, x1, y0, y1 = field.grid.extent
     side = max(x1 - x0, y1 - y0) / pixels
     shape = (max(2, round((x1 - x0) / side)), max(2, round((y1 - y0) / side)))
@@ -55,8 +55,8 @@ def lic_texture(
     centres = np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2) + 0.5
     points = [x0, y0] + centres * size
     noise = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-    # In steps of a pixel it is enough to know the direction at every pixel. Complex numbers are vectors here, and the
-    # frame of NaN stops what leaves the picture: there are no conditions to check, which would take most of the time.
+    # For steps of one pixel the direction at every pixel suffices. Complex numbers represent vectors, and a frame of
+    # NaN ends lines that leave the image. Explicit tests for this would take most of the time.
     along = _complex(direction(points) / size * side).reshape(shape)
     along, values = np.pad(along, FRAME, constant_values=np.nan), np.pad(noise, FRAME)
     total, squares = noise.ravel().copy(), np.ones(noise.size, np.float32)
@@ -67,7 +67,7 @@ def lic_texture(
         alive = np.flatnonzero(np.isfinite(heading))
         position, heading = start[alive], heading[alive]
         for weight in bell.astype(np.float32):
-            # The midpoint rule: Euler's would spiral out of circles.
+            # The midpoint rule is used because Euler's method would spiral out of circles.
             middle, onwards = _onwards(along, position + 0.5 * heading, heading)
             position = position + np.where(onwards, middle, heading)
             heading, onwards = _onwards(along, position, heading)
@@ -93,25 +93,24 @@ def line_integral_convolution(
 ) -> AxesImage:
     """Shade an image by the line integral convolution of an eigenvector field.
 
-    The texture darkens and lightens the colours below it equally, so that on average they are those of the colour bar.
+    The texture darkens and lightens colours equally, so on average they agree with the colour bar.
 
     Args:
         ax: the axes to draw on.
         field: a 2D field.
         which: ``"major"`` or ``"minor"``.
-        values: (*shape,) a scalar such as the HKS, drawn by `scalar_image`; None: what `ax` shows already, or grey.
-        contrast: how far the colours go to black and white, in (0, 1].
-        pixels: of the texture along the longer side; None: about 110 an inch of the axes, so that the grain has one
-            size on paper.
-        length: as for `lic_texture`.
-        seed: of the noise.
-        **kwargs: passed to `scalar_image`, for `values`.
+        values: (*shape,) a scalar such as the HKS, drawn by `scalar_image`; by default the image on `ax`, or grey.
+        contrast: the maximum opacity of black and white, in (0, 1].
+        pixels: the texture's pixels along the longer side. The default is about 110 per inch of the axes.
+        length: the same as for `lic_texture`.
+        seed: the seed of the noise.
+        **kwargs: arguments of `scalar_image` for `values`.
 
     Returns:
-        The texture's image.
+        The image of the texture.
 
     Raises:
-        ValueError: a 3D field; options that do not exist or are out of range.
+        ValueError: if the field is 3D, or if an option is unknown or out of range.
     """
     require_plane("field", field.grid)
     if not 0 < contrast <= 1:
@@ -125,7 +124,7 @@ def line_integral_convolution(
     shift = contrast * (2 * texture.T - 1)
     shade = np.zeros((*shift.shape, 4))
     if ax.images:
-        # Black at opacity p multiplies a colour by 1 − p; white at opacity p brings it as much nearer to white.
+        # Black at opacity p multiplies a colour by 1 − p. White multiplies the colour's distance to white by 1 − p.
         shade[..., :3] = (shift > 0)[..., None]
         shade[..., 3] = np.abs(shift)
     else:
@@ -148,7 +147,7 @@ def _pixel(position: Complex[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]
 def _onwards(
     along: Complex[np.ndarray, "px py"], position: Complex[np.ndarray, " n"], heading: Complex[np.ndarray, " n"]
 ) -> tuple[Complex[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return the direction at each position with the sign that goes on, and where it does go on."""
+    """Return the direction at each position with the sign that continues the line, and whether the line continues."""
     there = along[_pixel(position)]
     product = (there * heading.conj()).real
     straight = np.abs(product) > LEAST_COSINE * np.abs(there) * np.abs(heading)  # False for NaN

@@ -1,4 +1,4 @@
-"""Curves: the HKS over time at chosen points, and the counting function of a spectrum beside Weyl's law."""
+"""Curves of the HKS over time at chosen points, and of a spectrum's counting function with Weyl's law."""
 
 import math
 from collections.abc import Sequence
@@ -37,25 +37,25 @@ def hks_curves(
     cmap: str = "viridis",
     **kwargs: Any,
 ) -> list[Line2D]:
-    """Draw HKS(t) at the nodes nearest to `points`, with the expansion dashed in the same colour.
+    """Draw HKS(t) at the nodes nearest to `points`, with the expansion as dashed lines in the same colours.
 
     Args:
         ax: the axes to draw on.
-        values: (n_times, *shape), as `hks_jax.hks` returns them.
-        times: (n_times,), increasing.
+        values: (n_times, *shape) the result of `hks_jax.hks`.
+        times: (n_times,) in increasing order.
         grid: the grid of the values, 2D or 3D.
-        points: coordinates, one row of d numbers per curve.
-        expansion: (n_times, *shape), as `hks_jax.hks_expansion` returns it.
-        limit: the least time that the eigenpairs resolve, `hks_jax.truncation(pairs, times).smallest_time`; times below
+        points: (n, d) coordinates, one row for each curve.
+        expansion: (n_times, *shape) the result of `hks_jax.hks_expansion`.
+        limit: the least time that the eigenpairs resolve, `hks_jax.truncation(pairs, times).smallest_time`. Times below
             it are shaded.
-        labels: one per point; None: its coordinates.
+        labels: a label for each point, by default its coordinates.
         unit: the unit of t.
-        scaled: draw (4πt)^(d/2)·HKS, which is 1 for flat space without boundary, on a linear scale.
-        cmap: colour map; the curves take evenly spaced colours.
-        **kwargs: passed to `Axes.plot` for the HKS.
+        scaled: whether to draw (4πt)^(d/2)·HKS, which is 1 for flat space without boundary, on a linear scale.
+        cmap: a colour map, from which the curves take evenly spaced colours.
+        **kwargs: arguments of `Axes.plot` for the HKS.
 
     Raises:
-        ValueError: shapes that do not agree, or a point whose nearest node is outside the mask.
+        ValueError: if shapes disagree, or if the nearest node of a point is outside the mask.
     """
     t = checked_times(times, grid.shape, values=values, expansion=expansion)
     curves = np.asarray(values, dtype=np.float64)
@@ -72,7 +72,7 @@ def hks_curves(
         lines += ax.plot(t, factor * curves[history], **style)
         if series is not None:
             ax.plot(t, factor * series[history], color=style["color"], linestyle="--", linewidth=1.0)
-    # The series leaves the picture at large t: the curves, not it, choose the scale.
+    # The curves determine the scale, because the series diverges at large t.
     drawn = np.concatenate([np.asarray(line.get_ydata()) for line in lines])
     _logarithmic(ax, "x", t)
     if scaled:
@@ -101,12 +101,12 @@ def _nearest_nodes(points: np.ndarray, grid: Grid) -> list[tuple[int, ...]]:
     on_grid = np.all((index >= 0) & (index < grid.shape), axis=1)
     for point, node, on in zip(points, index, on_grid, strict=True):
         if not (on and grid.inside[tuple(node)]):
-            raise ValueError(f"points: {tuple(point.tolist())} lies outside the grid or its mask; choose one inside")
+            raise ValueError(f"points: got {tuple(point.tolist())} outside the grid or its mask; choose one inside")
     return [tuple(node) for node in index.tolist()]
 
 
 def _logarithmic(ax: Axes, name: str, values: np.ndarray) -> None:
-    """Make an axis logarithmic over the positive values, with few labels and a small margin."""
+    """Make an axis logarithmic over the positive values, with few tick labels and a small margin."""
     positive = values[values > 0]
     low, high = (float(positive.min()), float(positive.max())) if positive.size else (0.1, 1.0)
     margin = max(high / low, 1.1) ** 0.04
@@ -127,26 +127,26 @@ def spectrum(
     unit: str = "",
     **kwargs: Any,
 ) -> list[Line2D]:
-    """Draw the number N(λ) of eigenvalues up to λ, and Weyl's law for it.
+    """Draw the number N(λ) of eigenvalues up to λ and its approximation by Weyl's law.
 
     Args:
         ax: the axes to draw on.
-        pairs: from `eigenpairs`; those not kept are left out.
-        domain: the field or the mesh that the pairs are of, for the law's second term, that of the boundary; None: the
-            law's first term alone.
-        remainder: draw N(λ) less the law: without a trend, unless eigenvalues are missing (it falls) or the grid is too
-            coarse for the last of them (likewise: the eigenvalues of finite elements are too large).
+        pairs: the result of `eigenpairs`; pairs that are not kept are omitted.
+        domain: the field or mesh of the pairs, for the second term of the law, which belongs to the boundary. Without
+            it only the first term is drawn.
+        remainder: whether to draw N(λ) minus the law. This difference has no trend, but it falls if eigenvalues are
+            missing or if the grid is too coarse for the last ones, because finite-element eigenvalues are too large.
         unit: the unit of λ.
-        **kwargs: passed to `Axes.plot` for N.
+        **kwargs: arguments of `Axes.plot` for N.
 
     Returns:
-        The lines: N, the law with the boundary where `domain` is given, and the law's first term.
+        The lines of N, of the law with the boundary term if `domain` is given, and of the law's first term.
 
     Raises:
-        ValueError: a domain that the pairs are not of.
+        ValueError: if the pairs do not belong to the domain.
     """
     values = np.asarray(pairs.eigenvalues, np.float64)[np.asarray(pairs.kept)]
-    # Each step from its foot to its top.
+    # Each step is drawn from its lower to its upper end.
     steps = np.repeat(values, 2)
     count = np.repeat(np.arange(values.size + 1.0), 2)[1:-1]
     fine = np.linspace(0, values[-1], 400)

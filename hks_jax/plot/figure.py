@@ -1,4 +1,4 @@
-"""Figures, axes of grids and colour bars, which all pictures share."""
+"""Figures, axes and colour bars that all plots share."""
 
 import math
 import os
@@ -21,22 +21,21 @@ from hks_jax.storage import atomic_path
 
 SMALL = "small"
 LABELS = 21
-"""Points (1/72 inch) below the axes that tick labels and an axis label take."""
+"""The height of tick labels and an axis label below the axes, in points (1/72 inch)."""
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure (inches) that arranges its axes without overlaps."""
+    """Return an empty figure, with sizes in inches, that arranges its axes without overlaps."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) -> Path:
-    """Write a figure to `path` (its suffix names the format) in one step, and return the path.
+    """Write a figure to `path` atomically, in the format of the suffix, and return the path.
 
-    The picture is written beside its place and then moved there: no reader ever sees half a file. Missing
-    parent directories are made.
+    A temporary file is written and then moved to `path`, so no incomplete file is visible. Missing parents are created.
 
     Raises:
-        ValueError: a suffix that matplotlib cannot write.
+        ValueError: if matplotlib cannot write the format of the suffix.
     """
     target = Path(path)
     formats = fig.canvas.get_supported_filetypes()
@@ -52,7 +51,7 @@ def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) 
 
 
 def finished(fig: Figure, suptitle: str, path: str | os.PathLike[str] | None = None) -> Figure:
-    """Return the figure with its title, saved if there is a path."""
+    """Add a title to a figure, save it if a path is given, and return it."""
     if suptitle:
         fig.suptitle(suptitle)
     if path is not None:
@@ -64,19 +63,19 @@ def require_plane(name: str, grid: Grid) -> None:
     """Raise ValueError unless the grid is two-dimensional."""
     if grid.dimension != 2:
         raise ValueError(
-            f"{name}: got a grid of {grid.dimension} dimensions, shape {grid.shape}; expected 2. "
-            "Draw a slice: a Grid of two of the axes, with the values or tensors at one index of the third"
+            f"{name}: got a grid of {grid.dimension} dimensions with shape {grid.shape}; expected 2. Draw a slice "
+            "with a Grid of two axes and the values or tensors at one index of the third"
         )
 
 
 def cell_extent(grid: Grid) -> tuple[float, float, float, float]:
-    """Return (x_min, x_max, y_min, y_max) of the nodes' cells: half a spacing beyond the outermost nodes."""
+    """Return (x_min, x_max, y_min, y_max) of the nodes' cells, which extend half a spacing beyond the nodes."""
     (x0, x1, y0, y1), (hx, hy) = grid.extent, grid.spacing
     return x0 - hx / 2, x1 + hx / 2, y0 - hy / 2, y1 + hy / 2
 
 
 def panel_size(grid: Grid, side: float, steepest: float = 4.0) -> tuple[float, float]:
-    """Return an image's width and height: `side`, or less width where it is high, their ratio at most `steepest`."""
+    """Return an image's width, `side` or less for tall images, and height. Their ratio is at most `steepest`."""
     x0, x1, y0, y1 = cell_extent(grid)
     aspect = min(max((y1 - y0) / (x1 - x0), 1 / steepest), steepest)
     width = side / max(1.0, aspect**0.5)
@@ -84,7 +83,7 @@ def panel_size(grid: Grid, side: float, steepest: float = 4.0) -> tuple[float, f
 
 
 def frame(ax: Axes, grid: Grid) -> None:
-    """Show the grid in `ax`: equal aspect, array axis 0 horizontal, few ticks."""
+    """Set the limits of `ax` to the grid, with equal aspect, array axis 0 horizontal, and few ticks."""
     x0, x1, y0, y1 = cell_extent(grid)
     ax.set_aspect("equal")
     ax.set_xlim(x0, x1)
@@ -95,24 +94,24 @@ def frame(ax: Axes, grid: Grid) -> None:
 
 
 def figure_of(ax: Axes) -> Figure:
-    """Return the figure that axes are in."""
+    """Return the figure that contains the axes."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     return figure
 
 
 def inches(ax: Axes) -> Float[np.ndarray, "2"]:
-    """Return width and height of axes as they are before layout."""
+    """Return the width and height in inches of axes before layout."""
     return np.multiply(ax.get_position().size, figure_of(ax).get_size_inches())
 
 
 def side_in_inches(ax: Axes, extent: Sequence[float]) -> float:
-    """Return how long the longer side of an extent will be, in equal aspect on the axes as they are before layout."""
+    """Return the length in inches of an extent's longer side, for equal aspect on the axes before layout."""
     return float(np.min(inches(ax) / extent) * np.max(extent))
 
 
 def legend_below(ax: Axes, handles: Sequence[Artist], title: str = "") -> None:
-    """Add a legend below the axes, where it hides nothing."""
+    """Add a legend below the axes, where it does not cover the image."""
     ax.legend(
         handles=handles,
         title=title,
@@ -128,15 +127,15 @@ def legend_below(ax: Axes, handles: Sequence[Artist], title: str = "") -> None:
 
 
 def colour_bar(ax: Axes, mappable: ScalarMappable, label: str = "", **kwargs: Any) -> Colorbar:
-    """Add a colour bar to the right of `ax`, exactly as tall as its box."""
-    # An inset moves with its parent's box: the bar stays as tall as an image of equal aspect.
+    """Add a colour bar to the right of `ax` with exactly the same height."""
+    # An inset follows its parent's box, so the bar keeps the height of an image with equal aspect.
     return colour_bar_in(ax.inset_axes((1.03, 0.0, 0.045, 1.0)), mappable, label, **kwargs)
 
 
 def colour_bar_in(
     bar_axes: Axes, mappable: ScalarMappable, label: str = "", values: np.ma.MaskedArray | None = None, **kwargs: Any
 ) -> Colorbar:
-    """Draw a colour bar in axes of its own, with few ticks, powers of ten, and arrows where values lie beyond it."""
+    """Draw a colour bar in separate axes, with few ticks, powers of ten, and arrows if values exceed its range."""
     low, high = mappable.get_clim()
     drawn: Any = mappable.get_array() if values is None else values
     extend = ("neither", "min", "max", "both")[(drawn.min() < low) + 2 * (drawn.max() > high)]
@@ -156,7 +155,7 @@ def colour_bar_in(
 
 
 def _colour_ticks(bar: Colorbar) -> Locator:
-    """Return where a colour bar has ticks: two below a bar whose numbers take many digits, as at large t."""
+    """Return the tick locator of a colour bar, with two ticks below a bar whose numbers have many digits."""
     low, high = sorted(float(end) for end in bar.mappable.get_clim() if end is not None)
     largest = max(abs(low), abs(high))
     step = 10.0 ** math.floor(math.log10(max((high - low) / 5, 1e-300)))
@@ -166,7 +165,7 @@ def _colour_ticks(bar: Colorbar) -> Locator:
 
 
 def number_text(value: float) -> str:
-    """Write a number with three significant digits for a title or a label, powers of ten as such."""
+    """Return a number as text with three significant digits, with a power of ten if necessary."""
     if value == 0 or 1e-3 <= abs(value) < 1e5:
         return f"{float(f'{value:.3g}'):g}"
     mantissa, exponent = f"{value:.2e}".split("e")

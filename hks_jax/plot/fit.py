@@ -1,4 +1,4 @@
-"""Pictures of fits: the metric, and how well it explains the signature."""
+"""Figures of fits: the metric and its agreement with the signature."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # slow to import
     from hks_jax.inverse.metric_fit import MetricFit, Step
 
 LEAST_DIFFERENCE = 1e-6
-"""The least relative difference that takes the last colour: below it lie the errors of the eigenpairs."""
+"""The minimum of the colours' range for relative differences; the errors of the eigenpairs are smaller."""
 
 
 def fit_panels(
@@ -33,29 +33,29 @@ def fit_panels(
     title: str | None = None,
     orientation: Orientation | None = None,
 ) -> Figure:
-    """Return a figure of a fit in 2D: signatures, the metric, and the way there.
+    """Return a figure of a fit in 2D with signatures, the metric and the loss.
 
-    A row for each of a few times, the first and the last among them: the target, the fitted signature in the same
-    colours, and their relative difference, in colours shared by all rows. Below, the unit circles of the fitted metric
-    and the loss over the steps, a curve for each start, broken where a stage begins or a fit was resumed.
+    A few times, including the first and the last, have a row each. It shows the target, the fitted signature in the
+    same colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
+    metric and the loss over the steps. Each start has a curve, which is interrupted at a new stage or a resumed fit.
 
     Args:
         fit: the result of `hks_jax.fit_metric`.
-        target: (n_times, *grid.shape), of the fit; NaN where it was not observed.
-        times: (n_times,), or energies; None: the fit's.
-        max_times: the most rows.
+        target: (n_times, *grid.shape) the target of the fit; NaN at unobserved entries.
+        times: (n_times,) times or energies, by default those of the fit.
+        max_times: the maximum number of rows with times.
         title: the figure's title.
-        orientation: how the grid lies in space, as for `scalar_image`.
+        orientation: the orientation of the grid in space, as for `scalar_image`.
 
     Raises:
-        ValueError: a 3D grid; a target or a signature that is not one image per time; no times.
+        ValueError: if the grid is 3D, if target or signature is not one image per time, or if no times are given.
     """
     grid = fit.field.grid
     require_plane("fit", grid)
     if times is None:
         times = fit.problem.observation.times
     if times is None:
-        raise ValueError("times: got None, and the fit has none; expected one number per image of the target")
+        raise ValueError("times: got None for a fit without times; expected one number per image of the target")
     if max_times < 1:
         raise ValueError(f"max_times: got {max_times}; expected at least 1")
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
@@ -70,10 +70,10 @@ def fit_panels(
     if orientation is not None:
         field = TensorField(orientation.grid(grid), orientation.tensors(field.tensors), field.interpolation)
     width, height = panel_size(field.grid, 2.5)
-    # The lowest row is no lower than a curve needs.
+    # The lowest row has at least the height that the curves need.
     heights = [height] * len(rows) + [max(height, 1.8)]
     figure = new_figure(3 * (width + 0.9) + 0.4, sum(heights) + 0.3 * len(heights) + 0.6 + 0.3 * bool(title))
-    # Apart, because the last row's labels would else widen the columns above.
+    # Separate grids prevent the labels of the last row from widening the columns above.
     halves = figure.add_gridspec(2, 1, height_ratios=[sum(heights[:-1]), heights[-1]])
     panels, last = halves[0].subgridspec(len(rows), 3), halves[1].subgridspec(1, 2, width_ratios=(1, 1.7))
     symbol = fit.problem.observation.signature.symbol or "t"
@@ -99,9 +99,9 @@ def fit_panels(
 
 
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
-    """Draw the loss over the steps, and the data's part of it where there are penalties."""
+    """Draw the loss over the steps and, if there are penalties, the data's part of the loss."""
     starts = sorted({step.start for step in fit.history})
-    # A stage, a start or a resumed fit counts its steps from 0 again.
+    # Each stage, start or resumed fit numbers its steps from 0.
     pieces: list[list[Step]] = []
     for step in fit.history:
         last = pieces[-1][-1] if pieces else None

@@ -1,4 +1,4 @@
-"""Ellipses of a tensor field, its degenerate points, and crosses of tensors of either sign, such as derivatives."""
+"""Ellipses of a tensor field, its degenerate points, and crosses for indefinite tensors such as derivatives."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -32,27 +32,25 @@ def ellipses(
     colorbar: bool = True,
     **kwargs: Any,
 ) -> EllipseCollection:
-    """Draw the tensors of a 2D field as ellipses, subsampled and scaled so that no two overlap.
+    """Draw the tensors of a 2D field at a subset of nodes as ellipses, scaled to prevent overlaps.
 
     Args:
         ax: the axes to draw on.
-        field: the field; nodes outside its mask are left out.
-        every: draw every such node (one number or one per axis); None: about 24 along the longer side,
-            or fewer where the axes are small.
-        kind: ``"metric"``: the unit circle of the metric, {v : vᵀTv = const}, half axes ∝ 1/√λ; ``"tensor"``:
-            the image of a circle under T^(1/2), half axes ∝ √λ, as is usual for diffusion tensors. (λ: the
-            eigenvalues of T.)
-        sizes: ``"common"``: one scale for all, so that sizes compare; ``"fit"``: each as large as its cell
-            allows.
-        color: ``"anisotropy"`` (λ₁ − λ₂)/(λ₁ + λ₂), ``"orientation"`` of the longer axis in degrees, or
-            the name of one colour.
-        cmap: colour map; None: viridis for anisotropy, the cyclic twilight for orientation.
-        fill: the part of its cell that the largest ellipse may fill, at most 1.
+        field: the field; nodes outside its mask are omitted.
+        every: the step between drawn nodes, one number or one per axis; by default about 24 nodes on the longer side,
+            or fewer on small axes.
+        kind: ``"metric"`` draws the unit circle {v : vᵀTv = const} of the metric, with half axes ∝ 1/√λ for the
+            eigenvalues λ of T. ``"tensor"`` draws the image of a circle under T^(1/2), with half axes ∝ √λ, as is usual
+            for diffusion tensors.
+        sizes: ``"common"`` uses one scale, so that sizes are comparable; ``"fit"`` fills each cell with its ellipse.
+        color: ``"anisotropy"`` (λ₁ − λ₂)/(λ₁ + λ₂), ``"orientation"`` of the longer axis in degrees, or a colour.
+        cmap: the colour map, by default viridis for anisotropy and the cyclic twilight for orientation.
+        fill: the relative size of the largest ellipse in its cell, at most 1.
         colorbar: whether to add a colour bar.
-        **kwargs: passed to `matplotlib.collections.EllipseCollection`.
+        **kwargs: arguments of `matplotlib.collections.EllipseCollection`.
 
     Raises:
-        ValueError: a 3D field; options that do not exist; no node to draw.
+        ValueError: if the field is 3D, if an option is unknown, or if there is no node to draw.
     """
     grid = field.grid
     require_plane("field", grid)
@@ -61,11 +59,11 @@ def ellipses(
     if sizes not in ("common", "fit"):
         raise ValueError(f'sizes: got {sizes!r}; expected "common" or "fit"')
     if not 0 < fill <= 1:
-        raise ValueError(f"fill: got {fill}; expected a number in (0, 1]; ellipses overlap beyond 1")
+        raise ValueError(f"fill: got {fill}; expected a number in (0, 1], because larger ellipses overlap")
     steps, pick = nodes_drawn(grid, every, ax)
     inside = grid.inside[pick]
     if not inside.any():
-        raise ValueError(f"every: got {every}; no node drawn lies inside the mask. Use a smaller step")
+        raise ValueError(f"every: got {every}, with which no drawn node lies inside the mask; use a smaller step")
     tensors = np.asarray(field.tensors, dtype=np.float64)[pick][inside]
     centres = grid.nodes[pick][inside]
 
@@ -74,7 +72,7 @@ def ellipses(
     half_axes = eigenvalues**power
     longer = 0 if kind == "metric" else 1
     axis = vectors[:, :, longer]
-    # The box of the ellipse around its centre has half sides √((T^±1)_aa).
+    # The bounding box of the ellipse has the half sides √((T^±1)_aa).
     box = np.sqrt(np.einsum("nai,ni->na", vectors**2, half_axes**2))
     scale = 0.5 * fill / np.max(box / (np.array(steps) * grid.spacing), axis=1)
     if sizes == "common":
@@ -109,9 +107,9 @@ def ellipses(
 
 
 def nodes_drawn(grid: Grid, every: int | Sequence[int] | None, ax: Axes) -> tuple[tuple[int, ...], tuple[slice, ...]]:
-    """Return the step along each axis, and which nodes are drawn: as many as there is room for, in the middle.
+    """Return the step along each axis and the centred slices of the drawn nodes.
 
-    Steps are as given, or for some 10 nodes an inch of the longer side, 24 at most.
+    By default the longer side has about 10 nodes per inch and at most 24.
     """
     if every is None:
         width, height = (n * h for n, h in zip(grid.shape, grid.spacing, strict=True))
@@ -120,7 +118,7 @@ def nodes_drawn(grid: Grid, every: int | Sequence[int] | None, ax: Axes) -> tupl
     else:
         given = np.broadcast_to(np.asarray(every), (grid.dimension,))
         if not np.issubdtype(given.dtype, np.integer) or given.min() < 1:
-            raise ValueError(f"every: got {every}; expected positive integers, one or {grid.dimension}")
+            raise ValueError(f"every: got {every}; expected one positive integer or {grid.dimension}")
         steps = tuple(given.tolist())
     counts = [max(1, n // step) for n, step in zip(grid.shape, steps, strict=True)]
     firsts = [(n - m * s) // 2 + s // 2 for n, m, s in zip(grid.shape, counts, steps, strict=True)]
@@ -139,25 +137,25 @@ def sensitivity(
     legend: bool = True,
     **kwargs: Any,
 ) -> LineCollection:
-    """Draw the derivative of a number with respect to the tensors: which one, in which direction, drives it.
+    """Draw the derivative of a number with respect to the tensors at each node as a cross.
 
-    At each node a cross of two bars along the eigenvectors of the gradient, of lengths |μ|^power for its eigenvalues μ:
-    in the first colour where the number grows with the metric's length in that direction, in the second where it falls.
+    A cross has two bars along the eigenvectors of the gradient with lengths |μ|^power for its eigenvalues μ. A bar has
+    the first colour if the number increases with the metric's length in that direction, otherwise the second.
 
     Args:
         ax: the axes to draw on.
         grid: the 2D grid.
-        gradient: (*shape, 2, 2) symmetric, as `jax.grad` returns it; nodes outside the mask are left out.
-        every: draw every such node (one number or one per axis); None: about 24 along the longer side. The gradient
-            is of the drawn nodes, not of the area around them.
-        power: below 1 shows small derivatives beside large ones.
-        colors: for positive and negative eigenvalues.
-        fill: the part of its cell that the longest bar may fill.
-        legend: whether to say what the colours mean.
-        **kwargs: passed to `matplotlib.collections.LineCollection`.
+        gradient: (*shape, 2, 2) symmetric, as `jax.grad` returns it; nodes outside the mask are omitted.
+        every: the step between drawn nodes, one number or one per axis; by default about 24 nodes along the longer
+            side. The gradient belongs to the drawn nodes, not to the area around them.
+        power: an exponent; values below 1 make small derivatives visible beside large ones.
+        colors: the colours of positive and negative eigenvalues.
+        fill: the relative length of the longest bar in its cell.
+        legend: whether to add a legend of the colours.
+        **kwargs: arguments of `matplotlib.collections.LineCollection`.
 
     Raises:
-        ValueError: a 3D grid, a gradient of another shape, or NaN inside the mask.
+        ValueError: if the grid is 3D, or if the gradient has another shape or is NaN inside the mask.
     """
     require_plane("grid", grid)
     array = np.asarray(gradient, dtype=np.float64)
@@ -168,7 +166,9 @@ def sensitivity(
     matrices, centres = array[pick][inside], grid.nodes[pick][inside]
     if not np.isfinite(matrices).all():
         bad = int((~np.isfinite(matrices)).any(axis=(1, 2)).sum())
-        raise ValueError(f"gradient: {bad} of {len(matrices)} tensors drawn are NaN or infinite; expected finite ones")
+        raise ValueError(
+            f"gradient: got {bad} NaN or infinite tensors of {len(matrices)} drawn; expected finite tensors"
+        )
     eigenvalues, vectors = np.linalg.eigh((matrices + np.swapaxes(matrices, 1, 2)) / 2)
     lengths = np.abs(eigenvalues) ** power
     cell = min(s * h for s, h in zip(steps, grid.spacing, strict=True))
@@ -195,22 +195,22 @@ def degenerate_points(
     legend: bool = True,
     **kwargs: Any,
 ) -> PolyCollection:
-    """Mark the degenerate points of a 2D field over whatever `ax` shows, shape and colour by their index.
+    """Mark the degenerate points of a 2D field on `ax` with shapes and colours that depend on their index.
 
-    Trisectors (index −½) are triangles, wedges (½) discs, points of other indices polygons of |2·index| + 2 sides.
-    Marks have sizes in coordinates, and shrink where they would overlap.
+    Trisectors (index −½) are triangles, wedges (½) are discs, and other points are polygons with |2·index| + 2 sides.
+    The sizes are in coordinates, and are reduced where marks would overlap.
 
     Args:
         ax: the axes to draw on.
         field: the field.
-        merge: as for `hks_jax.degenerate_points`, which finds the points.
-        size: radius of a mark, relative to the longer side of the grid.
+        merge: the same as for `hks_jax.degenerate_points`, which computes the points.
+        size: the radius of a mark, relative to the longer side of the grid.
         cmap: a diverging colour map; its middle belongs to index 0.
-        legend: whether to say which mark is which index, and how many there are.
-        **kwargs: passed to `matplotlib.collections.PolyCollection`.
+        legend: whether to add a legend of the marks' indices and numbers.
+        **kwargs: arguments of `matplotlib.collections.PolyCollection`.
 
     Raises:
-        ValueError: a 3D field; merge less than 1; a size that is not positive.
+        ValueError: if the field is 3D, merge is less than 1, or the size is not positive.
     """
     if not size > 0:
         raise ValueError(f"size: got {size}; expected a positive number, relative to the longer side")

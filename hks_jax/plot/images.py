@@ -15,7 +15,7 @@ from hks_jax.plot.figure import cell_extent, colour_bar, frame, require_plane
 from hks_jax.plot.orientation import Orientation
 
 FADED = 2.0
-"""The number of standard deviations from which on values are no longer faded as noise."""
+"""The number of standard deviations above which values are not faded as noise."""
 
 
 def scalar_image(
@@ -35,32 +35,31 @@ def scalar_image(
     z: Real[ArrayLike, "nx ny"] | None = None,
     **kwargs: Any,
 ) -> AxesImage:
-    """Draw node values as an image: array axis 0 horizontal, one cell per node, transparent outside the mask.
+    """Draw nodal values as an image with array axis 0 horizontal and one cell per node, transparent outside the mask.
 
     Args:
         ax: the axes to draw on.
-        values: (*shape,), NaN where there is nothing to draw.
+        values: (*shape,), with NaN at nodes without a value.
         grid: the 2D grid of the values.
-        cmap: colour map; None: viridis, or a diverging one, red above and blue below, where there is a centre.
-        vmin: value of the first colour; None: from `quantiles`.
-        vmax: value of the last colour; None: from `quantiles`.
-        centre: value of the middle colour where vmin and vmax do not say, such as 1 for 4πt·HKS, which it is where the
-            metric is flat: the colours reach as far above it as below. Of values that are never negative they reach
-            down to 0 at most; if then most values would have one of the last colours, there is no centre.
-        quantiles: the values' quantiles that take the first and the last colour where vmin and vmax do not
-            say. The colour bar has arrows where values lie beyond.
-        least_range: the least difference between the last colour's value and the first's, relative to the larger.
-            A constant then looks constant, whatever its rounding or discretisation errors are.
+        cmap: the colour map, by default viridis or, with a centre, a diverging map with red above and blue below.
+        vmin: the value of the first colour, by default from `quantiles`.
+        vmax: the value of the last colour, by default from `quantiles`.
+        centre: the value of the middle colour unless vmin and vmax are given, such as 1 for 4πt·HKS, its value for a
+            flat metric. The colours reach equally far above and below. For values ≥ 0 they reach down to 0 at most;
+            there is no centre if most values would then have one of the last colours.
+        quantiles: the quantiles of the values with the first and the last colour, unless vmin and vmax are given. The
+            colour bar has arrows if values lie beyond.
+        least_range: the least difference of the values of the last and the first colour, relative to the larger. It
+            prevents colours from showing rounding or discretisation errors of a constant.
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
-        orientation: how the grid lies in space. The picture is then turned, has coordinates of space, and letters at
-            its edges.
-        z: (*shape,), how many standard deviations of noise the values are from what would be nothing
-            (`hks_jax.Uncertainty.z`): below `FADED` of them they fade into grey, which they are at 0.
-        **kwargs: passed to `Axes.imshow`.
+        orientation: the orientation of the grid in space, which turns the image and adds space coordinates and letters.
+        z: (*shape,) the distance of the values from a null value in standard deviations of noise
+            (`hks_jax.Uncertainty.z`). Values below `FADED` fade to grey, which they reach at 0.
+        **kwargs: arguments of `Axes.imshow`.
 
     Raises:
-        ValueError: a 3D grid, or values that are not of its shape or have nothing finite inside its mask.
+        ValueError: if the grid is 3D, or if the values have another shape or none of them is finite inside the mask.
     """
     require_plane("grid", grid)
     array = masked("values", values, grid)
@@ -100,22 +99,22 @@ def influence_map(
     label: str = "boundary's influence",
     **kwargs: Any,
 ) -> AxesImage:
-    """Draw the share of the HKS that the boundary decides at one time, with lines at a few levels.
+    """Draw the share of the HKS that is due to the boundary at one time, with contour lines.
 
     Args:
         ax: the axes to draw on.
-        influence: (*shape), one time of `hks_jax.boundary_influence`.
+        influence: (*shape) the result of `hks_jax.boundary_influence` at one time.
         grid: the 2D grid of the values.
-        levels: ascending, between 0 and 1.
-        cmap: colour map, from 0 to 1.
+        levels: the levels of the contour lines, ascending between 0 and 1.
+        cmap: the colour map from 0 to 1.
         label: the colour bar's label.
-        **kwargs: passed to `scalar_image`.
+        **kwargs: arguments of `scalar_image`.
 
     Returns:
         The image.
 
     Raises:
-        ValueError: a 3D grid, or values that are not of its shape.
+        ValueError: if the grid is 3D, or if the values have another shape.
     """
     values = masked("influence", influence, grid)
     image = scalar_image(ax, values, grid, cmap=cmap, vmin=0.0, vmax=1.0, label=label, **kwargs)
@@ -127,7 +126,7 @@ def influence_map(
 
 
 def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
-    """Return values on the grid, masked where they are not finite or outside its mask; raise if that is everywhere."""
+    """Return values with a mask where they are not finite or lie outside the grid's mask; raise if all are masked."""
     if isinstance(values, np.ma.MaskedArray):
         return values
     array = np.asarray(values, dtype=np.float64)
@@ -135,12 +134,12 @@ def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
         raise ValueError(f"{name}: got shape {array.shape}; expected the grid's shape {grid.shape}")
     masked = np.ma.array(array, mask=~(np.isfinite(array) & grid.inside))
     if masked.count() == 0:
-        raise ValueError(f"{name}: no finite value inside the grid's mask; nothing to draw")
+        raise ValueError(f"{name}: got no finite value inside the grid's mask; expected at least one")
     return masked
 
 
 class Colours(NamedTuple):
-    """The values of the first and the last colour, and the colour map unless another is asked for."""
+    """The values of the first and the last colour, and the default colour map."""
 
     low: float
     high: float
@@ -155,12 +154,12 @@ def colours_of(
     vmin: float | None = None,
     vmax: float | None = None,
 ) -> Colours:
-    """Return the colours of values; see `scalar_image`."""
+    """Return the colours of values by the rules of `scalar_image`."""
     low, high = (float(q) for q in np.quantile(values, quantiles))
     cmap = "viridis"
     if centre is not None:
         reach = max(high - centre, centre - low, 0.0)
-        if values.min() >= 0 < centre < reach:  # no colours for what is negative
+        if values.min() >= 0 < centre < reach:  # no colours for negative values
             reach = centre if np.median(values) <= 1.5 * centre else 0.0
         if reach or low == high:
             low, high, cmap = centre - reach, centre + reach, "RdBu_r"
@@ -170,7 +169,7 @@ def colours_of(
 
 
 def shared_colours(images: Sequence[np.ma.MaskedArray], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments of `scalar_image` by which all of these have the same colours for the same values."""
+    """Return arguments of `scalar_image` that give equal values in all these images the same colour."""
     values = np.concatenate([image.compressed() for image in images])
     names = ("quantiles", "least_range", "centre", "vmin", "vmax")
     low, high, own = colours_of(values, **{name: kwargs[name] for name in names if name in kwargs})

@@ -1,4 +1,4 @@
-"""Which side of a picture is left: arrays turned so that their axes run as nearly as they can along those of space."""
+"""The orientation of images: arrays are turned so that their axes are as close as possible to those of space."""
 
 from collections.abc import Sequence
 from itertools import permutations
@@ -14,23 +14,23 @@ from hks_jax.domain.grid import Grid
 
 View = Literal["neurological", "radiological"]
 LETTERS = ("LR", "PA", "IS")
-"""What lies at the low and the high end of the axes of space: left and right, back and front, foot and head."""
+"""The letters of the low and high ends of the space axes: left and right, back and front, foot and head."""
 
 
 class Orientation(NamedTuple):
-    """How the axes of an array run in space, and so how its picture is turned.
+    """The directions of an array's axes in space, by which its image is turned.
 
-    The picture does not depend on the order in which the voxels are stored. Of left to right, back to front and foot to
-    head, its horizontal axis is the earlier and its vertical axis the later; letters at its edges say which. Under the
-    radiological view left and right change sides.
+    The image does not depend on the storage order of the voxels. In the order left–right, back–front, foot–head its
+    horizontal axis precedes its vertical axis, and letters at its edges name the directions. The radiological view
+    swaps left and right.
 
     Attributes:
-        axes: for each axis of the picture, the array's axis.
-        turned: for each axis of the picture, whether the array's axis runs against it.
-        ends: for each axis of the picture, the letters of its low and its high end.
-        origin: for each axis of the picture, the coordinate of the array's first node. For voxels along the axes of
-            space these are the coordinates of space; for oblique voxels, coordinates along their own axes.
-        view: ``"neurological"``, left is on the left; or ``"radiological"``, left is on the right.
+        axes: the array's axis for each axis of the image.
+        turned: whether the array's axis has the opposite direction, for each axis of the image.
+        ends: the letters of the low and the high end, for each axis of the image.
+        origin: the coordinate of the array's first node, for each axis of the image. These are space coordinates for
+            voxels along the axes of space, and coordinates along the voxel axes for oblique voxels.
+        view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right).
     """
 
     axes: tuple[int, ...]
@@ -43,19 +43,19 @@ class Orientation(NamedTuple):
     def of(
         cls, affine: Real[ArrayLike, "4 4"], slice_axis: int | None = None, *, view: View = "neurological"
     ) -> "Orientation":
-        """Return the orientation of a volume, or of a slice of it.
+        """Return the orientation of a volume or of one of its slices.
 
         Args:
-            affine: (4, 4), voxel indices to coordinates that grow to the right, the front and the top, as NIfTI's do.
-            slice_axis: the axis that a slice cuts; None for a volume.
+            affine: (4, 4), maps voxel indices to coordinates that increase to the right, front and top, as in NIfTI.
+            slice_axis: the axis perpendicular to the slice; None for a volume.
             view: ``"neurological"`` or ``"radiological"``.
 
         Raises:
-            ValueError: an affine of another shape, singular or not finite; another axis or view.
+            ValueError: if the affine has another shape, is singular or not finite, or if axis or view are unknown.
         """
         matrix = np.asarray(affine, dtype=np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
-            raise ValueError(f"affine: got shape {matrix.shape}; expected (4, 4), finite, of three independent axes")
+            raise ValueError(f"affine: got shape {matrix.shape}; expected finite (4, 4) with independent axes")
         if slice_axis not in (None, 0, 1, 2):
             raise ValueError(f"slice_axis: got {slice_axis}; expected 0, 1, 2, or None for a volume")
         if view not in get_args(View):
@@ -63,7 +63,7 @@ class Orientation(NamedTuple):
         steps = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
 
         def nearness(order: tuple[int, ...]) -> tuple[float, ...]:
-            """Return how near the axes lie to those of space; where that decides nothing, where they point."""
+            """Return the closeness of the axes to those of space and, to break ties, their directions."""
             cosines = np.diag(steps[:, order])
             return tuple(np.round([np.abs(cosines).sum(), *(steps[:, order] * np.sign(cosines)).ravel()], 6).tolist())
 
@@ -80,9 +80,9 @@ class Orientation(NamedTuple):
         )
 
     def grid(self, grid: Grid) -> Grid:
-        """Return the grid of the picture for the grid of the array."""
+        """Return the grid of the image for the grid of the array."""
         if grid.dimension != len(self.axes):
-            raise ValueError(f"orientation: it is one of {len(self.axes)} axes, and the grid has {grid.dimension}")
+            raise ValueError(f"orientation: got {len(self.axes)} axes; expected {grid.dimension}, as for the grid")
         spacing = np.take(grid.spacing, self.axes)
         last = spacing * (np.take(grid.shape, self.axes) - 1)
         origin = np.array(self.origin) - np.where(self.turned, last, 0.0)
@@ -90,25 +90,25 @@ class Orientation(NamedTuple):
         return Grid(np.take(grid.shape, self.axes).tolist(), spacing.tolist(), origin.tolist(), mask, "all")
 
     def array(self, values: Any) -> Any:
-        """Return an array (*shape,) or (n_times, *shape), masked or not, as the picture has it."""
+        """Return an array (*shape,) or (n_times, *shape), masked or not, in the order of the image."""
         array = np.asanyarray(values)
         before = array.ndim - len(self.axes)
         array = array.transpose(*range(before), *(before + a for a in self.axes))
         return np.flip(array, tuple(before + a for a, turn in enumerate(self.turned) if turn))
 
     def tensors(self, values: Real[ArrayLike, "*shape d d"]) -> Real[np.ndarray, "*turned d d"]:
-        """Return tensors (*shape, d, d) as the picture has them, their components along its axes."""
+        """Return tensors (*shape, d, d) in the order of the image, with components along its axes."""
         signs = np.where(self.turned, -1, 1)
         components = np.moveaxis(np.asarray(values), (-2, -1), (0, 1))[np.ix_(self.axes, self.axes)]
         return np.moveaxis(self.array(components), (0, 1), (-2, -1)) * np.outer(signs, signs)
 
     def node(self, node: Sequence[int], shape: Sequence[int]) -> tuple[int, ...]:
-        """Return the indices in the picture of a node of the array, whose shape is given."""
+        """Return the image indices of a node of an array with the given shape."""
         turned = zip(self.axes, self.turned, strict=True)
         return tuple(shape[a] - 1 - node[a] if turn else node[a] for a, turn in turned)
 
     def letter(self, ax: Axes, plane: tuple[int, int] = (0, 1)) -> None:
-        """Write the letters at the edges of a picture of two axes, and turn it round under the radiological view."""
+        """Write the letters at the edges of an image of two axes, and mirror it for the radiological view."""
         horizontal, vertical = (self.ends[a] for a in plane)
         left, right, bottom, top = *horizontal, *vertical
         if self.view == "radiological" and horizontal == LETTERS[0]:

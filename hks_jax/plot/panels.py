@@ -1,4 +1,4 @@
-"""Figures of scalars on a plane over t: the HKS at each time, and several scalars, a row each."""
+"""Figures of scalars on a plane over t: the HKS at each time, and several scalars in one row each."""
 
 import math
 import os
@@ -32,24 +32,24 @@ def hks_panels(
     z: Real[ArrayLike, "n_times nx ny"] | None = None,
     **kwargs: Any,
 ) -> Figure:
-    """Return a figure with one image of the HKS per time, each with its own colour map unless `shared_range`.
+    """Return a figure with one image of the HKS per time, each with separate colours unless `shared_range` is set.
 
     Args:
-        values: (n_times, *shape), as `hks_jax.hks` returns them.
+        values: (n_times, *shape) the result of `hks_jax.hks`.
         times: (n_times,).
         grid: the 2D grid of the values.
-        titles: one per time; None: “t = …”.
-        unit: the unit of t, written after it.
+        titles: a title for each time, by default “t = …”.
+        unit: the unit of t, which follows its value.
         shared_range: whether all images use the colours of one range.
-        path: where to save the figure; None: nowhere.
+        path: the file in which to save the figure, if given.
         suptitle: the figure's title.
-        orientation: as for `scalar_image`.
-        z: (n_times, *shape), as for `scalar_image`: what noise could make fades.
-        **kwargs: passed to `scalar_image`, for all images, such as its cmap, vmin, vmax, centre, quantiles, least_range
+        orientation: the same as for `scalar_image`.
+        z: (n_times, *shape), by which values within the noise fade as in `scalar_image`.
+        **kwargs: arguments of `scalar_image` for all images, such as cmap, vmin, vmax, centre, quantiles, least_range
             and label.
 
     Raises:
-        ValueError: shapes that do not agree; no time at all.
+        ValueError: if shapes disagree or there is no time.
     """
     require_plane("grid", grid)
     t = checked_times(times, grid.shape, values=values)
@@ -70,7 +70,7 @@ def hks_panels(
 
 
 def axes_in_rows(figure: Figure, count: int, columns: int) -> list[Axes]:
-    """Return so many axes of a figure, in rows that are full but for the last."""
+    """Return a given number of axes of a figure in rows, which are full except for the last."""
     panels = figure.subplots(math.ceil(count / columns), columns, squeeze=False).ravel().tolist()
     for ax in panels[count:]:
         ax.remove()
@@ -88,26 +88,26 @@ def time_rows(
     quantiles: tuple[float, float] = (0.0, 1.0),
     suptitle: str = "",
 ) -> Figure:
-    """Return a figure with a row of images for each scalar and a column for each time, such as the HKS beside scalars.
+    """Return a figure with a row of images for each scalar and a column for each time.
 
     Args:
-        rows: the scalars by name, each (n_times, *shape), NaN where there is nothing to draw.
+        rows: the scalars (n_times, *shape) by name, with NaN at nodes without a value.
         times: (n_times,).
         grid: the 2D grid of the values.
         unit: the unit of t.
-        shared: which images share the colours of one range: ``"none"``, or those of each ``"row"``.
+        shared: the images that share one range of colours: ``"none"``, or those of each ``"row"``.
         cmap: a colour map, or one for each row by name.
-        quantiles: as for `scalar_image`.
+        quantiles: the same as for `scalar_image`.
         suptitle: the figure's title.
 
     Raises:
-        ValueError: no rows or times; values that are not one image per time; another `shared`.
+        ValueError: if there are no rows or times, if values are not one image per time, or if `shared` is unknown.
     """
     require_plane("grid", grid)
     if shared not in ("none", "row"):
         raise ValueError(f'shared: got {shared!r}; expected "none" or "row"')
     if not rows:
-        raise ValueError("rows: got none; expected one scalar or more")
+        raise ValueError("rows: got no scalars; expected at least one")
     t = checked_times(times, grid.shape, **{f"rows: {name}": values for name, values in rows.items()})
     width, height = panel_size(grid, 1.9)
     figure = new_figure(t.size * (width + 0.65) + 0.6, len(rows) * (height + 0.2) + 0.5 + 0.3 * bool(suptitle))
@@ -127,7 +127,7 @@ def time_rows(
 
 
 def checked_times(times: Any, shape: tuple[int, ...], **arrays: Any) -> Float[np.ndarray, " n_times"]:
-    """Return the times; raise ValueError unless there are some, and one value of each array per time and node."""
+    """Return the times; raise ValueError unless there is a time and each array has one value per time and node."""
     t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     for name, array in arrays.items():
         if array is not None and (np.shape(array) != (t.size, *shape) or t.ndim != 1 or t.size == 0):
@@ -139,7 +139,7 @@ def checked_times(times: Any, shape: tuple[int, ...], **arrays: Any) -> Float[np
 
 
 def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None, unit: str) -> Sequence[str]:
-    """Return a title for each time; raise ValueError for another number of them."""
+    """Return a title for each time; raise ValueError if the number of titles differs."""
     if titles is None:
         return [f"$t$ = {number_text(s)} {unit}".rstrip() for s in t]
     if len(titles) != t.size:
@@ -148,7 +148,7 @@ def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None,
 
 
 def _layout(n: int) -> tuple[int, int]:
-    """Return rows and columns for n panels: up to four in a row, rows evenly filled."""
+    """Return the numbers of rows and columns for n panels, with at most four per row and evenly filled rows."""
     if n <= 4:
         return 1, n
     columns = min(range(3, 6), key=lambda c: (-n % c, math.ceil(n / c)))

@@ -1,4 +1,4 @@
-"""The picture of a result: the signature over t, cropped to the domain and placed in space."""
+"""The figure of a result: its signature over t, cropped to the domain and oriented in space."""
 
 import math
 import os
@@ -20,18 +20,18 @@ from hks_jax.plot.panels import axes_in_rows, panel_titles
 from hks_jax.plot.volumes import volume_panels
 
 SPAN = (0.002, 0.998)
-"""The quantiles, away from the boundary, that the colours span."""
+"""The quantiles of the values away from the boundary that the first and last colours represent."""
 LABELS = {
     "raw": "HKS, in units of $t^{-3/2}$",
     "heat-trace": "HKS / heat trace, in units of $t^{-3/2}$",
     "volume": "HKS · volume",
     "flat": r"HKS · $(4\pi t)^{3/2}$",
 }
-"""The labels of the colours of a volume's picture; t has the unit of the squared lengths in the metric."""
+"""The labels of a volume's colour bars; t has the unit of squared lengths in the metric."""
 LEAST_RANGE = 0.01
-"""The least range of the colours, relative to the values: less contrast than this looks like what it is."""
+"""The least range of the colours relative to the values, below which contrast is not enhanced."""
 RIM = 5
-"""Nodes from the boundary. At small t it raises a Neumann signature up to fourfold: no colours would be left inside."""
+"""The least distance, in nodes, of values that set the colours from the boundary, which can raise the HKS fourfold."""
 
 
 def signature_panels(
@@ -44,23 +44,23 @@ def signature_panels(
     view: View = "neurological",
     through: tuple[int, int, int] | None = None,
 ) -> Figure:
-    """Return a figure of a signature for each time, with its own colours: a slice, or three slices of a volume.
+    """Return a figure of a signature on a slice, or on three slices of a volume, with separate colours for each time.
 
-    The colours span the values away from the boundary; arrows at a colour bar's ends say that some lie beyond. Under
-    "flat" normalisation they diverge from 1, which the signature is where the metric is flat. With error bars, what
-    noise could make of flat space fades.
+    The colours span the values away from the boundary, and a colour bar has arrows if other values lie beyond. With
+    "flat" normalisation they diverge from 1, the value for a flat metric. With error bars, deviations within the noise
+    fade.
 
     Args:
         result: the signature to draw.
         path: where to save the figure; None: nowhere.
-        titles: of a slice, one per time; None: “t = …”.
-        first: a title and a scalar (*shape,), drawn before the signature of a slice in grey.
-        title: of the whole picture of a slice.
-        view: what lies in space has left on the left (``"neurological"``) or on the right (``"radiological"``).
-        through: the voxel that slices run through, or the nearest one in the domain; None: one in the middle.
+        titles: a title for each time of a slice, by default “t = …”.
+        first: a title and a scalar (*shape,), drawn in grey before the signature of a slice.
+        title: the title of the whole figure of a slice.
+        view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right), for data in space.
+        through: the voxel through which slices run, or the nearest voxel in the domain; by default a central voxel.
 
     Raises:
-        ValueError: a result on a mesh.
+        ValueError: if the result is on a mesh.
     """
     volume, inside, z = result.volume, np.isfinite(result.values[0]), result.z
     grid, box = cropped(volume, inside)
@@ -69,7 +69,7 @@ def signature_panels(
     colours = _colours(result, inside)
     if volume.dimension == 3:
         node = None
-        if through is not None:  # the mask's thinnest parts are no part of the domain
+        if through is not None:  # the domain excludes the thinnest parts of the mask
             nodes, corner = np.argwhere(inside[box]), [part.start for part in box]
             node = nodes[np.argmin(np.sum((nodes + corner - through) ** 2, axis=1))].tolist()
         return volume_panels(
@@ -104,9 +104,9 @@ def signature_panels(
 
 
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
-    """Return for each time the colours, which span the values away from the boundary but for a few."""
+    """Return the colours for each time, which span nearly all values away from the boundary."""
     rim = normalise_boundary(result.settings["boundary"], inside.ndim)[-1]
-    # Under the mean the rim is like all else, but for its corners; in a volume but for the mask's thin parts, too.
+    # For "mean" the boundary is no exception, apart from its corners and, in a volume, thin parts of the mask.
     deep = inside if "mean" in rim and inside.ndim == 2 else away_from_rim(inside)
     span = (0.01, 0.99) if "mean" in rim else SPAN
     centre = 1.0 if result.settings["normalisation"] == "flat" else None
@@ -121,7 +121,7 @@ def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> 
 
 
 def placed(volume: TensorVolume, box: Sequence[slice] | None, view: View) -> Orientation | None:
-    """Return how a volume or slice, or a box of it, lies in space; None where that is not known."""
+    """Return the orientation of a box of a volume or slice, or None if it is not known."""
     if volume.affine is None:
         return None
     thin = volume.thin_axis if volume.dimension == 2 else None
@@ -133,21 +133,21 @@ def placed(volume: TensorVolume, box: Sequence[slice] | None, view: View) -> Ori
 
 
 def proportion(grid: Grid, orientation: Orientation | None) -> float:
-    """Return the height of a slice's picture relative to its width, within bounds that suit a figure."""
+    """Return the ratio of height to width of a slice's image, limited to a range that suits a figure."""
     shown = grid if orientation is None else orientation.grid(grid)
     width, height = np.multiply(shown.shape, shown.spacing)
     return float(np.clip(height / width, 0.3, 3.0))
 
 
 def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[slice, ...]:
-    """Return the slices that cut a box around the True entries, with a margin."""
+    """Return the slices of the bounding box of the True entries, with a margin."""
     (box,) = ndimage.find_objects(inside.astype(int))
     ends = zip(box, inside.shape, strict=True)
     return tuple(slice(max(part.start - margin, 0), min(part.stop + margin, n)) for part, n in ends)
 
 
 def away_from_rim(inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes over `RIM` nodes from the boundary, or over as many as leave a third of the nodes."""
+    """Mark the nodes at least `RIM` nodes from the boundary, or closer if less than a third would remain."""
     deep = inside
     for _ in range(RIM):
         smaller = ndimage.binary_erosion(deep)

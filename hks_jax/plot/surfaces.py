@@ -1,4 +1,4 @@
-"""Surfaces in space: those of meshes, coloured by a scalar, and those of equal value in a volume."""
+"""Surfaces in space: meshes coloured by a scalar, and isosurfaces of a volume."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -37,24 +37,24 @@ def surface(
     zoom: float = 1.25,
     **kwargs: Any,
 ) -> ScalarMappable:
-    """Draw a surface, or a solid's boundary, coloured by its vertices' values; return what a colour bar needs.
+    """Draw a surface, or the boundary of a solid, coloured by vertex values; return the mappable for a colour bar.
 
-    It is drawn without axes. The colours of a solid are those of what is seen of it.
+    The axes are hidden. The colours of a solid depend only on its visible part.
 
     Args:
-        ax: three-dimensional axes (``fig.add_subplot(projection="3d")``).
-        mesh: the surface, or a solid mesh; tens of thousands of triangles draw in a few seconds.
-        values: (V,), one per vertex; a triangle takes the mean of its three.
+        ax: three-dimensional axes, from ``fig.add_subplot(projection="3d")``.
+        mesh: a surface or solid mesh. Drawing tens of thousands of triangles takes a few seconds.
+        values: (V,) a value for each vertex. A triangle has the mean of its three values.
         cmap: colour map.
-        vmin: value of the first colour; None: the least.
-        vmax: value of the last colour; None: the greatest.
-        relief: how much darker a triangle is that faces away from the light: 0 … 1, 0 for colours alone.
-        light: the direction that light comes from.
+        vmin: the value of the first colour, by default the least value.
+        vmax: the value of the last colour, by default the greatest value.
+        relief: the strength of the shading between 0 and 1, where 0 means no shading.
+        light: the direction towards the light.
         zoom: the size of the surface in its axes.
-        **kwargs: passed to `Poly3DCollection`.
+        **kwargs: arguments of `Poly3DCollection`.
 
     Raises:
-        ValueError: values that are not of shape (V,).
+        ValueError: if the values do not have the shape (V,).
     """
     scalars = np.asarray(values, dtype=np.float64)
     if scalars.shape != (len(mesh.vertices),):
@@ -67,7 +67,7 @@ def surface(
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     direction = np.asarray(light) / np.linalg.norm(light)
-    # |n·l|: the orientation of a mesh's triangles does not matter.
+    # The absolute value |n·l| makes the orientation of triangles irrelevant.
     brightness = 1 - relief * (1 - np.abs(normals @ direction))
 
     mappable = ScalarMappable(Normalize(vmin, vmax), colormaps[cmap])
@@ -75,15 +75,15 @@ def surface(
     mappable.autoscale_None()
     colours = mappable.to_rgba(scalars[mesh.faces].mean(axis=1))
     colours[:, :3] *= brightness[:, None]
-    # Edges in the faces' colours close the hairlines that antialiasing leaves between triangles.
+    # Edges with the faces' colours hide the gaps that antialiasing causes between triangles.
     ax.add_collection3d(
         Poly3DCollection(corners, facecolors=colours, edgecolors=colours, **{"linewidths": 0.2, **kwargs})
     )
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # a flat surface has a box, too
+    thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # a flat surface also needs a box
     low, high = low - thin, high + thin
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # of the former its corners show
+    ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # a flat surface shows its corners
     ax.set_axis_off()
     return mappable
 
@@ -104,41 +104,41 @@ def isosurfaces(
     outline: bool = True,
     resolution: float = 200.0,
 ) -> ScalarMappable:
-    """Render surfaces of equal value on axes, seen from afar, and return what a colour bar needs.
+    """Render isosurfaces in parallel projection on axes, and return the mappable for a colour bar.
 
-    The rendering is an image in the axes, of the size that they have now. It needs PyVista
-    (``pip install "hks-jax[pyvista]"``) and, without a display, EGL or OSMesa.
+    The result is an image with the present size of the axes. Rendering needs PyVista (``pip install
+    "hks-jax[pyvista]"``) and, without a display, EGL or OSMesa.
 
     Args:
-        ax: two-dimensional axes; their frame and ticks are taken off.
-        values: (*shape,), NaN where there is nothing to draw. Surfaces end at elements with such a node.
+        ax: two-dimensional axes, whose frame and ticks are removed.
+        values: (*shape,), with NaN at nodes without a value. Surfaces end at elements with such a node.
         grid: the 3D grid of the values.
-        levels: the values of the surfaces, or how many, evenly between the first and the last colour's.
+        levels: the values of the surfaces, or the number of evenly spaced values between the first and the last colour.
         cmap: colour map.
-        vmin: value of the first colour; None: from `quantiles`.
-        vmax: value of the last colour; None: from `quantiles`.
-        quantiles: the values' quantiles that take the first and the last colour where vmin and vmax do not say.
-        opacity: of each surface, from 0 to 1.
+        vmin: the value of the first colour, by default from `quantiles`.
+        vmax: the value of the last colour, by default from `quantiles`.
+        quantiles: the quantiles of the values with the first and the last colour, unless vmin and vmax are given.
+        opacity: the opacity of each surface, above 0 and at most 1.
         view: the direction from the volume to the viewer; z is up.
         zoom: the size of the volume in its axes.
-        outline: whether to draw the grid's box, the rim of the mask if there is one, and the directions of the axes.
+        outline: whether to draw the grid's box, the boundary of a mask, and the directions of the axes.
         resolution: pixels per inch.
 
     Raises:
-        ImportError: PyVista is not installed.
-        ValueError: a grid that is not 3D, values that are not of its shape or nowhere finite, no level, an opacity
-            that is not between 0 and 1, a view along z or from nowhere.
+        ImportError: if PyVista is not installed.
+        ValueError: if the grid is not 3D, if the values have another shape or none is finite, if there is no level, if
+            the opacity is not in (0, 1], or if the view is zero or along z.
     """
     require_volume(grid)
     array = masked("values", values, grid)
     low, high, _ = colours_of(array.compressed(), quantiles, vmin=vmin, vmax=vmax)
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
-        raise ValueError(f"levels: got {levels}; expected a number from 1, or finite values")
+        raise ValueError(f"levels: got {levels}; expected a number of at least 1, or finite values")
     if not 0 < opacity <= 1:
-        raise ValueError(f"opacity: got {opacity}; expected more than 0 and at most 1")
+        raise ValueError(f"opacity: got {opacity}; expected a number in (0, 1]")
     if not np.isfinite(view).all() or np.hypot(view[0], view[1]) == 0:
-        raise ValueError(f"view: got {view}; expected a direction that is not along z")
+        raise ValueError(f"view: got {view}; expected a nonzero direction that is not along z")
     pyvista = optional("pyvista")
     with _quiet_about_displays():
         size = tuple(max(round(resolution * side), 64) for side in inches(ax))
@@ -171,9 +171,9 @@ def isosurfaces(
 
 
 def _domain(pyvista: ModuleType, array: np.ma.MaskedArray, grid: Grid) -> Any:
-    """Return the elements all of whose nodes have a value, with the values at their points."""
+    """Return the elements whose nodes all have a value, with the values at their points."""
     image = pyvista.ImageData(dimensions=grid.shape, spacing=grid.spacing, origin=grid.origin)
-    image.point_data["values"] = array.filled(0.0).ravel(order="F")  # VTK's first axis runs fastest
+    image.point_data["values"] = array.filled(0.0).ravel(order="F")  # VTK stores the first axis contiguously
     inside = active_elements(~np.ma.getmaskarray(array), (False,) * 3)
     return image.extract_cells(np.flatnonzero(inside.ravel(order="F")))
 
@@ -190,7 +190,7 @@ def _rim(pyvista: ModuleType, domain: Any) -> Any:
 
 @contextmanager
 def _quiet_about_displays() -> Iterator[None]:
-    """Keep VTK from writing that there is no display: it then takes EGL or OSMesa, which need none."""
+    """Suppress VTK's message that there is no display, because EGL or OSMesa need none."""
     from vtkmodules.vtkCommonCore import vtkLogger
 
     cutoff = vtkLogger.GetCurrentVerbosityCutoff()

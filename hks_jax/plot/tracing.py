@@ -1,8 +1,8 @@
 """Integral lines of the eigenvector fields of a 2D tensor field.
 
-An eigenvector has no sign, so its field is one of directions. The tensor, which has no such ambiguity, is
-interpolated bilinearly from the nodes; the direction at a point comes from the interpolated tensor in closed
-form, and its sign from the direction that the line had.
+An eigenvector has no sign, but the tensor is unambiguous. So the tensors at the nodes are interpolated bilinearly. The
+direction at a point follows from the interpolated tensor in closed form, and its sign from the line's previous
+direction.
 """
 
 from typing import Any, Literal
@@ -19,15 +19,15 @@ from hks_jax.plot.figure import frame, require_plane, side_in_inches
 
 Which = Literal["major", "minor"]
 
-# A line ends where (λ₁ − λ₂)/(λ₁ + λ₂) falls below this, or where it would turn by over 60° within a step.
+# A line ends where (λ₁ − λ₂)/(λ₁ + λ₂) falls below this, or where it would turn by more than 60° in a step.
 DEGENERATE = 1e-3
 LEAST_COSINE = 0.5
 
 
 class DirectionField:
-    """The major or minor eigenvector direction of a field at any point, NaN where there is none.
+    """The major or minor eigenvector direction of a field at any point, or NaN at degenerate points.
 
-    Major belongs to the larger eigenvalue of the field's tensors, whatever they mean.
+    The major direction belongs to the larger eigenvalue of the field's tensors, for metrics and diffusion tensors.
     """
 
     def __init__(self, field: TensorField, which: Which) -> None:
@@ -37,7 +37,7 @@ class DirectionField:
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
         self.which = which
-        # (a, b) = λ₁ − λ₂ times cosine and sine of twice the major angle; the trace makes it dimensionless.
+        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace makes it dimensionless.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
         components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
         components[~grid.inside] = np.nan
@@ -46,7 +46,7 @@ class DirectionField:
     def __call__(
         self, points: Float[np.ndarray, "n 2"], towards: Float[np.ndarray, "n 2"] | None = None
     ) -> Float[np.ndarray, "n 2"]:
-        """Return unit vectors (n, 2), within 90° of `towards`; NaN outside and at degenerate points."""
+        """Return unit vectors (n, 2) within 90° of `towards`, or NaN outside the domain and at degenerate points."""
         a, b, trace = self.interpolant(points).T
         with np.errstate(invalid="ignore"):
             angle = 0.5 * np.arctan2(b, a)
@@ -67,20 +67,20 @@ def trace(
     step: float | None = None,
     max_length: float | None = None,
 ) -> list[Float[np.ndarray, "m 2"]]:
-    """Return the integral lines through the seeds, each followed both ways.
+    """Return the integral lines through the seeds in both directions.
 
-    All lines advance at once, by fixed steps of the classical Runge–Kutta method. A line ends at the side of
-    the grid or the mask's rim, near a degenerate point, or at half of `max_length` from its seed.
+    All lines are computed at once with fixed steps of the classical Runge–Kutta method. A line ends at the boundary of
+    the domain, near a degenerate point, or at half of `max_length` from its seed.
 
     Args:
         field: a 2D field.
         seeds: (n, 2) coordinates.
         which: ``"major"`` (larger eigenvalue) or ``"minor"``.
-        step: arc length of a step in coordinates; None: half the smaller grid spacing.
-        max_length: longest arc length; None: eight times the longer side of the grid.
+        step: the arc length of a step in coordinates, by default half the smaller grid spacing.
+        max_length: the maximum arc length, by default eight times the longer side of the grid.
 
     Returns:
-        One (m, 2) array of points per seed, in order along the line; (0, 2) for a seed without a direction.
+        An (m, 2) array of consecutive points for each seed, or (0, 2) for a seed without a direction.
     """
     points = np.asarray(seeds, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
@@ -98,19 +98,19 @@ def evenly_spaced_lines(
     max_length: float | None = None,
     least_length: float | None = None,
 ) -> list[Float[np.ndarray, "m 2"]]:
-    """Return integral lines that cover the domain about `separation` (coordinates) apart.
+    """Return integral lines that fill the domain with a distance of about `separation`, in coordinates.
 
-    After Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997): the next line
-    starts as near as allowed to the lines there are, and each ends where it comes closer than half the
-    separation to another, or to itself. Circles close.
+    The method is that of Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). The next
+    line starts as close as allowed to the existing lines. A line ends where it is closer than half the separation to
+    another line or to itself. Circles are closed.
 
     Args:
         field: a 2D field.
         which: ``"major"`` or ``"minor"``.
-        separation: distance between neighbours where they start.
-        step: as for `trace`.
-        max_length: as for `trace`.
-        least_length: shorter lines are left out; None: twice the separation.
+        separation: the distance between neighbouring lines where they start.
+        step: the same as for `trace`.
+        max_length: the same as for `trace`.
+        least_length: the length below which lines are omitted, by default twice the separation.
     """
     if not separation > 0:
         raise ValueError(f"separation: got {separation}; expected a positive length in coordinates")
@@ -123,7 +123,7 @@ def evenly_spaced_lines(
     lines: list[np.ndarray] = []
     tree: cKDTree | None = None
     centre = np.array([0.5 * (a[0] + a[-1]) for a in field.grid.axes])
-    # The distance from each candidate to the lines so far; before the first, from a point near the middle.
+    # The distance from each candidate to the existing lines or, for the first line, to a point near the middle.
     distance = separation + np.linalg.norm(seeds - centre - 0.3 * separation, axis=1)
     free = np.array([len(f) > 0 for f in forward])
     while True:
@@ -143,10 +143,10 @@ def evenly_spaced_lines(
 
 
 def _grow(forward: np.ndarray, backward: np.ndarray, others: cKDTree | None, gap: float, step: float) -> np.ndarray:
-    """Cut a line where it comes nearer than `gap` to the others or to itself; join its ends if they meet."""
+    """Cut a line where it is closer than `gap` to the others or to itself; join its ends if they meet."""
     if others is not None:
         forward, backward = (half[: _first(others.query(half)[0] < gap)] for half in (forward, backward))
-    # Points this far apart along the line are not merely its neighbours.
+    # Points at this distance along the line are not mere neighbours on the line.
     lag = int(np.ceil(np.pi * gap / step)) + 1
     end = _first_return(forward, lag, gap)
     if end < len(forward):
@@ -160,7 +160,7 @@ def _grow(forward: np.ndarray, backward: np.ndarray, others: cKDTree | None, gap
 
 
 def _first_return(line: np.ndarray, lag: int, gap: float) -> int:
-    """Return the first index whose point lies within `gap` of one at least `lag` before it, or the length."""
+    """Return the first index whose point is within `gap` of a point at least `lag` earlier, or the line's length."""
     n = len(line)
     if n <= lag:
         return n
@@ -176,7 +176,7 @@ def _first(condition: np.ndarray) -> int:
 def _both_ways(
     direction: DirectionField, seeds: np.ndarray, step: float, n_steps: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Trace from each seed forwards and backwards; both halves begin with the seed, if it has a direction."""
+    """Trace from each seed forwards and backwards; both halves begin with the seed if it has a direction."""
     start = direction(seeds)
     points, heading = np.concatenate([seeds, seeds]), np.concatenate([start, -start])
     alive = np.flatnonzero(np.isfinite(heading[:, 0]))
@@ -231,21 +231,21 @@ def integral_lines(
     max_length: float | None = None,
     **kwargs: Any,
 ) -> LineCollection:
-    """Draw integral lines of an eigenvector field over whatever `ax` shows.
+    """Draw integral lines of an eigenvector field on `ax`.
 
     Args:
         ax: the axes to draw on.
         field: a 2D field.
         which: ``"major"``, the eigenvector of the larger eigenvalue of T, or ``"minor"``.
-        seeds: (n, 2) points that the lines go through; None: evenly spaced lines.
-        density: with evenly spaced lines, how dense: 1 leaves a 25th of the longer side between neighbours,
-            or more where the axes are small.
-        step: arc length of an integration step; None: half the smaller grid spacing.
-        max_length: longest arc length of a line; None: eight times the longer side.
-        **kwargs: passed to `matplotlib.collections.LineCollection` (``colors``, ``linewidths``, ``alpha``).
+        seeds: (n, 2) points on the lines, by default the seeds of evenly spaced lines.
+        density: the density of evenly spaced lines. At 1 their distance is 1/25 of the longer side or, on small axes,
+            more.
+        step: the arc length of an integration step, by default half the smaller grid spacing.
+        max_length: the maximum arc length of a line, by default eight times the longer side.
+        **kwargs: arguments of `matplotlib.collections.LineCollection` (``colors``, ``linewidths``, ``alpha``).
 
     Raises:
-        ValueError: a 3D field; options that do not exist; sizes that are not positive.
+        ValueError: if the field is 3D, an option is unknown, or a size is not positive.
     """
     require_plane("field", field.grid)
     if seeds is None:

@@ -1,4 +1,4 @@
-"""Scalars on volumes: three orthogonal slices through a node, and panels of them over time."""
+"""Scalars on volumes as three orthogonal slices through a node, at one time or at several."""
 
 import math
 import os
@@ -21,20 +21,20 @@ from hks_jax.plot.panels import checked_times, panel_titles
 
 AXES = "xyz"
 PLANES = ((0, 1), (0, 2), (1, 2))
-"""The axes of the three slices: horizontal, vertical."""
+"""The horizontal and vertical axes of the three slices."""
 _COLUMN, _COLUMNS = 2.3, 6
-"""The width of a column of slices, in inches, and how many are side by side."""
+"""The width of a column of slices in inches, and the maximum number of columns."""
 
 
 def middle_node(inside: Bool[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
-    """Return the node inside that is nearest to the middle of the nodes inside.
+    """Return the inside node that is nearest to the mean of all inside nodes.
 
     Raises:
-        ValueError: no node inside.
+        ValueError: if no node is inside.
     """
     nodes = np.argwhere(inside)
     if not len(nodes):
-        raise ValueError("inside: no node is; expected at least one")
+        raise ValueError("inside: got no node inside; expected at least one")
     extent = np.maximum(np.ptp(nodes, axis=0), 1)
     distance = np.sum(((nodes - nodes.mean(axis=0)) / extent) ** 2, axis=1)
     return tuple(nodes[np.argmin(distance)].tolist())
@@ -50,22 +50,21 @@ def orthogonal_slices(
     orientation: Orientation | None = None,
     **kwargs: Any,
 ) -> AxesImage:
-    """Draw the slices xy, xz and yz of a volume through a node, in the same colours, and return the last image.
+    """Draw the slices xy, xz and yz of a volume through a node in the same colours, and return the last image.
 
     Args:
         axes: three axes, for the planes xy, xz and yz in this order.
-        values: (*shape,), NaN where there is nothing to draw.
-        grid: the 3D grid of the values; its spacing makes the aspect.
-        node: indices (i, j, k) of the node; None: `middle_node` of the finite values.
-        cross: whether thin lines show where the other two slices are.
-        orientation: how the grid lies in space. The slices are then turned, have coordinates of space, and letters at
-            their edges.
-        **kwargs: passed to `scalar_image`, such as its cmap, vmin, vmax, centre and quantiles, which are those of the
-            whole volume.
+        values: (*shape,), with NaN at nodes without a value.
+        grid: the 3D grid of the values, whose spacing determines the aspect.
+        node: the indices (i, j, k) of the node, by default `middle_node` of the finite values.
+        cross: whether thin lines show the positions of the other two slices.
+        orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
+            letters.
+        **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
-        ValueError: not three axes, a grid that is not 3D, values that are not of its shape or nowhere finite, a node
-            out of range or where there is no value.
+        ValueError: if there are not three axes, if the grid is not 3D, if the values have another shape or none is
+            finite, or if the node is out of range or has no value.
     """
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
@@ -86,7 +85,7 @@ def _slices(
     z: np.ma.MaskedArray | None = None,
     **kwargs: Any,
 ) -> AxesImage:
-    """Draw the slices of values that are turned already, and return the last image."""
+    """Draw the slices of values that are already turned, and return the last image."""
     for ax, (first, second) in zip(axes, PLANES, strict=True):
         normal = 3 - first - second
         plane = (np.take(of, (first, second)).tolist() for of in (grid.shape, grid.spacing, grid.origin))
@@ -120,27 +119,27 @@ def volume_panels(
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "n_times nx ny nz"] | None = None,
 ) -> Figure:
-    """Return a figure with one column per time: three orthogonal slices of the HKS, and their colour bar.
+    """Return a figure with a column of three orthogonal slices of the HKS and a colour bar for each time.
 
     Args:
-        values: (n_times, *shape), as `hks_jax.hks` returns them.
+        values: (n_times, *shape) the result of `hks_jax.hks`.
         times: (n_times,).
         grid: the 3D grid of the values.
-        node: indices (i, j, k) of the node that the slices run through; None: `middle_node` of the finite values.
-        titles: one per time; None: “t = …”.
-        unit: the unit of t, written after it.
+        node: the indices (i, j, k) of a node on the slices, by default `middle_node` of the finite values.
+        titles: a title for each time, by default “t = …”.
+        unit: the unit of t, which follows its value.
         length_unit: the unit of the coordinates.
-        limits: the values of the first and the last colour, one pair per time; None: from `quantiles`.
-        path: where to save the figure; None: nowhere.
-        cmap: colour map, or one per time.
-        quantiles: those of each volume that take the first and the last colour.
+        limits: the values of the first and the last colour for each time, by default from `quantiles`.
+        path: the file in which to save the figure, if given.
+        cmap: a colour map, or one per time.
+        quantiles: the quantiles of each volume with the first and the last colour.
         label: the colour bars' label.
         suptitle: the figure's title.
-        orientation: as for `orthogonal_slices`.
-        z: (n_times, *shape), as for `hks_panels`: what noise could make fades.
+        orientation: the same as for `orthogonal_slices`.
+        z: (n_times, *shape), by which values within the noise fade as in `hks_panels`.
 
     Raises:
-        ValueError: shapes that do not agree; no time at all; what `orthogonal_slices` raises.
+        ValueError: if shapes disagree or there is no time, or as in `orthogonal_slices`.
     """
     require_volume(grid)
     t = checked_times(times, grid.shape, values=values)
@@ -206,34 +205,32 @@ def _label_slices(
 
 
 def _heights(grid: Grid) -> list[float]:
-    """Return the slices' heights in inches, when the widest of them is as wide as a column."""
+    """Return the slices' heights in inches if the widest slice has the width of a column."""
     sizes = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
     scale = _COLUMN / max(sizes[0], sizes[1])
     return [min(max(scale * sizes[second], 0.25), 3 * _COLUMN) for _, second in PLANES]
 
 
 def require_volume(grid: Grid) -> None:
-    """Raise if a grid is not three-dimensional."""
+    """Raise ValueError unless the grid is three-dimensional."""
     if grid.dimension != 3:
-        raise ValueError(
-            f"grid: got shape {grid.shape}; expected a grid of three dimensions. Use hks_panels in the plane"
-        )
+        raise ValueError(f"grid: got shape {grid.shape}; expected three dimensions. Use hks_panels for two dimensions")
 
 
 def _turned(
     array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
 ) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
-    """Return values, grid and node as the picture has them, the node being one with a value."""
+    """Return values, grid and node in the order of the image; raise ValueError if the node has no value."""
     if node is not None:
         inside, node = ~np.ma.getmaskarray(array), tuple(int(i) for i in node)
         if len(node) != 3 or not all(0 <= i < n for i, n in zip(node, grid.shape, strict=True)):
             raise ValueError(f"node: got {node}; expected three indices within the grid's shape {grid.shape}")
         if not inside[node]:
             raise ValueError(
-                f"node: {node} has no value; the one nearest to the middle that has is {middle_node(inside)}"
+                f"node: got {node}, which has no value; expected a node with one, such as {middle_node(inside)}"
             )
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)
         array, grid = orientation.array(array), orientation.grid(grid)
-    # One in the middle is sought in the picture: of two that are as near, the order of storage chooses none.
+    # The middle is determined in the image, so that ties do not depend on the storage order.
     return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else node

@@ -1,4 +1,4 @@
-"""How far the boundary of a domain reaches into its heat kernel signature."""
+"""The influence of a domain's boundary on its heat kernel signature."""
 
 from typing import Any
 
@@ -27,60 +27,59 @@ def boundary_influence(
     boundary: BoundarySpec = "neumann",
     solver: str | Eigensolver = "auto",
 ) -> Float[Array, "n_times *shape"]:
-    """Return what part of the heat kernel signature the boundary decides, (k_N − k_D)/(k_N + k_D).
+    """Return the share of the heat kernel signature that is due to the boundary, (k_N − k_D)/(k_N + k_D).
 
-    k_N and k_D are the signatures with natural and with Dirichlet conditions on the whole rim, that of a mask included;
-    k_N ≥ k_D. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t): 1 on the rim, 0 where no
-    heat has come back from it, whatever conditions are set there.
+    Here k_N ≥ k_D are the signatures with Neumann and with Dirichlet conditions on the whole boundary, also that of a
+    mask. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t). It is 1 on the boundary and 0
+    where the boundary has no effect yet, whatever its conditions are.
 
-    Differentiable with respect to the tensors. It takes the eigenpairs of two problems, which are also those of the
-    boundary ``"mean"``, whose signature is (k_N + k_D)/2.
+    The result is differentiable with respect to the tensors. Two problems are solved for eigenpairs. Together they are
+    the problem with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
 
     Args:
-        domain: the metric, 2D or 3D; or a mesh; or eigenpairs with the boundary ``"mean"``, which hold both problems.
+        domain: a metric in 2D or 3D, a mesh, or eigenpairs with the boundary ``"mean"``, which contain both problems.
         times: (n_times,) positive, in (metric length)².
-        k: how many eigenpairs of either problem; not with eigenpairs.
-        boundary: ``"neumann"`` or, the same here, ``"mean"``; on grids also ``"periodic"``, one for all axes or one per
-            axis. Not with eigenpairs.
-        solver: as for `eigenpairs`.
+        k: the number of eigenpairs of each problem; to be omitted if eigenpairs are given.
+        boundary: ``"neumann"`` or ``"mean"``, which mean the same here. On grids also ``"periodic"``, either one value
+            for all axes or one per axis. To be omitted if eigenpairs are given.
+        solver: the same as for `eigenpairs`.
 
     Returns:
-        (n_times, *shape), 0 … 1, without unit; NaN outside the mask.
+        (n_times, *shape), dimensionless numbers between 0 and 1; NaN outside the mask.
 
     Raises:
-        ValueError: another boundary, or other eigenpairs; a domain with no rim, or with no node off it; what
-            `eigenpairs` and `hks` refuse.
+        ValueError: if the boundary is invalid, if no or every node lies on it, or as in `eigenpairs` and `hks`.
 
     Warns:
-        AccuracyWarning: as `eigenpairs` and `hks` do.
+        AccuracyWarning: as in `eigenpairs` and `hks`.
     """
     if isinstance(domain, Eigenpairs):
         if k is not None or boundary != "neumann":
-            raise ValueError("k, boundary: eigenpairs have them already; leave them out")
+            raise ValueError("k, boundary: got values, but the eigenpairs determine both; omit them")
         if len(domain.pencil.parts) != 2:
-            raise ValueError('domain: got eigenpairs of another boundary than "mean"; compute them with that')
+            raise ValueError('domain: got eigenpairs of another boundary; compute them with boundary="mean"')
         times = resolved_times(domain, times)
         free, zero = (spectral_diagonal(domain.of_part(i), Heat(times)) for i in range(2))
     else:
         if k is None:
-            raise ValueError("k: got None; say how many eigenpairs of either problem to compute")
+            raise ValueError("k: got None; expected the number of eigenpairs to compute for each of the two problems")
         pencil = assemble(domain, _glued(domain, boundary))
         pairs = (eigenpairs(part, k, solver=solver, multiplet="complete") for part in pencil.parts)
         free, zero = (hks(each, times) for each in pairs)
-    # Rounding where both are equal, and truncation where both are small, may leave the interval.
+    # Rounding, where both are nearly equal, and truncation, where both are small, may cause values outside [0, 1].
     return jnp.clip((free - zero) / (free + zero), 0, 1)
 
 
 def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:
-    """Return the boundary that has the mean on all of the rim."""
+    """Return the boundary conditions with "mean" on every side that is not periodic."""
     if isinstance(domain, SimplicialMesh):
         if boundary not in ("neumann", "mean"):
-            raise ValueError(f'boundary: got {boundary!r}; a mesh takes "neumann" here')
+            raise ValueError(f'boundary: got {boundary!r}; expected "neumann" for a mesh')
         return "mean"
     sides = normalise_boundary(boundary, domain.grid.dimension)
     if not {condition for pair in sides for condition in pair} <= {"neumann", "mean", "periodic"}:
         raise ValueError(
-            f'boundary: got {boundary!r}; expected "neumann" or "periodic" for each axis: natural and Dirichlet '
-            "conditions on all sides that are not periodic are compared"
+            f'boundary: got {boundary!r}; expected "neumann" or "periodic" for each axis. Neumann and Dirichlet '
+            "conditions are compared on all sides that are not periodic"
         )
     return tuple("periodic" if pair == ("periodic", "periodic") else "mean" for pair in sides)

@@ -1,4 +1,4 @@
-"""How the kernel Φ C Φᵀ of a spectral function, C (k, k), is read: diagonal, columns, distances, flows."""
+"""Linear functionals of the kernel Φ C Φᵀ of a spectral function: its diagonal, columns, distances and flows."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -14,21 +14,21 @@ from hks_jax.linear.products import quadratic_forms
 
 
 class Contraction(eqx.Module):
-    """A reading of Φ C Φᵀ; what it depends on linearly is its leaves."""
+    """Values computed from the kernel Φ C Φᵀ with C (k, k). They are linear in the array leaves of this object."""
 
     @abstractmethod
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m *s n"]:
-        """Return the reading for each diagonal C = diag(weights)."""
+        """Return the values for each diagonal matrix C = diag(weights)."""
 
     @abstractmethod
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
     ) -> Float[Array, "m *s n"]:
-        """Return the reading for each symmetric C, negligible between functions that do not matter."""
+        """Return the values for each symmetric C. Its entries are negligible where neither row nor column matters."""
 
 
 class Diagonal(Contraction):
-    """(Φ C Φᵀ)(x, x)."""
+    """The diagonal (Φ C Φᵀ)(x, x) of the kernel."""
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m n"]:
         """Return Σᵢ cᵢ φᵢ(x)²."""
@@ -42,11 +42,11 @@ class Diagonal(Contraction):
 
 
 class _Bilinear(Contraction):
-    """Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x), for coefficients a (s, k) that are linear in the functions."""
+    """Sums Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x), whose coefficients a (s, k) are linear in the eigenfunctions."""
 
     @abstractmethod
     def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
-        """Return a."""
+        """Return the coefficients a (s, k)."""
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
         """Return Σᵢ cᵢ aᵢ φᵢ(x)."""
@@ -60,16 +60,16 @@ class _Bilinear(Contraction):
 
 
 class Applied(_Bilinear):
-    """Φ C Φᵀ w for functionals w.
+    """The products Φ C Φᵀ w of the kernel with functionals w.
 
     Attributes:
-        functionals: (s, n).
+        functionals: (s, n) the s functionals w.
     """
 
     functionals: Float[Array, "s n"]
 
     def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
-        """Return φᵢ·w."""
+        """Return the inner products φᵢ·w."""
         return _matmul(self.functionals, vectors.T)
 
 
@@ -78,19 +78,19 @@ class _FromSources(Contraction):
     sources: StaticArray = eqx.field(static=True)
 
     def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
-        """Return φᵢ(x_s) at the source nodes (flat node indices): 0 at Dirichlet nodes."""
+        """Return the values φᵢ(x_s) at the source nodes, given as flat indices; they are 0 at Dirichlet nodes."""
         degrees = self.space.degrees_of_freedom[self.sources.value]
         return jnp.where(degrees >= 0, vectors[:, degrees], 0).T
 
 
 class Columns(_FromSources, _Bilinear):
-    """(Φ C Φᵀ)(x_s, x) for source nodes x_s."""
+    """The columns (Φ C Φᵀ)(x_s, x) of the kernel for source nodes x_s."""
 
 
 class SquaredDistances(_FromSources):
-    """The squared distance that C induces from source nodes: C between φ(x) − φ(x_s) and itself, at all nodes x.
+    """The squared distances (φ(x) − φ(x_s))ᵀ C (φ(x) − φ(x_s)) between source nodes x_s and all nodes x.
 
-    The sum of squared differences: expanded, its terms would cancel to nothing at large times.
+    The differences are formed before they are squared, because the expanded terms would cancel at large times.
     """
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s nodes"]:

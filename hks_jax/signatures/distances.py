@@ -29,7 +29,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     Args:
         pairs: from `eigenpairs`.
         times: (n_times,) positive.
-        sources: node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers.
+        sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Returns:
         (n_times, n_sources, *shape) in 1/(metric length)^(d/2); NaN outside the mask.
@@ -43,19 +43,19 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
 
     Args:
         pairs: from `eigenpairs`.
-        sources: node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers.
+        sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Returns:
         (n_sources, *shape) in (metric length)^(2 − d/2); NaN outside the mask.
 
     Raises:
-        ValueError: sources out of range or outside the mask; a domain of several components; no positive eigenvalue.
+        ValueError: if a source is outside the domain, if it has several components, or if no eigenvalue is positive.
     """
     known = pairs.null_space_known or not is_traced(jax.lax.stop_gradient(pairs.eigenvalues))
     if known and pairs.n_null > 1:
         raise ValueError(
-            f"pairs: the domain has {pairs.n_null} components, and the biharmonic distance between two of them is "
-            "infinite; compute the eigenpairs of one component"
+            f"pairs: got eigenpairs of {pairs.n_null} components, between which the biharmonic distance is infinite; "
+            "expected one. Compute the eigenpairs of each component separately"
         )
     positive_range(pairs)
     return _distance(pairs, Power(jnp.full(1, -2.0, pairs.eigenvalues.dtype)), sources)[0]
@@ -63,41 +63,38 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
 
 def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, "m s *shape"]:
     squared = spectral_squared_distances(pairs, filters, source_indices(pairs, sources))
-    # The root has no derivative at distance zero; there the distance is set, with derivative zero.
+    # The square root is not differentiable at zero. Zero distances are set to the constant 0 with derivative 0.
     root = jnp.sqrt(jnp.where(squared == 0, 1, squared))
     return nan_outside(jnp.where(squared == 0, 0, root), pairs.space.domain)
 
 
 def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
-    """Return the eigenvalues times volume^(2/d), which scaling the metric does not change (Reuter et al. 2006).
-
-    NaN for pairs that are not kept.
-    """
+    """Return the scale-invariant eigenvalues λᵢ·volume^(2/d) (Reuter et al. 2006), or NaN if a pair is not kept."""
     values = pairs.eigenvalues
     if normalise:
         dimension = dimension_of(pairs, "ShapeDNA that is normalised")
         values = values * volume_of(pairs, "ShapeDNA that is normalised") ** (2 / dimension)
-    # NaN comes last: as 0·NaN it would reach the volume's derivative.
+    # NaN is inserted last because the product 0·NaN would otherwise enter the derivative of the volume.
     return nan_outside(values, pairs.kept)
 
 
 def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
-    """Return φᵢ(x)/√λᵢ for the positive λᵢ (Rustamov 2007); signs, and bases of multiple eigenvalues, are arbitrary.
+    """Return φᵢ(x)/√λᵢ for the positive λᵢ (Rustamov 2007), or NaN if a pair is not kept.
 
-    NaN for pairs that are not kept.
+    The signs and the bases of multiple eigenvalues are arbitrary.
     """
     positive_range(pairs)
-    n = pairs.n_null  # raises where that is not known
-    if not pairs.null_space_known:  # negative ones come first
+    n = pairs.n_null  # raises an error if the null space is not known
+    if not pairs.null_space_known:  # negative eigenvalues come first
         n = int((jax.lax.stop_gradient(pairs.eigenvalues) <= 0).sum())
     scaled = pairs.at_nodes[n:] / jnp.sqrt(jnp.where(pairs.kept, pairs.eigenvalues, 1)[n:, None])
     return pairs.space.extend(nan_outside(scaled, pairs.kept[n:, None]))
 
 
 MARGIN = 10.0
-"""How many times what lies beyond k a kernel must be: its logarithm is then off by at most about 0.1."""
+"""The least ratio of a kernel to its truncation error. The error of its logarithm is then at most about 0.1."""
 GRID_LIMIT = 0.1
-"""The largest relative error of a squared distance that the spacing may cause."""
+"""The largest relative error of a squared distance that is accepted from the grid spacing."""
 
 
 def varadhan_distance(
@@ -105,41 +102,40 @@ def varadhan_distance(
 ) -> Float[Array, "n_times n_sources *shape"]:
     """Estimate the geodesic distance by Varadhan's formula: d(x_s, x)² is the limit of −4t log k_t(x_s, x) as t → 0.
 
-    Varadhan 1967; Zobel, Reininghaus and Hotz, section 2. At a positive t the kernel is (4πt)^(−n/2) exp(−d²/4t)
-    (u₀ + O(t)) in n dimensions. Divided by its diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), it has no power of t
-    before it: the error of d² is −4t log u₀ + O(t²), none on a flat domain away from its sides. The formula as it
-    stands errs by 2nt log 4πt besides.
+    See Varadhan 1967 and Zobel, Reininghaus and Hotz, section 2. At a time t > 0 the kernel in n dimensions is
+    (4πt)^(−n/2) exp(−d²/4t) (u₀ + O(t)). Normalisation by the diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), removes
+    the power of t. The error of d² is then −4t log u₀ + O(t²), which vanishes on a flat domain away from its boundary.
+    Without normalisation the error has the further term 2nt log 4πt.
 
-    Small times need fine grids and many pairs: linear elements with neighbours at the distance h err by d²h²/48t² of
-    d², and exp(−d²/4t) must stand out from the part beyond k and from rounding. Where the kernel's estimated error
-    exceeds a tenth of it, or the grid's error of d² a tenth, the result is NaN. Larger times reach further, at the cost
-    of an error that grows with t.
+    Small times need fine grids and many pairs: linear elements with node spacing h have the relative error h²d²/48t² of
+    d², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated relative
+    error of the kernel or the grid's relative error of d² exceeds 0.1. Larger times reach further, but with larger
+    errors.
 
     Args:
-        pairs: from `eigenpairs`; more of them reach further. Distances are those within the domain: around holes of its
-            mask, across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
-        times: (n_times,) positive, in (metric length)²; about d·h for distances d.
-        sources: node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers (n_sources,).
-        normalised: whether to divide by the diagonal. False is the formula as it stands, which depends on the unit of
-            length and has no root, NaN, where k_t > 1.
+        pairs: the result of `eigenpairs`; more pairs reach further. Paths stay in the domain: they go around holes of
+            its mask and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
+        times: (n_times,) positive, in (metric length)²; a time of about d·h suits the distance d.
+        sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
+        normalised: whether to divide by the diagonal. Otherwise the result depends on the length unit and is NaN where
+            k_t > 1.
 
     Returns:
-        (n_times, n_sources, *shape) in metric length; if normalised, 0 at the source. NaN outside the mask, at
-        Dirichlet nodes, and where times, pairs and grid do not resolve the distance.
+        (n_times, n_sources, *shape) in metric length. Normalised distances are 0 at the source. NaN outside the mask,
+        at Dirichlet nodes and where the distance is not resolved.
 
     Raises:
-        ValueError: bad times; sources out of range, outside the mask or at Dirichlet nodes.
+        ValueError: if times are invalid or if a source is out of range, outside the mask or at a Dirichlet node.
 
     Warns:
-        AccuracyWarning: how many distances are NaN, and what limits them; and as `hks`, times too small for k or
-            for the grid.
+        AccuracyWarning: if distances are NaN, with the cause, or if times are too small for k or for the grid.
     """
     times = resolved_times(pairs, times)
     nodes, space = source_indices(pairs, sources), pairs.space
     if not space.free.ravel()[nodes].all():
-        raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is zero; choose others")
+        raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is 0; expected others")
 
-    # Zero, not NaN, outside the mask: as 0·NaN it would reach the derivatives.
+    # Values outside the mask are 0, because NaN would enter the derivatives as the product 0·NaN.
     kernel = jnp.where(space.domain, spectral_columns(pairs, Heat(times), nodes), 0)
     diagonal = jnp.where(space.domain, spectral_diagonal(pairs, Heat(times)), 0)
     scale = _broadcast(diagonal.reshape(times.size, -1)[:, nodes], space) * diagonal[:, None]
@@ -149,7 +145,7 @@ def varadhan_distance(
     _warn_of_distance(pairs, times, relative, by_pairs, by_grid)
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
-        # At distance zero the root has no derivative, and rounding may leave the kernel just off 1: there it is set.
+        # At distance zero the root has no derivative and the kernel may differ from 1 by rounding, so the value is set.
         numbers = np.arange(space.domain.size).reshape(1, *space.node_shape)
         zero = (relative >= 1) | (numbers == _broadcast(nodes, space))[None]
     else:
@@ -161,17 +157,18 @@ def varadhan_distance(
 
 
 def _broadcast(values: Any, space: FunctionSpace) -> Any:
-    """Give values, one for each source or time, an axis of length one for each of the nodes'."""
+    """Append axes of length one for the nodes to values that belong to sources or times."""
     return values.reshape(*values.shape, *[1] * len(space.node_shape))
 
 
-# What truncation, inexact eigenvectors and rounding leave in the normalised kernel is, by Cauchy and Schwarz, about
-# what they leave in the diagonal: the tail's share, and the mean of the residuals, weighted as in the trace.
+# By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as those of its diagonal. They
+# are the tail's share, from truncation, and the mean of the residuals with the weights of the trace.
 #
 # Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
-# kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴: of
-# first order in h² the squared distance errs by d²h² (d² − 4t)/48t². Lumped, it is −d²h² (d² − 12t)/48t².
-# Where it matters, d² is several t, and it is d²h²/48t² of d²: with d² = 4t log 1/k, h²/12t · log 1/k.
+# kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To
+# first order in h² the error of the squared distance is d²h² (d² − 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped
+# mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which is h²/12t ·
+# log 1/k with d² = 4t log 1/k.
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
@@ -179,14 +176,12 @@ def _least_kernels(
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
-        raise ValueError(
-            "pairs: the distance needs the spacing of nodes, which is known of grids and linear elements alone"
-        )
+        raise ValueError("pairs: got eigenpairs without the needed node spacing; expected a grid or linear elements")
     weights = jnp.where(pairs.kept[None], jnp.exp(-times[:, None] * pairs.eigenvalues[None]), 0)
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
-    # The spacing along the way is not known: that at its ends, or the domain's mean if that is larger.
+    # The spacing along the geodesic is not known. Use the spacing at its ends, or the domain's mean if it is larger.
     along = jnp.maximum(
         jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )
@@ -197,7 +192,7 @@ def _least_kernels(
 def _warn_of_distance(
     pairs: Eigenpairs, times: Float[Array, " m"], relative: Array, by_pairs: Array, by_grid: Array
 ) -> None:
-    """Warn (AccuracyWarning) of nodes that are too far, where values are concrete."""
+    """Issue an AccuracyWarning if nodes are too far from a source and values are concrete."""
     relative, by_pairs, by_grid = jax.lax.stop_gradient((relative, by_pairs, by_grid))
     if is_traced((relative, by_pairs, by_grid)):
         return
@@ -209,6 +204,6 @@ def _warn_of_distance(
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
             f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
-            f"{float(times[worst]):.4g}: so far from a source the heat kernel is not resolved. Use larger times, or "
-            f"{remedy}"
+            f"{float(times[worst]):.4g}, too far from a source for the heat kernel to be resolved. Use larger times "
+            f"or {remedy}"
         )

@@ -1,4 +1,4 @@
-"""Filters f(λ): what a spectral function makes of the eigenvalues, with divided differences free of cancellation."""
+"""Filters, which are functions f(λ) of the eigenvalue, and their divided differences without cancellation."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -16,8 +16,8 @@ Function = Callable[[Array], Array]
 def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return f[a, b] = (f(b) − f(a))/(b − a) for a ≤ b, and f'(a) where they are equal.
 
-    The difference quotient loses digits where a and b are near; the mean of f' over the interval by Gauss quadrature,
-    which is the same number, does where they are far apart. `_mean_or_quotient` chooses.
+    This is also the mean of f' over the interval. The difference quotient is inaccurate where a and b are close, and
+    Gauss quadrature of the mean where they are far apart. `_mean_or_quotient` chooses between them.
     """
     gap = high - low
     slope = _derivative(f)
@@ -30,7 +30,8 @@ def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, 
 #
 #     f[a, b, c] = ∫₀¹ s ∫₀¹ f''(a + s (b − a) + s u (c − b)) du ds,
 #
-# by Gauss quadrature for both. It is also (f[b, c] − f[a, b])/(c − a), which loses digits where all three are near.
+# which is computed by Gauss quadrature in both variables. The equal (f[b, c] − f[a, b])/(c − a) is inaccurate for close
+# a, b, c.
 def second_divided_difference(
     f: Function,
     low: Float[Array, "*n"],
@@ -42,13 +43,13 @@ def second_divided_difference(
 ) -> Float[Array, "*n"]:
     """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where they are equal, given f[a, b] and f[b, c].
 
-    The scale is the largest magnitude of f' or [f]. The result is accurate to its rounding: where f' is much smaller,
-    it may still have errors of that size, 1 − tanh² for example.
+    The scale is the largest magnitude of f' or [f]. The error of the result is about the rounding error of the scale,
+    also where f' is much smaller, as for f' = 1 − tanh².
     """
     curvature = _derivative(_derivative(f))
 
     def triangle(n: int) -> Array:
-        # All points at once: one by one, they would take the compiler long.
+        # Evaluating all points at once shortens compilation.
         nodes, weights = (np.asarray(numbers) for numbers in gauss(n))
         s = jnp.asarray(np.repeat(nodes, n), low.dtype).reshape(-1, *(1,) * low.ndim)
         u = jnp.asarray(np.tile(nodes, n), low.dtype).reshape(s.shape)
@@ -66,14 +67,14 @@ def _mean_or_quotient(
     change: Float[Array, "*n"],
     size: Float[Array, "..."],
 ) -> Float[Array, "*n"]:
-    """Return the mean where two quadrature rules for it and the quotient agree as far as each can; else the quotient.
+    """Return the mean if two quadrature rules and the quotient agree to within their errors, otherwise the quotient.
 
-    The quotient is the change, the difference of two terms of a given size, over the gap.
+    The quotient is the change over the gap. The change is the difference of two terms of the given size.
     """
     eps = jnp.finfo(gap.dtype).eps
     apart = gap > 0
     smooth = jnp.abs(fine - coarse) * gap <= eps * size
-    # Both rules may miss a sharp transition; the quotient does not.
+    # Both rules may miss a sharp transition, which the quotient includes.
     smooth &= jnp.abs(fine * gap - change) <= jnp.sqrt(eps) * size
     return jnp.where(~apart | smooth, fine, change / jnp.where(apart, gap, 1))
 
@@ -98,9 +99,9 @@ def _mean(function: Function, low: Array, gap: Array, n: int) -> Array:
 
 
 class Filter(eqx.Module):
-    """A function f(λ) of the eigenvalue, elementwise; its parameters are array leaves, all of them differentiable.
+    """An elementwise function f(λ) of the eigenvalue. Its parameters are differentiable array leaves.
 
-    Several filters at once are one filter whose leaves have a leading axis, as `jax.vmap` takes it.
+    Several filters are stored as one filter whose leaves have a leading axis, for `jax.vmap`.
     """
 
     @abstractmethod
@@ -123,7 +124,7 @@ def _mean_decay_jvp(
     primals: tuple[Float[Array, "*n"]], tangents: tuple[Float[Array, "*n"]]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     def free_of_cancellation(y: Array) -> Array:
-        """Return the same; where y is small, its derivatives by quadrature."""
+        """Return the mean of exp(−sy), with derivatives by quadrature where y is small."""
         small = y < 1
         nodes, weights = gauss(8)
         near = sum(w * jnp.exp(-s * jnp.where(small, y, 0)) for s, w in zip(nodes, weights, strict=True))
@@ -134,7 +135,7 @@ def _mean_decay_jvp(
 
 
 class Heat(Filter):
-    """exp(−λt), of heat diffusing for the time t."""
+    """The filter exp(−λt) of heat diffusion for the time t."""
 
     time: Float[Array, "*m"]
 
@@ -149,7 +150,7 @@ class Heat(Filter):
 
 
 class Wave(Filter):
-    """exp(−(e − log λ)²/2σ² − c) for λ > 0, of the wave kernel signature at energy e; 0 at λ = 0."""
+    """The filter exp(−(e − log λ)²/2σ² − c) of the wave kernel signature at energy e; it is 0 at λ = 0."""
 
     energy: Float[Array, "*m"]
     sigma: Float[Array, "*m"]
@@ -157,7 +158,7 @@ class Wave(Filter):
 
     @jax.jit
     def __call__(self, x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the bell of log x."""
+        """Return the Gaussian function of log x."""
         positive = x > 0
         logarithm = jnp.log(jnp.where(positive, x, 1))
         bell = jnp.exp(-jnp.square((self.energy - logarithm) / self.sigma) / 2 - self.offset)
@@ -165,7 +166,7 @@ class Wave(Filter):
 
 
 class Power(Filter):
-    """λ^p for λ > 0; 0 at λ = 0."""
+    """The filter λ^p for λ > 0, which is 0 at λ = 0."""
 
     exponent: Float[Array, "*m"]
 
@@ -191,7 +192,7 @@ class Custom(Filter):
 
 
 class Derivative(Filter):
-    """The derivative of a filter along a direction in its parameters: with Heat(t) and Heat(1), −λ exp(−λt)."""
+    """The derivative of a filter in a direction of its parameters: −λ exp(−λt) for Heat(t) in the direction Heat(1)."""
 
     filter: Filter
     direction: Filter

@@ -1,4 +1,4 @@
-"""Heat flow of functions on a domain, and the scale space that it makes."""
+"""Heat flow of functions on a domain and the scale space that the flow generates."""
 
 import math
 from typing import Any
@@ -23,33 +23,32 @@ from hks_jax.traced import is_traced
 def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_times *functions_and_shape"]:
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
-    Anisotropic where the metric is. Differentiable with respect to the functions, the times and the tensors.
+    The diffusion is anisotropic where the metric is. The result is differentiable by functions, times and tensors.
 
     Args:
-        pairs: from `eigenpairs`. Their boundary conditions hold for u, too: with ``"dirichlet"`` its values there are
-            not used. With ``"mirror"`` and ``"mean"`` u is continued evenly, which is the flow with ``"neumann"``
-            there.
+        pairs: the result of `eigenpairs`. Their boundary conditions also hold for u. Values of u at Dirichlet nodes are
+            not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as ``"neumann"``.
         times: (n_times,) positive, in (metric length)².
-        functions: (*shape), or several (…, *shape); values outside the mask are not used.
+        functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
 
     Returns:
         (n_times, *functions.shape); NaN outside the mask, 0 at Dirichlet nodes.
 
     Raises:
-        ValueError: times that are not positive; functions of another shape, or not finite inside the mask.
+        ValueError: if a time is not positive, or if a function has another shape or is not finite inside the mask.
 
     Warns:
-        AccuracyWarning: the part of a function beyond the k pairs has not decayed at some time to 1 % of its norm.
+        AccuracyWarning: if the part of a function beyond the k pairs exceeds 1 % of its norm at some time.
     """
     times, shape = times_of(pairs, times), pairs.space.node_shape
     require_real("functions", functions)
     u = jnp.asarray(functions, times.dtype)
     if u.shape[u.ndim - len(shape) :] != shape:
-        raise ValueError(f"functions: got shape {u.shape}; expected {shape}, or more axes before it")
+        raise ValueError(f"functions: got shape {u.shape}; expected {shape}, with optional leading axes")
     if not is_traced(u):
         lacking = int((~np.isfinite(np.asarray(u))[..., pairs.space.free]).sum())
         if lacking:
-            raise ValueError(f"functions: {lacking} values inside the mask are NaN or infinite; expected finite ones")
+            raise ValueError(f"functions: got {lacking} NaN or infinite values inside the mask; expected finite values")
     rows = jnp.where(pairs.space.domain, u, 0).reshape(-1, *shape)
     _warn_if_truncated(pairs, times, rows)
     return spectral_flow(pairs, Heat(times), rows).reshape(*times.shape, *u.shape)
@@ -73,30 +72,30 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
         enough = np.log(share / TAIL_LIMIT) / rate
         warn_of_accuracy(
             f"times: the heat flow at t = {float(jnp.min(times)):.4g} lacks up to {left:.1%} of a function's norm, "
-            f"which lies beyond the computed eigenpairs. Use times from about {enough:.4g}, or more eigenpairs",
+            f"which lies beyond the computed eigenpairs. Use times of at least {enough:.4g}, or more eigenpairs",
         )
 
 
 def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape"]]:
     """Return the trace, the determinant and the anisotropy of the tensors at the nodes.
 
-    The anisotropy is (λ₁ − λ₂)/(λ₁ + λ₂) in 2D and the fractional anisotropy (Basser and Pierpaoli 1996) in 3D, both 0
-    for multiples of the identity and below 1.
+    The anisotropy is (λ₁ − λ₂)/(λ₁ + λ₂) in 2D and the fractional anisotropy (Basser and Pierpaoli 1996) in 3D. Both
+    are below 1, and 0 for multiples of the identity.
 
     Args:
-        field: the tensors on a grid. Of an array T (*shape, d, d) take ``TensorField(Grid(shape), T)``; of diffusion
-            tensors D, whose invariants are not those of the metric, ``TensorField(grid, D)`` or
+        field: the tensors on a grid. Pass ``TensorField(Grid(shape), T)`` for an array T (*shape, d, d). For diffusion
+            tensors D, whose invariants differ from those of the metric, pass ``TensorField(grid, D)`` or
             ``from_diffusion(grid, D, "tensor")``.
 
     Returns:
-        ``"trace"``, ``"determinant"`` and ``"anisotropy"``, each (*shape), NaN outside the mask; on the host.
+        ``"trace"``, ``"determinant"`` and ``"anisotropy"``, each a NumPy array (*shape) with NaN outside the mask.
 
     Raises:
-        TypeError: anything but a field.
+        TypeError: if the argument is not a tensor field.
     """
     if not isinstance(field, TensorField):
         raise TypeError(
-            f"field: got {type(field).__name__}; expected hks_jax.TensorField. Of an array T (*shape, d, d) pass "
+            f"field: got {type(field).__name__}; expected hks_jax.TensorField. For an array T (*shape, d, d), pass "
             "TensorField(Grid(shape), T)"
         )
     tensors = np.asarray(field.domain_tensors, np.float64)
@@ -112,21 +111,21 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
 def gaussian_scale_space(
     field: TensorField, times: Any, functions: Any
 ) -> Float[np.ndarray, "n_times *functions_and_shape"]:
-    """Blur functions by Gaussians, the same in all directions and everywhere, as far as heat spreads on average.
+    """Blur functions by an isotropic Gaussian that is as wide everywhere as the mean spread of heat.
 
-    In coordinates the standard deviation is √(2t/s), s the mean of |T|^(1/d) over the domain. Division by the
-    blurred mask and reflection at the sides of the grid keep constants as they are.
+    In coordinates the standard deviation is √(2t/s), where s is the mean of |T|^(1/d) over the domain. Division by the
+    blurred mask and reflection at the sides of the grid preserve constant functions.
 
     Args:
         field: the metric, for its scale, its grid and its mask.
         times: (n_times,) positive, in (metric length)².
-        functions: (*shape), or several (…, *shape); values outside the mask are not used.
+        functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
 
     Returns:
-        (n_times, *functions.shape), NaN outside the mask; on the host.
+        A NumPy array (n_times, *functions.shape) with NaN outside the mask.
 
     Raises:
-        ValueError: times that are not positive; functions of another shape.
+        ValueError: if a time is not positive, or if the functions have another shape.
     """
     grid, d = field.grid, field.grid.dimension
     require_real("times", times)
@@ -135,7 +134,7 @@ def gaussian_scale_space(
     if t.ndim != 1 or not (np.isfinite(t) & (t > 0)).all():
         raise ValueError(f"times: got {times}; expected a vector of positive numbers")
     if u.shape[u.ndim - d :] != grid.shape:
-        raise ValueError(f"functions: got shape {u.shape}; expected {grid.shape}, or more axes before it")
+        raise ValueError(f"functions: got shape {u.shape}; expected {grid.shape}, with optional leading axes")
     inside = grid.inside
     determinant = np.linalg.det(np.asarray(field.domain_tensors, np.float64)[inside])
     scale = float(np.mean(determinant ** (1 / d)))
@@ -146,7 +145,7 @@ def gaussian_scale_space(
 def _blur(u: np.ndarray, inside: np.ndarray, sigma: float, spacing: tuple[float, ...]) -> np.ndarray:
     weight = inside.astype(float)
     for axis, h in enumerate(spacing):
-        # Three times the side, and nothing varies any more; wider kernels only take longer.
+        # Three times the side blurs any function to a constant; wider kernels only take longer.
         nodes = min(sigma / h, 3.0 * inside.shape[axis])
         weight = scipy.ndimage.gaussian_filter1d(weight, nodes, axis=axis, mode="mirror")
         u = scipy.ndimage.gaussian_filter1d(u, nodes, axis=axis - len(spacing), mode="mirror")

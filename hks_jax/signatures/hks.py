@@ -1,4 +1,4 @@
-"""The heat kernel signature, each time by the method that reaches it: eigenpairs for the large, none for the small."""
+"""The heat kernel signature, computed from eigenpairs at large times and without eigenpairs at small times."""
 
 import math
 import warnings
@@ -23,23 +23,24 @@ from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, 
 from hks_jax.traced import is_traced
 
 _DEARER = 10.0
-"""The most work of the comparison, as a multiple of the work of the times that need it."""
+"""The maximum work of comparing both methods at one time, relative to the work of the spectrum-free times."""
 
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
 HKSMethod = Literal["spectral", "spectrum-free", "auto"]
 
 
 class AutomaticHKS(eqx.Module):
-    """A signature whose times come from two methods, and how they agree.
+    """A signature that is computed by two methods, each at some of the times, and the agreement of the methods.
 
     Attributes:
         values: (n_times, *shape).
         times: (n_times,).
-        spectral: (n_times,) bool, which times are from the eigenpairs; the others are spectrum-free.
-        tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), which decided.
-        method: what the other times were computed by: ``"colouring"``, ``"selected-inversion"``, or ``"none"``.
-        overlap_time: a time that both computed, NaN where there is none: the shortest from the eigenpairs.
-        overlap_difference: the greatest difference there, relative to (4πt)^(−d/2).
+        spectral: (n_times,) bool, true at times computed from eigenpairs, false at spectrum-free times.
+        tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), by which the method was chosen.
+        method: the method of the spectrum-free times: ``"colouring"``, ``"selected-inversion"`` or, without any,
+            ``"none"``.
+        overlap_time: the shortest time of the eigenpairs, which was computed by both methods; NaN if no time was.
+        overlap_difference: the greatest difference of the two methods at that time, relative to (4πt)^(−d/2).
     """
 
     values: Float[Array, "n_times *shape"]
@@ -51,7 +52,7 @@ class AutomaticHKS(eqx.Module):
     overlap_difference: Float[Array, ""]
 
     def summary(self) -> str:
-        """Say in a few lines which times came from where, and how the two agree."""
+        """Return a few lines of text with the times of each method and the difference between the methods."""
         times, spectral = np.asarray(self.times), np.asarray(self.spectral)
         lines = []
         for name, which in (("eigenpairs", spectral), (self.method, ~spectral)):
@@ -61,7 +62,7 @@ class AutomaticHKS(eqx.Module):
                 lines.append(f"{len(some)} of {times.size} times by {name}: {listed}")
         if math.isfinite(float(self.overlap_time)):
             lines.append(
-                f"both at t = {float(self.overlap_time):.4g}: they differ by {float(self.overlap_difference):.1e}"
+                f"at t = {float(self.overlap_time):.4g} the two methods differ by {float(self.overlap_difference):.1e}"
             )
         return "\n".join(lines)
 
@@ -81,22 +82,22 @@ def hks(
         pairs: from `eigenpairs`.
         times: (n_times,) positive, in (metric length)².
         normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
-            domain's area or volume (→ 1 for large t, but with a potential or a density); ``"flat"`` multiplies by
-            (4πt)^(d/2) (→ 1 for small t inside, 1/ρ with a density ρ).
-        method: ``"spectral"``: the sum over the pairs. ``"spectrum-free"``: without them, from the matrices that they
-            belong to (see `hks_spectrum_free`). ``"auto"``: the pairs at the times that they resolve to the
-            tolerance, the other at the rest; `hks_auto` also reports which, and how they agree.
-        tolerance: of the last two, relative to (4πt)^(−d/2).
+            domain's area or volume (→ 1 for large t, except with a potential or a density); ``"flat"`` multiplies by
+            (4πt)^(d/2) (→ 1 for small t away from the boundary, or 1/ρ with a density ρ).
+        method: ``"spectral"`` sums over the pairs. ``"spectrum-free"`` uses only the matrices of the pairs (see
+            `hks_spectrum_free`). ``"auto"`` uses the pairs at times that they resolve to the tolerance and the matrices
+            at the other times. `hks_auto` also reports the choice and the agreement of the methods.
+        tolerance: the error allowed to the last two methods, relative to (4πt)^(−d/2).
 
     Returns:
-        (n_times, *shape); NaN outside the mask, 0 at Dirichlet nodes. Units of "raw": 1/(metric length)^d.
+        (n_times, *shape); NaN outside the mask, 0 at Dirichlet nodes. The unit of ``"raw"`` is 1/(metric length)^d.
 
     Raises:
-        ValueError: times that are not positive and finite, or an unknown normalisation or method; ``"heat-trace"``
-            without the spectrum; ``"auto"`` where values are traced.
+        ValueError: if times are not positive and finite, if the normalisation or the method is unknown, if
+            ``"heat-trace"`` is used without the spectrum, or if ``"auto"`` is used with traced values.
 
     Warns:
-        AccuracyWarning: times too small for the number of pairs or for the grid (see `truncation`).
+        AccuracyWarning: if times are too small for the number of pairs or for the grid (see `truncation`).
     """
     if method == "spectral":
         times = resolved_times(pairs, times)
@@ -117,34 +118,34 @@ def hks(
 def hks_auto(
     pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw", tolerance: float = 1e-4
 ) -> AutomaticHKS:
-    """Compute the heat kernel signature, each time by the method that reaches it, and report on it.
+    """Compute the heat kernel signature with the suitable method at each time, and report the choice.
 
-    A time is left to the eigenpairs where the estimated share beyond them is below the tolerance. The
-    others come from `hks_spectrum_free`. Where there are times of both kinds, the shortest of the former is
-    computed both ways, provided that this takes no more than ten times the work of the rest.
+    A time is computed from the eigenpairs if the estimated share beyond them is at most the tolerance, and otherwise by
+    `hks_spectrum_free`. If there are times of both kinds, the shortest time of the eigenpairs is computed by both
+    methods, provided that this takes at most ten times the work of the spectrum-free times.
 
     Args:
         pairs: from `eigenpairs`.
         times: (n_times,) positive.
         normalisation: see `hks`.
-        tolerance: of both methods, relative to (4πt)^(−d/2).
+        tolerance: the error allowed to both methods, relative to (4πt)^(−d/2).
 
     Returns:
-        The values, with which times came from where, and how the two agree.
+        The values, the method of each time, and the difference between the methods.
 
     Raises:
-        ValueError: as `hks`; traced values, from which no choice can be made.
+        ValueError: as in `hks`, or if values are traced, because the choice depends on them.
 
     Warns:
-        AccuracyWarning: the two differ by more than ten times the tolerance, or times too small for the grid.
+        AccuracyWarning: if the methods differ by ten times the tolerance, or if times are too small for the grid.
     """
     require_number("tolerance", tolerance, 1)
     times = times_of(pairs, times)
     known_pairs, known_times = jax.lax.stop_gradient((pairs, times))
     if is_traced((known_pairs.eigenvalues, known_times)):
         raise ValueError(
-            'method: "auto" chooses by values, which are traced here (jax.jit, vmap); call hks with method="spectral" '
-            'or, for the small times, "spectrum-free"'
+            'method: got "auto", which chooses by values that are traced here (jax.jit, vmap); expected "spectral" '
+            'or, for small times, "spectrum-free"'
         )
     estimate = truncation(known_pairs, known_times)
     spectral = np.asarray(estimate.tail) <= tolerance
@@ -157,7 +158,7 @@ def hks_auto(
     settings = choose_method(pencil, times[small], "auto", tolerance)
     raw = hks_spectrum_free(pencil, times[small], method=settings or "selected-inversion", tolerance=tolerance)
     others = _scaled(pairs, times[small], normalisation, raw)
-    # That k is too small is no matter here; the grid may be.
+    # These times do not use the k pairs, so warn only about the grid.
     some = jax.tree.map(lambda leaf: leaf[small] if leaf.ndim else leaf, estimate)
     for message in eqx.tree_at(lambda e: e.tail, some, jnp.zeros(small.size)).messages():
         warn_of_accuracy(message)
@@ -183,15 +184,16 @@ def hks_auto(
 def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, values: Array) -> Array:
     if normalisation == "heat-trace":
         raise ValueError(
-            'normalisation: "heat-trace" needs the whole spectrum; use "raw", "volume" or "flat", or method="spectral"'
+            'normalisation: "heat-trace" needs all eigenvalues; expected "raw", "volume" or "flat", or '
+            'method="spectral"'
         )
     return values * normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
-    """Return how far the two methods are apart at one time, at most, relative to (4πt)^(−d/2).
+    """Return the greatest difference of the two methods at one time, relative to (4πt)^(−d/2).
 
-    NaN where that would take more work than is allowed, or rounding does not allow the tolerance.
+    The result is NaN if the comparison exceeds the allowed work or if rounding exceeds the tolerance.
     """
     pencil = pairs.pencil
     try:
@@ -208,7 +210,7 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
 
 
 def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
-    """Return the factor at each time that `hks` multiplies the raw signature with."""
+    """Return the factor at each time by which `hks` multiplies the raw signature."""
     if normalisation == "raw":
         return jnp.ones_like(times)
     if normalisation == "heat-trace":

@@ -1,4 +1,4 @@
-"""Signatures of one filter each: heat kernel, trace, scale-invariant, wave kernel, and functions of your own."""
+"""Signatures that are given by one filter: heat trace, heat kernel, scale-invariant HKS, WKS and custom functions."""
 
 import math
 from collections.abc import Callable
@@ -22,10 +22,10 @@ def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:
     """Compute the heat trace Σᵢ exp(−λᵢt) = ∫ HKS(t, x) dx at times (n_times,).
 
     Raises:
-        ValueError: times that are not positive and finite.
+        ValueError: if times are not positive and finite.
 
     Warns:
-        AccuracyWarning: times too small for the number of pairs or for the grid.
+        AccuracyWarning: if times are too small for the number of pairs or for the grid.
     """
     return spectral_trace(pairs, Heat(resolved_times(pairs, times)))
 
@@ -36,13 +36,13 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
     Args:
         pairs: from `eigenpairs`.
         times: (n_times,) positive.
-        sources: node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers (n_sources,).
+        sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
 
     Returns:
         (n_times, n_sources, *shape); NaN outside the mask.
 
     Raises:
-        ValueError: bad times, or sources out of range or outside the mask.
+        ValueError: if times are invalid, or if a source is out of range or outside the mask.
     """
     return spectral_columns(pairs, Heat(resolved_times(pairs, times)), source_indices(pairs, sources))
 
@@ -52,17 +52,17 @@ def scale_invariant_hks(
 ) -> Float[Array, "n_frequencies *shape"]:
     """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT| of d/dτ log HKS(exp τ, x), low frequencies.
 
-    Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant; the derivative drops the constant, the
-    modulus of the Fourier transform the shift. The default times follow the spectrum, which makes the invariance exact.
+    Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant and
+    the modulus of the Fourier transform the shift. The default times scale with the spectrum, so invariance is exact.
 
     Args:
         pairs: from `eigenpairs`.
-        n_frequencies: how many Fourier moduli, from frequency 0.
-        n_times: how many samples of τ.
-        times: (n,) log-spaced times, to compare shapes at absolute scales; None: from 4 ln10/λ_last to 4 ln10/λ₁.
+        n_frequencies: the number of Fourier moduli, from frequency 0.
+        n_times: the number of samples of τ.
+        times: (n,) log-spaced times for comparison at absolute scales; by default from 4 ln10/λ_last to 4 ln10/λ₁.
 
     Returns:
-        (n_frequencies, *shape), without unit; NaN outside the mask and at Dirichlet nodes.
+        (n_frequencies, *shape), dimensionless; NaN outside the mask and at Dirichlet nodes.
     """
     if times is None:
         first, last = positive_range(pairs)
@@ -71,10 +71,10 @@ def scale_invariant_hks(
         times = resolved_times(pairs, times)
     if not 1 <= n_frequencies <= times.size // 2 + 1:
         raise ValueError(
-            f"n_frequencies: got {n_frequencies}; {times.size} times have 1 … {times.size // 2 + 1} frequencies"
+            f"n_frequencies: got {n_frequencies}; expected 1 to {times.size // 2 + 1} for {times.size} times"
         )
     signature = spectral_diagonal(pairs, Heat(times))
-    # d/dτ at t = exp τ is t d/dt, known in closed form: no differences needed.
+    # The derivative d/dτ at t = exp τ is t d/dt, which has a closed form.
     slope = spectral_diagonal(pairs, Derivative(Heat(times), Heat(times))) / signature
     return jnp.abs(jnp.fft.rfft(slope, axis=0))[:n_frequencies] / times.size
 
@@ -86,17 +86,17 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
 
     Args:
         pairs: from `eigenpairs`.
-        energies: (n,) values of log λ; default: `default_energies`, 100 of them.
-        sigma: the width σ > 0 in log λ; default: the one that belongs to the default energies.
+        energies: (n,) values of log λ, by default the 100 values of `default_energies`.
+        sigma: the width σ > 0 in log λ, by default the width of `default_energies`.
 
     Returns:
         (n_energies, *shape) in 1/(metric length)^d; NaN outside the mask.
 
     Raises:
-        ValueError: only one of energies and sigma given, wrong shape, sigma ≤ 0, no positive eigenvalue.
+        ValueError: if only one of energies and sigma is given or one is invalid, or if no eigenvalue is positive.
     """
     if (energies is None) != (sigma is None):
-        raise ValueError("energies, sigma: give both or neither; `default_energies(pairs, n)` returns a pair of them")
+        raise ValueError("energies, sigma: got only one; expected both, as from `default_energies`, or neither")
     positive_range(pairs)
     if energies is None:
         energies, sigma = default_energies(pairs)
@@ -108,7 +108,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     if sigma.ndim != 0:
         raise ValueError(f"sigma: got shape {sigma.shape}; expected one positive width in log λ")
     require_number("sigma", sigma)
-    # The largest exponent is taken out of both sums: they do not underflow far outside of the spectrum.
+    # The largest exponent is factored out of both sums to prevent underflow far outside the spectrum.
     offset = _largest_exponents(*jax.lax.stop_gradient((energies, sigma, pairs.eigenvalues, pairs.kept)))
     bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
@@ -134,16 +134,16 @@ def spectral_signature(
 
     Args:
         pairs: from `eigenpairs`.
-        function: maps (θ, λ) to f, elementwise in λ (any shape), differentiable by JAX on λ > 0. What is traced must
-            come in by θ and not by closure. Every new function object compiles anew: define it once.
+        function: maps (θ, λ) to f elementwise for λ of any shape, and is differentiable by JAX for λ > 0. Pass traced
+            values in θ, not by closure. Define the function once, because every new function object is compiled again.
         parameters: θ, a pytree of floating point arrays with a leading axis m.
-        sources: None for the diagonal; else node indices (n_sources, d), or (d,) for one; on a mesh vertex numbers.
+        sources: None for the diagonal, or node indices (n_sources, d) or (d,); vertex numbers on a mesh.
 
     Returns:
         (m, *shape), or (m, n_sources, *shape) with sources; NaN outside the mask.
 
     Raises:
-        ValueError: parameters without a common leading axis; bad sources.
+        ValueError: if the parameters have no common leading axis or a source is invalid.
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
     require_real("parameters", parameters)

@@ -1,4 +1,4 @@
-"""The determinant of a Laplacian, as its zeta function defines it."""
+"""The zeta-regularised determinant of a Laplacian."""
 
 import math
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ from hks_jax.signatures.truncation import truncation
 from hks_jax.traced import is_traced
 
 _FIRST = 18.0
-"""The least λ_last·T: the eigenvalues beyond the last then contribute less than 1e-9 each."""
+"""The least λ_last·T. Each eigenvalue beyond the last then contributes less than 1e-9."""
 _TIMES, _PER_DOUBLING = 12, 2
-"""How many times T are tried, and in how many of them T doubles."""
+"""The number of times T that are tried, and the number of steps in which T doubles."""
 _DOUBTFUL = 0.01
-"""The error from which on a warning says so."""
+"""The estimated error above which a warning is issued."""
 _SMALL, _TERMS, _NODES = 2.0, 20, 32
-"""Up to this argument E₁ is a series, with this many terms; beyond, an integral by as many points: 1e-14 for both."""
+"""The largest argument for the series of E₁, its number of terms, and the quadrature points beyond; error 1e-14."""
 
 
 class LogDeterminant(NamedTuple):
@@ -32,10 +32,9 @@ class LogDeterminant(NamedTuple):
 
     Attributes:
         value: log det′ Δ.
-        error: an estimate of its error: that of the elements, and of the terms of the heat trace without a coefficient.
-            Constant to derivatives.
-        time: T, before which the heat trace is taken from its coefficients, and after which from the eigenvalues;
-            likewise constant.
+        error: an estimate of the discretisation error and of omitted terms of the heat trace; constant to derivatives.
+        time: T. The heat trace is computed from its coefficients up to T and from eigenvalues after T. T is constant to
+            derivatives.
     """
 
     value: Float[Array, ""]
@@ -52,20 +51,20 @@ def heat_coefficients(
 ) -> Float[Array, " 3"]:
     """Return a₀, a₁, a₂ of the heat trace Σ exp(−λᵢt) ~ a₀/t + a₁/√t + a₂ of a surface (Kac 1966; McKean, Singer 1967).
 
-    a₀ = V/4π; a₁ = ±L/8√π, + under Neumann conditions; a₂ = χ/6 + Σ (π − θ)²/24πθ over the corners.
+    They are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the corners.
 
     Args:
-        pairs: from `eigenpairs`, of the area V in 2D; under "mirror" and "mean" of the doubled domain.
-        euler_characteristic: χ: 2 of a sphere, 0 of a torus, 1 of a disc or a square.
+        pairs: the result of `eigenpairs` in 2D. V is the area, under "mirror" and "mean" that of the doubled domain.
+        euler_characteristic: χ, which is 2 for a sphere, 0 for a torus, and 1 for a disc or a square.
         boundary_length: L, in the units of the metric.
-        corners: the inner angles θ of the boundary's corners, in radians: four times π/2 of a square.
-        condition: that on all of the boundary.
+        corners: the inner angles θ of the boundary's corners, in radians; for a square, four times π/2.
+        condition: the condition on the whole boundary.
 
     Raises:
-        ValueError: pairs that are not of a surface, or whose area is not known; angles outside of (0, 2π].
+        ValueError: if the domain is not a surface of known area, or if an angle is outside (0, 2π].
     """
     if dimension_of(require_pairs(pairs), "the heat trace") != 2:
-        raise ValueError("pairs: got a 3D domain; give `log_determinant` its coefficients a₀, a₁, a₂, a₃ yourself")
+        raise ValueError("pairs: got a 3D domain; expected 2D. Pass your own a₀, a₁, a₂, a₃ to `log_determinant`")
     angles = np.asarray(corners, float)
     if not ((angles > 0) & (angles <= 2 * math.pi)).all():
         raise ValueError(f"corners: got {corners}; expected inner angles in radians, above 0 and at most 2π")
@@ -76,42 +75,40 @@ def heat_coefficients(
     return jnp.stack(known)
 
 
-# With Z the heat trace, n₀ the number of zero eigenvalues and T > 0,
+# Let Z be the heat trace, n₀ the number of zero eigenvalues and T > 0. Then
 #
 #     Γ(s) ζ(s) = ∫₀^∞ t^(s−1) (Z(t) − n₀) dt,    Z(t) ~ Σⱼ aⱼ t^pⱼ,    pⱼ = (j − d)/2.
-#
-# Up to T the terms of Z are integrated one by one and continued analytically, and beyond it the exponentials are. With
-# 1/Γ(s) = s + γs² + … the value at zero is
+# Up to T each term of the expansion of Z is integrated and continued analytically. Beyond T each exponential is
+# integrated. With 1/Γ(s) = s + γs² + … the value at zero is
 #
 #     −log det′ = ζ′(0) = (a_d − n₀) (log T + γ) + Σ_{j≠d} aⱼ T^pⱼ/pⱼ + Σ E₁(λᵢT).
-#
-# What is missing is ∫₀^T (Z − Σⱼ aⱼ t^pⱼ) dt/t, which begins with the first power left out: from values at T, 2T, 4T, …
-# it is extrapolated away as Richardson does, power by power.
+# The error is ∫₀^T (Z − Σⱼ aⱼ t^pⱼ) dt/t, whose leading term is the first omitted power. Richardson extrapolation from
+# the values at T, 2T, 4T, … removes these powers.
 def log_determinant(
     pairs: Eigenpairs, coefficients: Any, *, extrapolate: Sequence[float] = (), time: Any = None
 ) -> LogDeterminant:
-    """Compute log det′ Δ = −ζ′(0), ζ(s) = Σ λᵢ^(−s) over the positive eigenvalues.
+    """Compute log det′ Δ = −ζ′(0), where ζ(s) = Σ λᵢ^(−s) is the sum over the positive eigenvalues.
 
-    Eigenvalues alone do not tell it: what is beyond the last comes from the heat trace's expansion at small times.
-    Differentiable, through the eigenvalues and the coefficients. The eigenvalues' own errors limit the result: of
-    linear elements with spacing h the error is about a₀h²/16T² in 2D, so that many pairs, and small T, need fine grids.
+    The heat trace's expansion at small times supplies the part of the eigenvalues beyond the last. The result is
+    differentiable by the eigenvalues and the coefficients. Errors of the eigenvalues limit its accuracy: for linear
+    elements with spacing h in 2D the error is about a₀h²/16T², so many pairs and small T need fine grids.
 
     Args:
-        pairs: the lowest, from `eigenpairs`.
-        coefficients: a₀, a₁, …, at least as far as a_d, of Σ exp(−λᵢt) ~ Σⱼ aⱼ t^((j−d)/2): `heat_coefficients`.
-        extrapolate: the next powers of t in the expansion, whose coefficients are not known: (1, 2) on a closed curved
-            surface, (0.5, 1) with a curved boundary. On flat tori and polygons there are none.
-        time: T, in (metric length)²; None takes the one whose estimated error is least.
+        pairs: the lowest eigenpairs, from `eigenpairs`.
+        coefficients: a₀ to at least a_d in Σ exp(−λᵢt) ~ Σⱼ aⱼ t^((j−d)/2), for example from `heat_coefficients`.
+        extrapolate: the next powers of t in the expansion, with unknown coefficients: (1, 2) on a closed curved
+            surface, (0.5, 1) with a curved boundary, none on flat tori and polygons.
+        time: T, in (metric length)²; by default the time with the least estimated error.
 
     Returns:
-        The value, and an estimate of its error.
+        The value with an estimate of its error.
 
     Raises:
-        ValueError: fewer than d + 1 coefficients; powers that are not positive; pairs in an interval, negative
-            eigenvalues, or none that is positive; a dimension that is not known.
+        ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if pairs are in an interval,
+            if no or a negative eigenvalue is found, or if the dimension is not known.
 
     Warns:
-        AccuracyWarning: an estimated error above 0.01.
+        AccuracyWarning: if the estimated error exceeds 0.01.
     """
     d, dtype = dimension_of(require_pairs(pairs), "the determinant"), pairs.eigenvalues.dtype
     a = jnp.asarray(coefficients, dtype)
@@ -119,31 +116,31 @@ def log_determinant(
         raise ValueError(f"coefficients: got shape {a.shape}; expected at least {d + 1}, a₀ to a_{d}")
     powers = np.asarray(extrapolate, float)
     if not (powers > 0).all() or len(set(powers)) != powers.size:
-        raise ValueError(f"extrapolate: got {extrapolate}; expected different positive powers of t")
+        raise ValueError(f"extrapolate: got {extrapolate}; expected distinct positive powers of t")
     if not pairs.lowest:
-        raise ValueError("pairs: these lie in an interval; the determinant is that of the lowest eigenpairs")
+        raise ValueError("pairs: got eigenpairs in an interval; expected the lowest eigenpairs")
     if not is_traced(pairs.eigenvalues) and (pairs.eigenvalues < 0).any():
         raise ValueError(f"pairs: got the eigenvalue {float(pairs.eigenvalues[0]):.4g}; expected none below zero")
     _, last = jax.lax.stop_gradient(positive_range(pairs))
     steps = 2.0 ** (np.arange(_TIMES) / _PER_DOUBLING)
     times = _FIRST / last * jnp.asarray(steps, dtype) if time is None else jnp.asarray(time, dtype)[None]
-    # At (m,) times, and at each √2, 2, … times as late, the odd ones for the error.
+    # Values at (m,) times multiplied by 1, √2, 2, 2√2, …; the odd powers of √2 serve the error estimate.
     count = powers.size + 1
     doublings = 2.0 ** (np.arange(2 * count + 1) / 2)
     values = _at(pairs, a, d, times[:, None] * jnp.asarray(doublings, dtype)[None])
-    # Weights that keep constants and take the powers away; 0 stands for the constants.
+    # The weights preserve constants (the power 0) and cancel the other powers.
     weights = np.linalg.solve(2.0 ** np.outer(np.append(0, powers), np.arange(count)), np.eye(count)[0])
     levels = [values[:, i : i + 2 * count : 2] @ jnp.asarray(weights, dtype) for i in range(3)]
     rest = jnp.maximum(jnp.abs(levels[0] - levels[1]), jnp.abs(levels[0] - levels[2]))
-    # The trace of linear elements errs by d h²/16t, three times as much as the signature at a node.
+    # The error of the trace of linear elements is d h²/16t, three times that of the signature at a node.
     bias = 3 * truncation(pairs, times).resolution_bias * jnp.abs(a[0]) * times ** (-d / 2) / (d / 2 + 1)
     errors = jax.lax.stop_gradient(rest + jnp.where(jnp.isfinite(bias), bias, 0))
     best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))
     result = LogDeterminant(levels[0][best], errors[best], times[best])
     if not is_traced(result) and not float(result.error) <= _DOUBTFUL:
         warn_of_accuracy(
-            f"pairs: log det′ = {float(result.value):.4g} may be off by {float(result.error):.2g}. Use a finer grid or "
-            "more pairs; name the powers of t that the coefficients leave out by `extrapolate`, or give more of them"
+            f"pairs: log det′ = {float(result.value):.4g} has the estimated error {float(result.error):.2g}. Use a "
+            "finer grid, more pairs or coefficients, or name the powers of t without one in `extrapolate`"
         )
     return result
 
@@ -162,13 +159,13 @@ def _at(pairs: Eigenpairs, a: Float[Array, " m"], d: int, times: Float[Array, "*
 
 @jax.custom_jvp
 def exponential_integral(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return E₁(x) = ∫₁^∞ exp(−xu) du/u for x > 0; that of JAX takes many times as long to compile and to compute."""
+    """Return E₁(x) = ∫₁^∞ exp(−xu) du/u for x > 0; JAX's function takes much longer to compile and to run."""
     near, far = jnp.minimum(x, _SMALL), jnp.maximum(x, _SMALL)
     series, term = -np.euler_gamma - jnp.log(near), -jnp.ones_like(x)
     for k in range(1, _TERMS + 1):
         term = term * -near / k
         series += term / k
-    # With u = 1/v, from 0 to 1.
+    # The substitution u = 1/v maps the integral to the interval from 0 to 1.
     integral = sum(w / v * jnp.exp(-far / v) for v, w in zip(*gauss(_NODES), strict=True))
     return jnp.where(x < _SMALL, series, integral)
 

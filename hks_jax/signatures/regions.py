@@ -1,4 +1,4 @@
-"""Signatures by region: what a label map's regions have in the mean, and how much they vary inside."""
+"""Statistics of signatures over the regions of a label map."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,17 +11,16 @@ from hks_jax.checks import require_number, require_real
 
 @dataclass(frozen=True, eq=False)
 class RegionStatistics:
-    """A signature's statistics over r regions; on the host.
+    """Statistics of a signature over r regions, as NumPy arrays.
 
     Attributes:
-        labels: (r,) the regions' numbers, ascending.
-        nodes: (r,) how many nodes of the region have a value: the nodes of the domain.
-        coverage: (r,) their share of all of the region's nodes. What lies outside the mask has no value.
-        volume: (r,) the nodes' number times that of one; an area in the plane.
-        mean: (n_times, r) over the nodes, each counted alike.
-        deviation: (n_times, r) the root mean square distance from that mean: the spread within the region (divided by
-            the number of nodes, not by one less).
-        median: (n_times, r).
+        labels: (r,) the regions' numbers in ascending order.
+        nodes: (r,) the number of the region's nodes in the domain, which have a value.
+        coverage: (r,) the share of such nodes among all nodes of the region; nodes outside the mask have no value.
+        volume: (r,) the number of nodes times the volume (in 2D, the area) of one node.
+        mean: (n_times, r) the unweighted mean over the nodes.
+        deviation: (n_times, r) the standard deviation within the region, with the number of nodes as divisor.
+        median: (n_times, r) the median over the nodes.
     """
 
     labels: Int[np.ndarray, " r"]
@@ -37,32 +36,31 @@ def region_statistics(values: Any, labels: Any, node_volume: float = 1.0) -> Reg
     """Return mean, standard deviation and median of a signature over each region of a label map.
 
     Args:
-        values: (n_times, *shape); NaN outside the domain, as signatures are.
-        labels: (*shape) whole numbers: the number of the region that a node belongs to, 0 for none.
-        node_volume: the volume (in the plane, the area) that one node stands for.
+        values: (n_times, *shape) a signature, with NaN outside the domain.
+        labels: (*shape) integers, the number of each node's region or 0 for none.
+        node_volume: the volume (in 2D, the area) of one node.
 
     Returns:
-        One entry for every label but 0. A region without a node in the domain has the coverage 0 and NaN statistics.
+        One entry for each nonzero label. A region without a node in the domain has coverage 0 and NaN statistics.
 
     Raises:
-        ValueError: shapes that disagree; labels that are no whole numbers, or 0 everywhere; times at which other nodes
-            have values.
+        ValueError: if shapes disagree, if labels are not integers or all 0, or if the nodes with values depend on time.
     """
     require_real("values", values)
     require_real("labels", labels)
     require_number("node_volume", node_volume)
     u, regions = np.asarray(values, np.float64), np.asarray(labels)
     if u.ndim < 2 or u.shape[1:] != regions.shape:
-        raise ValueError(f"labels: got shape {regions.shape}; expected that of the values without times, {u.shape[1:]}")
+        raise ValueError(f"labels: got shape {regions.shape}; expected the values' shape without times, {u.shape[1:]}")
     if not np.array_equal(regions, np.rint(regions)):
-        raise ValueError("labels: got numbers with a fraction; expected whole numbers, 0 for none")
+        raise ValueError("labels: got fractional numbers; expected integers, 0 for no region")
     u, regions = u.reshape(len(u), -1), regions.ravel().astype(np.int64)
     inside = np.isfinite(u[0])
     if not np.array_equal(np.isfinite(u), np.broadcast_to(inside, u.shape)):
-        raise ValueError("values: NaN at some times alone; expected values at the same nodes at all times")
+        raise ValueError("values: got nodes with NaN at only some times; expected NaN at all times or at none")
     labelled, whole = np.unique(regions[regions != 0], return_counts=True)
     if not labelled.size:
-        raise ValueError("labels: 0 everywhere; expected the number of a region at some of the nodes")
+        raise ValueError("labels: got 0 at all nodes; expected a region's number at some nodes")
     chosen = inside & (regions != 0)
     order = np.argsort(regions[chosen], kind="stable")
     nodes = np.searchsorted(regions[chosen][order], labelled, side="right")

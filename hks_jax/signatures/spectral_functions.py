@@ -21,6 +21,7 @@ from hks_jax.linear.linear_map import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter
+from hks_jax.signatures.mixing import like, mixing, on_host, weights_of
 from hks_jax.traced import is_traced
 
 _ROWS = 128
@@ -125,11 +126,11 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         change, d_frame = _instantiated((d_pairs.pencil, d_pairs.frame))
         for number, part in enumerate(pairs.pencil.parts):
             own = pairs.of_part(number)
-            known = own.eigenvalues, own.vectors, own.kept, d_frame
+            known = own.eigenvalues, own.vectors, own.kept
             static = part.n_fixed > 0, len(pairs.pencil.parts), pairs.space
             reader = None if part.row_sums is None else part
             matrices = change.parts[number], reader
-            terms.append(_tangent(contraction, filters, known, _rows_of(own, number), *static, *matrices))
+            terms.append(_tangent(contraction, filters, known, d_frame, _rows_of(own, number), *static, *matrices))
     elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves are moved: plain rules
         pairs = first_order_only(pairs)
         moved = jax.jvp(
@@ -162,12 +163,13 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
 
 
 # The transpose computes its intermediate results again: kept, they would be two copies of the eigenvectors.
-@jit_quickly(static_argnames=("fixed", "copies"))
-@partial(jax.checkpoint, static_argnums=(4, 5))
+@jit_quickly(static_argnames=("fixed", "copies"), linear=("d_frame", "change"), like=like, on_host=on_host)
+@partial(jax.checkpoint, static_argnums=(5, 6))
 def _tangent(
     contraction: Contraction,
     filters: Filter,
-    pairs: tuple[Float[Array, " k"], Float[Array, "k n_dof"], Bool[Array, " k"], Float[Array, "k n_dof"]],
+    pairs: tuple[Float[Array, " k"], Float[Array, "k n_dof"], Bool[Array, " k"]],
+    d_frame: Float[Array, "k n_dof"],
     selection: tuple[Int[Array, " m"], Bool[Array, " m"]] | None,
     fixed: bool,
     copies: int,
@@ -176,7 +178,7 @@ def _tangent(
     reader: Pencil | None,
 ) -> Array:
     """Return the derivative by the change of one part: of values, vectors, those kept, and their moving frame."""
-    values, vectors, kept, d_frame = pairs if selection is None else (x[selection[0]] for x in pairs)
+    values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
         vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these
     if not len(vectors):
@@ -202,24 +204,14 @@ def _tangent(
         read, d_read = jax.jvp(read_by, (reader, vectors), (change, d_frame))
     _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (read,), (d_read,))
 
-    def mixing(one: Filter) -> tuple[Float[Array, "k k"], Bool[Array, " k"]]:
-        of_f, of_lambda_f = _divided_differences(one, values, kept, fixed)
-        matters = _matters(_weights(one, values, kept), jnp.diagonal(of_f), values)
-        return of_f * stiffness - of_lambda_f * mass, matters
-
     def inner(some: Filter) -> Array:
-        matrices, matters = jax.lax.map(mixing, some)
-        return contraction.mixed(matrices, read, matters)
+        _, of_f, of_lambda_f, matters = mixing(some, values, kept, fixed)
+        return contraction.mixed(of_f * stiffness - of_lambda_f * mass, read, matters)
 
     together = min(_FILTERS, len(weights))
     starts, place = row_blocks(len(weights), together)
     some = starts[:, None] + np.arange(together)
     return outer + jax.lax.map(inner, jax.tree.map(lambda leaf: leaf[some], filters))[place]
-
-
-def _weights(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
-    """Return f(λᵢ), zero where the pairs are not kept."""
-    return jnp.where(kept, one(values), 0)
 
 
 def _all_weights(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, "m k"]:
@@ -231,35 +223,10 @@ def _all_weights(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, 
 
 
 def _each(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, "m k"]:
-    return jax.vmap(lambda one: _weights(one, values, kept))(filters)
+    return jax.vmap(lambda one: weights_of(one, values, kept))(filters)
 
 
 _each_at_once = jax.jit(_each)
-
-
-def _divided_differences(
-    one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
-) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
-    """Return the matrices [f] and [λf], f being zero where the pairs are not kept."""
-    rows, columns = values[:, None], values[None]
-    low, high = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
-    f = _weights(one, values, kept)
-    gap = rows - columns
-    quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
-    both = kept[:, None] & kept[None]
-    of_f = jnp.where(both, one.divided_difference(low, high), quotient)
-    # Between null vectors that every perturbation annihilates G vanishes; and f need not have a derivative at 0.
-    of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
-    # f at the larger eigenvalue, where it is small, and not the other way round: no cancellation.
-    return of_f, jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
-
-
-def _matters(f: Float[Array, " k"], slope: Float[Array, " k"], values: Float[Array, " k"]) -> Bool[Array, " k"]:
-    """Return where f or λf' is not negligible beside what they are elsewhere, the constants apart."""
-    size = jnp.maximum(jnp.abs(f), jnp.abs(values * slope))
-    largest = jnp.max(jnp.where(values > 0, size, 0))
-    # Between two that are not, [f] is at most f' at one of them, or, if f is not monotone, ε over their relative gap.
-    return ~(size <= jnp.finfo(f.dtype).eps * largest)  # NaN matters
 
 
 def _is_zero(leaf: Any) -> bool:

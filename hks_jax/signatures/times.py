@@ -1,4 +1,4 @@
-"""What signatures need of pairs, and the default times and energies of Sun et al. and of Aubry et al."""
+"""Properties of eigenpairs that signatures need, and the default times and energies of Sun et al. and Aubry et al."""
 
 import math
 from typing import Any
@@ -14,37 +14,36 @@ from hks_jax.traced import is_traced
 
 
 def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
-    """Return the pairs of one domain; raise TypeError or ValueError for anything else."""
+    """Return the pairs; raise TypeError or ValueError unless they are eigenpairs of one domain."""
     if not isinstance(pairs, Eigenpairs):
-        raise TypeError(f"pairs: got {type(pairs).__name__}; expected what `eigenpairs` returns")
+        raise TypeError(f"pairs: got {type(pairs).__name__}; expected the result of `eigenpairs`")
     if pairs.eigenvalues.ndim != 1:
         raise ValueError(
-            f"pairs: got a batch, eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Map over the batch "
-            "with jax.vmap"
+            f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap"
         )
     return pairs
 
 
 def times_of(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
-    """Return times as an array in the precision of the pairs; raise TypeError or ValueError for anything else."""
+    """Return times as an array with the dtype of the pairs; raise TypeError or ValueError if they are invalid."""
     return checked_times(times, require_pairs(pairs).eigenvalues.dtype)
 
 
 def dimension_of(pairs: Eigenpairs, purpose: str) -> int:
-    """Return the dimension of the manifold; raise ValueError where it is not known."""
+    """Return the dimension of the manifold; raise ValueError if it is not known."""
     return _stated(pairs.space.dimension, "dimension", "manifold", purpose)
 
 
 def volume_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
-    """Return the area or volume of the domain; raise ValueError where it is not known."""
+    """Return the area or volume of the domain; raise ValueError if it is not known."""
     return _stated(pairs.pencil.volume, "volume", "domain", purpose)
 
 
 def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
     if value is None:
         raise ValueError(
-            f"pairs: {purpose} needs the {name} of the {of}, which matrices do not say; give "
-            f"`sparse_pencil(K, M, {name}=…)`"
+            f"pairs: got matrices without the {name} of the {of}, which {purpose} needs. Use `sparse_pencil(K, M, "
+            f"{name}=…)`"
         )
     return value
 
@@ -52,15 +51,15 @@ def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     """Return the first positive and the last eigenvalue.
 
-    Of a multiple one, the mean over its copies: the same number, and a differentiable one.
+    A multiple eigenvalue is returned as the mean over its multiplet, which is differentiable.
 
     Raises:
-        ValueError: if no eigenvalue is positive, as far as that is known.
+        ValueError: if no eigenvalue can be positive.
     """
     if _n_positive(require_pairs(pairs)) < 1:
         raise ValueError(
-            f"pairs: none of the {pairs.k} eigenvalues that are kept is positive (each natural component has a zero "
-            "one); compute more eigenpairs"
+            f"pairs: got {pairs.k} eigenvalues, none positive (each Neumann component has a zero). Compute more "
+            "eigenpairs"
         )
     return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance)
 
@@ -75,7 +74,7 @@ def _ends(xp: Any, values: Any, kept: Any, tolerance: Any) -> tuple[Any, Any]:
 
 
 def _n_positive(pairs: Eigenpairs) -> int:
-    """Return how many positive eigenvalues are kept, as far as that is known."""
+    """Return the number of kept eigenvalues that are positive, or an upper bound for traced values."""
     values, kept = jax.lax.stop_gradient((pairs.eigenvalues, pairs.kept))
     if not is_traced((values, kept)):
         return int((kept & (values > 0)).sum())
@@ -85,8 +84,8 @@ def _n_positive(pairs: Eigenpairs) -> int:
 def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
-    At the first the last mode has decayed by 1e-4; at the last all but the constant have, or by `decay`, but not before
-    the first. The command line takes 1e-2, where a picture still shows the variation.
+    At the first time the last mode has decayed by the factor 1e-4. At the last, which is not before the first, all
+    modes except the constant have decayed by `decay`. The command line uses 1e-2, which is still visible.
     """
     if n < 1:
         raise ValueError(f"n: got {n}; expected at least 1")
@@ -100,12 +99,14 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
 def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Return n energies and the width σ of the wave kernel signature (Aubry, Schlickewei and Cremers 2011).
 
-    σ = 7 (log λ_last − log λ₁)/n, and the energies run from log λ₁ + 2σ to log λ_last − 2σ.
+    Here σ = 7 (log λ_last − log λ₁)/n. The energies run from log λ₁ + 2σ to log λ_last − 2σ.
     """
     if n < 29:
-        raise ValueError(f"n: got {n}; expected at least 29, so that 2σ fits between the ends twice")
+        raise ValueError(f"n: got {n}; expected at least 29, so that the range of energies exceeds 4σ")
     if _n_positive(pairs) < 2:
-        raise ValueError(f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected two or more")
+        raise ValueError(
+            f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two, from more eigenpairs"
+        )
     first, last = (jnp.log(value) for value in positive_range(pairs))
     sigma = 7 * (last - first) / n
     return jnp.linspace(first + 2 * sigma, last - 2 * sigma, n), sigma

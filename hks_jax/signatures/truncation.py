@@ -1,4 +1,4 @@
-"""What a truncated spectrum on a grid of finite spacing resolves: time by time, and node by node."""
+"""Truncation and discretisation errors of heat kernel signatures at each time and each node."""
 
 import math
 from collections.abc import Sequence
@@ -29,19 +29,18 @@ BIAS_LIMIT = 0.1
 
 
 class Truncation(eqx.Module):
-    """Error estimates for heat kernel signatures at given times: a diagnostic, constant to derivatives.
+    """Error estimates for heat kernel signatures at given times, which derivatives treat as constants.
 
     Attributes:
         times: (n,).
-        tail: (n,) the part of the heat trace that lies beyond the k pairs, relative, by Weyl's law. A mean over the
-            domain: single nodes lack more (`truncation_map`).
-        resolution_bias: (n,) the relative error by the spacing of the nodes, at the median node.
-        lasting_bias: (n,) the part of it that does not fall as t grows, because the tensors turn or stretch from node
-            to node.
-        coarse_fraction: (n,) the fraction of nodes where that bias exceeds 10 %.
-        smallest_time: the least time that the k pairs resolve to 1 % in that mean. The worst node then lacks up to 6 %,
-            beside a Dirichlet side up to 20 %.
-        order: the power of 1/t with which the rest of the bias falls.
+        tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. It is a mean over the domain; single
+            nodes lack more (`truncation_map`).
+        resolution_bias: (n,) the relative discretisation error at the median node.
+        lasting_bias: (n,) the part of this error that does not decrease with t, due to tensors that turn or stretch.
+        coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
+        smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or up to 20 %
+            beside a Dirichlet side.
+        order: the power of 1/t with which the rest of the discretisation error decreases.
     """
 
     times: Float[Array, " n"]
@@ -53,57 +52,57 @@ class Truncation(eqx.Module):
     order: int = eqx.field(static=True, default=1, kw_only=True)
 
     def messages(self) -> list[str]:
-        """Say in sentences which times are under-resolved; empty if none is. Needs concrete values."""
+        """Return a sentence for each kind of unresolved time. Values must be concrete."""
         times, messages = np.asarray(self.times), []
         smallest = f"t = {times.min():.4g}"
         tail, bias = np.asarray(self.tail), np.asarray(self.resolution_bias)
         if (tail > TAIL_LIMIT).any():
             messages.append(
-                f"{int((tail > TAIL_LIMIT).sum())} of {times.size} times are too small for k: an estimated "
-                f"{tail.max():.1%} of the signature at {smallest}, in the mean over the domain, lies beyond the "
-                "computed eigenpairs (single nodes lack several times as much: see hks_jax.truncation_map). Use "
-                f"times from about {float(self.smallest_time):.4g}, or more eigenpairs"
+                f"{int((tail > TAIL_LIMIT).sum())} of {times.size} times are too small for k: on average over the "
+                f"domain, an estimated {tail.max():.1%} of the signature at {smallest} lies beyond the computed "
+                "eigenpairs (single nodes may lack several times as much, see hks_jax.truncation_map). Use times of "
+                f"at least about {float(self.smallest_time):.4g}, or more eigenpairs"
             )
         lasting = np.asarray(self.lasting_bias)
         early = (bias > BIAS_LIMIT) & (lasting <= BIAS_LIMIT)
         if early.any():
             at = np.argmax(np.where(early, bias, 0))
             first = times[at]
-            # The estimate is x/(1 + x) with x² = (a/t)^(2·order) + c² (see `_resolution_bias`); c does not fall.
+            # The estimate is x/(1 + x) with x² = (a/t)^(2·order) + c², where c is constant (see `_resolution_bias`).
             x, c, limit = (each / (1 - each) for each in (min(bias[at], 1 - 1e-15), lasting[at], BIAS_LIMIT))
             least = first * ((x**2 - c**2) / max(limit**2 - c**2, 1e-6)) ** (0.5 / self.order)
             messages.append(
                 f"{int(early.sum())} of {times.size} times are too small for the grid: the discretisation biases the "
-                f"signature at t = {first:.4g} by about {bias[at]:.1%} at half of the nodes. "
-                f"Use times from about {least:.4g}, or a finer grid"
+                f"signature at t = {first:.4g} by about {bias[at]:.1%} at half of the nodes. Use times of at least "
+                f"about {least:.4g}, or a finer grid"
             )
         if (lasting > BIAS_LIMIT).any():
             messages.append(
-                f"the tensors turn or stretch too much from node to node: the discretisation biases the signature at "
+                "the tensors turn or stretch too much from node to node: the discretisation biases the signature at "
                 f"{int((lasting > BIAS_LIMIT).sum())} of {times.size} times by about {lasting.max():.1%}, which does "
-                'not fall as t grows. Use a finer grid; interpolation="log-euclidean" keeps the volume at least'
+                'not decrease with t. Use a finer grid; interpolation="log-euclidean" at least preserves the volume'
             )
         return messages
 
 
 @nan_is_meant
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:
-    """Estimate what k pairs and the node spacing leave out of the signature at each time.
+    """Estimate the truncation error of k pairs and the discretisation error of the signature at each time.
 
-    Weyl's law N(λ) = k (λ/Λ)^(d/2), whose constant is taken from the spectrum itself (Λ is the first eigenvalue beyond
-    the k), gives the part of the heat trace beyond Λ: a mean over the domain. `truncation_map` has single nodes.
+    Weyl's law N(λ) = k (λ/Λ)^(d/2), where Λ is the first eigenvalue beyond the k, gives the part of the heat trace
+    beyond Λ. This is a mean over the domain; `truncation_map` estimates the error at each node.
 
-    The error by the spacing h has two parts, both of leading order in h. One is that of a constant metric, d h²/48t
-    where its axes are the grid's, more where they are not. The other does not fall as t grows: where tensors turn or
-    stretch from node to node, elements are too stiff, and the interpolated tensors have another volume. Where k was
-    enough for t, the median error on such fields was a third of the estimate to three times it; a quarter at eigenvalue
-    ratios of 30 on coarse grids. On meshes only the first part is estimated.
+    The discretisation error has two parts of leading order in the spacing h. For a constant metric it is d h²/48t if
+    the metric's axes are the grid's, and more otherwise. The second part does not decrease with t: where tensors turn
+    or stretch between nodes, elements are too stiff and the interpolated tensors have another volume. With enough pairs
+    the median error on such fields was a third to three times the estimate, and a quarter of it for eigenvalue ratios
+    of 30 on coarse grids. On meshes only the first part is estimated.
 
-    With a potential, or where nothing is known of the null space, the exponent is the one that the mean of the pairs'
-    eigenvalues tells, if it is more than d/2. The error by the spacing is then NaN, as that of matrices from elsewhere.
+    With a potential or an unknown null space the exponent follows from the mean of the eigenvalues if it exceeds d/2.
+    The discretisation error is then NaN, and also for other matrices.
 
     Raises:
-        ValueError: times that are not positive and finite; pairs in an interval; matrices whose dimension is not known.
+        ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.
     """
     pairs, at = _estimated(pairs, times)
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
@@ -129,15 +128,15 @@ def _truncation(
     by_weyl: bool,
     order: int,
 ) -> tuple[Any, ...]:
-    """Return what `Truncation` has beside the times; the exponent is Weyl's or that of the spectrum."""
-    # Weyl's law counts from the bottom of the spectrum, which a potential moves.
+    """Return the fields of `Truncation` except the times, for the exponent of Weyl or of the spectrum."""
+    # Weyl's law counts from the bottom of the spectrum, which a potential shifts.
     values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
     complete = xp.isinf(next_eigenvalue)
     following = xp.where(complete, 1, next_eigenvalue)
     count = xp.sum(kept, dtype=at.dtype)
     if by_weyl:
         left, least = beyond_by_weyl(xp, count, dimension, following * at), resolving(TAIL_LIMIT, dimension)
-    else:  # between two levels, of which there may be few
+    else:  # the midpoint between two levels, because there may be few levels
         following = (following + xp.max(xp.where(kept, values, 0))) / 2
         mean = xp.sum(xp.where(kept, values, 0)) / (count * following)
         exponent = xp.maximum(_exponent(xp, mean), dimension / 2)
@@ -157,14 +156,14 @@ def _truncation(
     return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
 
-# Eigenvalues larger by the factor 1 + δ make the heat trace Z(t) that of the time (1 + δ)t: an error proportional to
-# s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where the constant is left. A volume larger by the
-# factor 1 + v is that of the metric times (1 + v)^(2/d), which divides the signature by 1 + v and eigenvalues by
-# (1 + v)^(2/d): an error of v(1 − s). Where k pairs are too few for t, what lies beyond them counts with s = 1.
+# If all eigenvalues are larger by the factor 1 + δ, the heat trace Z(t) is that of the time (1 + δ)t. This error is
+# proportional to s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where only the constant is left. If the
+# volume is larger by the factor 1 + v, the metric is multiplied by (1 + v)^(2/d). This divides the signature by 1 + v
+# and the eigenvalues by (1 + v)^(2/d), which is an error of v(1 − s). The part beyond too few pairs has s = 1.
 def _resolution_bias(
     xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any, order: int
 ) -> tuple[Any, Any]:
-    """Return the estimated relative error (n, nodes) by the spacing, and its part that does not fall with t.
+    """Return the estimated relative discretisation error (n, nodes) and its part that does not decrease with t.
 
     Both are 0 at nodes that are not free.
     """
@@ -172,14 +171,14 @@ def _resolution_bias(
     lasting = slope[:, None] * turning[None] + (xp.abs(1 - slope) * errors[2])[:, None]
     lasting = xp.where(free.ravel()[None], lasting, 0)
     both = xp.hypot((dispersion[None] / times[:, None]) ** order, lasting)
-    # Discrete signatures stay bounded as t falls, so that their relative error tends to 1.
+    # Discrete signatures stay bounded as t tends to 0, so their relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 
 
 def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
     """Return the medians (n) over the free nodes of numbers (n, nodes) between 0 and 1, which are 0 at the others.
 
-    To 1e-12; NaN where one is. By bisection: sorting takes JAX ten times as long.
+    The accuracy is 1e-12, and NaN gives NaN. Bisection is ten times as fast as sorting in JAX.
     """
     twice_half = 2 * free.size - xp.sum(free)
 
@@ -194,18 +193,18 @@ def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
 
 
 def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, " n"]]:
-    """Return pairs and times, constant to derivatives; raise ValueError for pairs of which nothing is estimated."""
+    """Return pairs and times as constants to derivatives; raise ValueError if the pairs allow no estimate."""
     at = times_of(pairs, times)
     if not pairs.lowest:
-        raise ValueError("pairs: these lie in an interval; the error is estimated of the lowest eigenpairs")
+        raise ValueError("pairs: got eigenpairs in an interval; expected the lowest, which allow an estimate")
     return jax.lax.stop_gradient((pairs, at))
 
 
 def resolved_times(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
-    """Return times as `times_of` does; warn (AccuracyWarning) of those that k or the spacing does not resolve.
+    """Return times as `times_of` does, with an AccuracyWarning if k or the spacing does not resolve some of them.
 
-    Nothing is said where values are traced, of pairs in an interval, whose sums are meant to be those of a band, nor
-    where the dimension of the manifold is not known.
+    No warning is issued if values are traced, if pairs lie in an interval (their sums are band-limited on purpose), or
+    if the dimension of the manifold is not known.
     """
     times = times_of(pairs, times)
     known, at = jax.lax.stop_gradient((pairs, times))
@@ -216,25 +215,25 @@ def resolved_times(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
 
 
 _EXPONENTS = np.geomspace(0.5, 8, 33)
-"""Between a strip, which is a line to all eigenfunctions that were computed, and a corner of Dirichlet sides in 3D."""
+"""From ½ for a thin strip, whose lowest eigenfunctions vary along one axis, to 8 for a 3D corner of Dirichlet sides."""
 _RESOLVING = scipy.special.gammainccinv(_EXPONENTS, TAIL_LIMIT)
-"""The Λt from which on no more than that share of the heat trace lies beyond Λ, for each of these exponents."""
+"""The least Λt at which at most `TAIL_LIMIT` of the heat trace lies beyond Λ, for each of these exponents."""
 _POINTS, _WEIGHTS = np.polynomial.laguerre.laggauss(24)
-"""Gauss and Laguerre's quadrature, of f(u) e^(−u) from 0 to ∞."""
+"""Gauss–Laguerre quadrature of f(u) e^(−u) from 0 to ∞."""
 
 
-# If N(λ) = N(Λ) (λ/Λ)^a, what lies beyond Λ is
+# If N(λ) = N(Λ) (λ/Λ)^a, the part beyond Λ is
 #
 #     ∫_Λ^∞ e^(−λt) dN = N(Λ) a (Λt)^(−a) ∫_Λt^∞ e^(−y) y^(a−1) dy = N(Λ) (a/x) e^(−x) ∫_0^∞ (1 + u/x)^(a−1) e^(−u) du
 #
-# with x = Λt and y = x + u. The incomplete gamma function, which is the integral in the middle, takes JAX ten times as
-# long to compile, and thirty times as long to compute.
+# with x = Λt and y = x + u. JAX's incomplete gamma function, which is the integral in the middle, takes ten times as
+# long to compile and thirty times as long to run.
 def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return ∫ e^(−λt) dN over λ > Λ, with N(λ) = count · (λ/Λ)^exponent and x = Λt.
 
-    To 1e-3 from x = 0.1 on, to 1e-7 from x = 1 on, for exponents from ½ to 8; x below 1e-3 counts as that.
+    The accuracy for exponents from ½ to 8 is 1e-3 for x ≥ 0.1 and 1e-7 for x ≥ 1. If x < 1e-3, x = 1e-3 is used.
     """
-    x = jnp.maximum(x, 1e-3)  # nothing overflows
+    x = jnp.maximum(x, 1e-3)  # prevents overflow
     count, exponent = (jnp.expand_dims(each, tuple(range(x.ndim - each.ndim))) for each in (count, exponent))
 
     def add(total: Array, node: tuple[Array, ...]) -> tuple[Array, None]:
@@ -246,7 +245,7 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     return count * exponent / x * jnp.exp(-x) * integral
 
 
-# For a = 1 the integral is 1, for a = 3/2, by parts, 1 + (√π/2) erfc(√x) e^x/√x.
+# The integral is 1 for a = 1. For a = 3/2, integration by parts gives 1 + (√π/2) erfc(√x) e^x/√x.
 def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
     """Return `beyond` of x (...) for Weyl's exponent d/2, d = 2 or 3."""
     if dimension == 2:
@@ -256,7 +255,7 @@ def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
 
 
 def resolving(share: float, dimension: int) -> float:
-    """Return the Λt from which on no more than this share of the heat trace lies beyond Λ, by Weyl's law."""
+    """Return the least Λt at which at most this share of the heat trace lies beyond Λ, by Weyl's law."""
     return float(scipy.special.gammainccinv(dimension / 2, share))
 
 
@@ -269,27 +268,27 @@ def _exponent(xp: Any, mean: Any) -> Any:
 def truncation_map(
     pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n_times"]
 ) -> Float[Array, "n_times *shape"]:
-    """Estimate, node by node, what part of the heat kernel signature lies beyond the k pairs.
+    """Estimate the share of the heat kernel signature beyond the k pairs at each node.
 
-    `truncation` estimates the mean over the domain; beside a Dirichlet side, in its corners, or where the tensors vary
-    from node to node, a single node can lack several times as much. Here Weyl's law is local: the function
-    N(λ, x) = Σ φᵢ(x)² over λᵢ < λ is taken for N(Λ, x) (λ/Λ)^a(x), Λ the first eigenvalue beyond the k. The constant
-    N(Λ, x) and the exponent a(x) come from the pairs, the latter from the mean of λ at the node, which is Λ a/(a + 1):
-    about d/2 inside and at natural sides, d/2 + 1 at a Dirichlet side.
+    `truncation` estimates the mean over the domain. A single node beside a Dirichlet side, in its corners, or where
+    tensors vary between nodes can lack several times as much. Here Weyl's law is local: the function N(λ, x) = Σ φᵢ(x)²
+    over λᵢ < λ is approximated by N(Λ, x) (λ/Λ)^a(x), where Λ is the first eigenvalue beyond the k. The pairs determine
+    N(Λ, x). The mean of λ at the node, which is Λ a/(a + 1), determines the exponent a(x). The exponent is about d/2
+    inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
 
-    An estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the largest estimate
-    where the mean was above 0.1 %, and up to 3 times at a mean of 1e-6.
+    The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the
+    largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6.
 
     Args:
         pairs: from `eigenpairs`.
         times: (n_times,) positive, in (metric length)².
 
     Returns:
-        (n_times, *shape), 0 … 1, relative to the signature of all pairs; NaN outside the mask, 0 at Dirichlet nodes and
-        where all pairs were computed. Constant to derivatives.
+        (n_times, *shape) between 0 and 1, relative to the signature of all pairs. NaN outside the mask; 0 at Dirichlet
+        nodes and if all pairs were computed. Derivatives treat the result as a constant.
 
     Raises:
-        ValueError: times that are not positive and finite; pairs in an interval.
+        ValueError: if times are not positive and finite, or if pairs lie in an interval.
     """
     return _map(*_estimated(pairs, times))
 
@@ -303,7 +302,7 @@ def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
     following = jnp.where(complete, 1, pairs.next_eigenvalue)
     at_zero = jnp.zeros(1, dtype)
     count = spectral_diagonal(pairs, Heat(at_zero))[0]
-    # The derivative of exp(−λt) by t at 0 is −λ.
+    # The derivative of exp(−λt) with respect to t at 0 is −λ.
     moment = -spectral_diagonal(pairs, Derivative(Heat(at_zero), Heat(jnp.ones(1, dtype))))[0]
     mean = moment / jnp.where(count > 0, count * following, 1)
     left = beyond(count, _exponent(jnp, mean), following * at.reshape(-1, *axes))

@@ -1,1 +1,1 @@
-"""Heat kernel signatures without eigenpairs: exp(−tM⁻¹K)M⁻¹ by polynomials and by rational functions."""
+"""Heat kernel signatures without eigenpairs, by polynomial and rational approximations of exp(−tM⁻¹K)M⁻¹."""

@@ -1,4 +1,4 @@
-"""Colouring: how far apart sources must be, and to what degree the exponential must be expanded, for a tolerance."""
+"""Colouring: the spacing of sources and the degree of the expansion that a given tolerance needs."""
 
 import math
 from dataclasses import dataclass
@@ -14,29 +14,29 @@ from hks_jax.linear.chebyshev import coefficient_tails, least_degree
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
 
 _STEEPEST = 0.9
-"""How much of the steepest decay of M⁻¹ is made use of: near all of it the bound has a large factor before it."""
+"""The share of the steepest decay rate of M⁻¹ that the bound uses. Close to 1 the factor of the bound is large."""
 
 
 @dataclass(frozen=True)
 class Colouring:
-    """How `hks_spectrum_free` probes: static, made by `colouring` from a field and times.
+    """The static settings of the probing in `hks_spectrum_free`, which `colouring` computes from a field and times.
 
-    Sources of one colour are ``spacing`` nodes apart along each axis (one or so more here and there, so that a
-    periodic axis comes out even), and the exponential is expanded to ``degree``.
+    Sources of one colour are ``spacing`` nodes apart along each axis. On a periodic axis some of these distances are
+    slightly larger, so that they add up to the length of the axis.
 
     Attributes:
-        spacing: nodes between sources, per axis; n nodes or more stand for one source on the whole axis.
-        degree: of the Chebyshev expansion in M⁻¹K.
-        mass_degree: of the polynomial that stands for M⁻¹; 1 with a lumped mass, which is inverted exactly.
-        columns: how many colours are worked on at once.
-        top: the bound on the eigenvalues that the expansion is for.
-        low: the bound from below on those of D⁻¹M, D the row sums.
-        reach: per axis what `Bounds.reach` was, times the longest time.
-        across: per axis what `Bounds.across` was.
-        error: per time what the error stays below, relative to the smaller of (4πt)^(−d/2) and the largest value a
-            node can have, rounding included. With a lumped mass a bound (but for a probability of 10⁻⁶ that `top` is
-            too small). With a consistent mass it is proven to first order in the polynomial for M⁻¹, as t → 0 and for a
-            constant metric; for varying ones it was never exceeded, and fifty times too large or more.
+        spacing: the distance between sources on each axis, in nodes; n or more for one source on an axis of n nodes.
+        degree: the degree of the Chebyshev expansion in M⁻¹K.
+        mass_degree: the degree of the polynomial approximation of M⁻¹; 1 for a lumped mass, which is inverted exactly.
+        columns: the number of colours that are processed at once.
+        top: the upper bound on the eigenvalues for which the expansion is made.
+        low: the lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M.
+        reach: `Bounds.reach` for each axis, times the longest time.
+        across: `Bounds.across` for each axis.
+        error: an error bound at each time that includes rounding, relative to the smaller of (4πt)^(−d/2) and the
+            largest possible value at a node. For a lumped mass it holds except with probability 10⁻⁶, if `top` is too
+            small. For a consistent mass it is proven to first order in the polynomial for M⁻¹, for t → 0 and for a
+            constant metric. Errors for varying metrics were at most a fiftieth of it.
     """
 
     spacing: tuple[int, ...]
@@ -50,7 +50,7 @@ class Colouring:
     error: tuple[float, ...]
 
     def colours(self, space: GridSpace) -> StaticArray:
-        """Number the colours of the free nodes, int (*shape); −1 at the others."""
+        """Return the colours of the free nodes as integers (*shape), with −1 at the other nodes."""
         axes = [
             axis_colours(n, s, wraps)
             for n, s, wraps in zip(space.node_shape, self.spacing, space.periodic, strict=True)
@@ -63,22 +63,22 @@ class Colouring:
         return StaticArray(result)
 
     def n_vectors(self, space: GridSpace) -> int:
-        """Count the colours."""
+        """Return the number of colours."""
         return int(self.colours(space).value.max()) + 1
 
 
 def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> Any:
-    """Bound √(D_x D_y) times the kernel between nodes ``distance`` apart along an axis.
+    """Return a bound on √(D_x D_y) times the kernel between nodes at this distance along an axis.
 
-    Davies' method: with the weights exp(αi) along the axis, ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)), κ the
-    reach, as only the symmetric part of the weighted K counts, in which couplings across the axis are multiplied by
-    cosh α. So the kernel is at most exp(−αs + tκ (cosh α − 1)), least at sinh α = s/tκ: the Gauss kernel
-    exp(−s²/2tκ) for s ≪ tκ, and what random walks do instead for s ≫ tκ.
+    Davies' method uses the weights exp(αi) along the axis. Then ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)),
+    where κ is the reach: only the symmetric part of the weighted K matters, in which couplings across the axis are
+    multiplied by cosh α. So the kernel is at most exp(−αs + tκ (cosh α − 1)), whose minimum is at sinh α = s/tκ. This
+    is the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ and the decay of a random walk for s ≫ tκ.
 
-    A consistent mass has an inverse that is not local. The symmetric part of the weighted M is M + (cosh α − 1) C, C
-    its couplings across the axis, and −C ⪯ βM: it is at least low (1 − β (cosh α − 1)) D, and the inverse decays like
-    exp(−αs) over that. This factor times the one above is a bound as t → 0, and for a constant metric; in between it
-    is not proven for metrics that vary from node to node.
+    A consistent mass M has a nonlocal inverse. The symmetric part of the weighted M is M + (cosh α − 1) C, where C has
+    the couplings across the axis and −C ⪯ βM. So it is at least low (1 − β (cosh α − 1)) D, and the inverse is bounded
+    by exp(−αs) divided by that. The product of this and the bound above is a bound for t → 0 and for a constant metric.
+    For varying metrics and other times it is not proven.
     """
     s = np.asarray(distance, float)
     alpha = np.arcsinh(s / reach_time)
@@ -90,24 +90,24 @@ def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> An
 
 
 def _unit(time: float, limits: Bounds, dimension: int) -> float:
-    """Return the unit of errors, times the least entry of D.
+    """Return the unit of errors times the least entry of D.
 
-    The unit is the flat kernel's diagonal, or the largest 1/D where time is below the resolution.
+    The unit is the diagonal of the flat kernel, or the least 1/D if the grid does not resolve the time.
     """
     return limits.least_mass * min((4 * math.pi * time) ** (-dimension / 2), 1 / limits.greatest_mass)
 
 
 def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Bounds, space: GridSpace) -> float:
-    """Bound the error at one time, relative to the unit of errors.
+    """Return a bound on the error at one time, relative to the unit of errors.
 
-    Two parts: the expansion's tail, and what other sources of the colour add. The latter is the kernel at their
-    distance, and no more than the tail beyond as many terms as there are nodes between, for a polynomial of lower
-    degree does not reach there (lumped mass).
+    The bound is the sum of the expansion's tail and the contributions of the other sources of a colour. A contribution
+    is the kernel at the source's distance. For a lumped mass it is at most the expansion's tail from the degree that
+    equals the distance in nodes, because polynomials of lower degree do not couple the two nodes.
     """
     low, d = limits.low, space.dimension
     tails = coefficient_tails(time * limits.top / 2)
     beyond = float(tails[min(degree + 1, tails.size - 1)])
-    # The sources of one colour, by how many spacings they are away along each axis; all but the first are there twice.
+    # The distances of the sources of one colour along each axis, in spacings. All but the first occur twice.
     steps = [np.arange(_steps(*of_axis)) for of_axis in zip(space.node_shape, spacing, space.periodic, strict=True)]
     distances = [s * along for s, along in zip(spacing, steps, strict=True)]
     of_axes = zip(distances, time * limits.reach, limits.across, strict=True)
@@ -122,11 +122,11 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
 
 
 def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) -> float:
-    """Bound the error of taking P for M⁻¹, relative to the unit of errors, to first order in ε = max |1 − μ p(μ)|.
+    """Return a first-order bound in ε = max |1 − μ p(μ)| on the relative error of the approximation P of M⁻¹.
 
-    With w = M^(−½)e_x, S = M^(−½)KM^(−½) and P = M^(−½)(1 − E)M^(−½), ‖E‖ ≤ ε, Duhamel's formula and an integration by
-    parts where the solution is not smooth yet bound the error by 4.5 ε ‖w‖ ‖exp(−St/4)w‖, that is, by
-    4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)). Neither of these is more than 1/(low D).
+    Let w = M^(−½)e_x, S = M^(−½)KM^(−½) and P = M^(−½)(1 − E)M^(−½) with ‖E‖ ≤ ε. Duhamel's formula, with integration
+    by parts at small times, bounds the error by 4.5 ε ‖w‖ ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)). Both factors
+    under the root are at most 1/(low D). The result is relative to the unit of errors.
     """
     low = limits.low
     if low == 1:
@@ -136,23 +136,23 @@ def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) ->
 
 
 def rounding_error(time: float, limits: Bounds, dimension: int, eps: float) -> float:
-    """Return what rounding leaves of the signature, relative to the unit of errors.
+    """Return an estimate of the rounding error of the signature, relative to the unit of errors.
 
-    The vectors of the recurrence are as large as M⁻¹ at their source, up to 1/(low D), and D itself is rounded; what
-    rounding leaves of them does not grow with the degree as far as measured, and was 0.05 to 0.7 of this in float32.
+    The vectors of the recurrence are as large as M⁻¹ at their source, at most 1/(low D), and D is rounded too. Measured
+    errors did not grow with the degree and were 0.05 to 0.7 times this estimate in float32.
     """
     return eps * (1 + 1 / limits.low) / _unit(time, limits, dimension)
 
 
 def _steps(n: int, spacing: int, wraps: bool) -> int:
-    """Count the distances, zero among them, at which other sources are on an axis."""
+    """Return the number of distances between sources on an axis, including zero."""
     if wraps:
         return max(n // spacing, 1) // 2 + 1
     return -(-n // min(spacing, n))
 
 
 def least_mass_degree(times: Float[np.ndarray, " m"], limits: Bounds, dimension: int, tolerance: float) -> int:
-    """Return how many steps invert the mass to the tolerance at all times; 1 if it is lumped."""
+    """Return the polynomial degree that inverts the mass to the tolerance at all times; 1 for a lumped mass."""
     degree = 1
     while max(mass_error(degree, time, limits, dimension) for time in times) > tolerance:
         degree += 1
@@ -168,7 +168,7 @@ def choose(
     columns: int,
     eps: float,
 ) -> Colouring:
-    """Choose the least spacing and degree whose bound is below the tolerance at all times."""
+    """Return the least spacing and degree whose error bound is below the tolerance at all times."""
     d, shape, low = space.dimension, space.node_shape, limits.low
     others = [mass_error(mass_degree, time, limits, d) + rounding_error(time, limits, d, eps) for time in times]
     tolerance -= max(others)
@@ -176,7 +176,7 @@ def choose(
     def least(time: float, share: float) -> int:
         return least_degree(time * limits.top / 2, share * tolerance * _unit(time, limits, d))
 
-    # It counts once at every source that the expansion reaches: the node itself and its neighbours of one colour.
+    # The tail adds to the error once for each source in reach: the node and its 3ᵈ − 1 neighbours of the same colour.
     degree = max(1, *(least(time, 0.05 * low / 3**d) for time in times))
     spacing = (1,) * d
     for time in times:
@@ -189,7 +189,7 @@ def choose(
             allowed /= 2
         spacing = tuple(map(max, spacing, trial))
     if low == 1:
-        # Or else no wider than the expansion reaches: then nothing comes from other sources.
+        # Alternatively, a spacing that exceeds the degree of the expansion excludes contributions of other sources.
         shortest = max(least(time, 1.0) for time in times)
         apart = tuple(min(shortest + 1, n) for n in shape)
         if math.prod(apart) <= math.prod(spacing):

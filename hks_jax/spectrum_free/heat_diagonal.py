@@ -1,4 +1,4 @@
-"""Heat kernel signatures without eigenpairs."""
+"""The heat kernel signature without eigenpairs, by colouring or by selected inversion."""
 
 from functools import partial
 from typing import Any
@@ -37,33 +37,32 @@ def hks_spectrum_free(
 ) -> Float[Array, "n_times *shape"]:
     """Compute the heat kernel signature without eigenpairs: the diagonal of exp(−tM⁻¹K)M⁻¹.
 
-    What all eigenpairs of the same discretisation would give, at any t. The cost of colouring grows with t/h², where
-    that of eigenpairs falls; that of selected inversion is the same at any t. docs/spectrum-free.md derives the bounds.
+    The result is that of all eigenpairs of the discretisation, at any t. The cost of colouring grows with t/h², whereas
+    the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md derives the bounds.
 
     Args:
-        domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of one from `assemble`.
+        domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
         times: (n_times,) positive, in (metric length)².
-        boundary: see `assemble`; belongs to the pencil if one is given.
-        mass: likewise. ``"lumped"`` is 50 to 100 times as fast with colouring.
-        method: ``"colouring"`` (grids): Chebyshev polynomials on sums of point sources that are far enough apart, all
-            times from the same vectors. ``"selected-inversion"``: rational approximation and selected inversion, to
-            about 1e-10 at any time, one time after another; O(n^1.5) operations a time for n nodes in 2D, O(n²) in 3D,
-            with the memory of factors in complex numbers. ``"auto"``: whichever takes less work. Or a `Colouring` that
-            `colouring` made beforehand, which is what colouring needs under `jax.jit`.
-        tolerance: what the error of colouring stays below at every node, relative to the smaller of (4πt)^(−d/2) and
-            the largest value that a node can have (`Colouring.error` says how far that is proven); of a potential times
-            exp(−vt), v its least value. Selected inversion does not use it.
+        boundary: see `assemble`; a given pencil already contains it.
+        mass: the same. With colouring, ``"lumped"`` is 50 to 100 times as fast.
+        method: ``"colouring"`` (on grids) applies Chebyshev polynomials to sums of distant point sources, with the same
+            vectors for all times. ``"selected-inversion"`` uses a rational approximation with an error of about 1e-10.
+            For n nodes each time takes O(n^1.5) operations in 2D, O(n²) in 3D, and memory for complex factors.
+            ``"auto"`` chooses the method with less work. Under `jax.jit`, colouring needs a `Colouring` from
+            `colouring`.
+        tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
+            largest possible value at a node; with a potential, times exp(−vt), where v is its least value. See
+            `Colouring.error` for proofs. Selected inversion does not use it.
 
     Returns:
-        (n_times, *shape) in 1/(metric length)^d; NaN outside the mask, 0 at Dirichlet nodes. NaN throughout where a
+        (n_times, *shape) in 1/(metric length)^d; NaN outside the mask, 0 at Dirichlet nodes. All values are NaN if a
         given `Colouring` was made for a smaller spectrum or shorter times.
 
     Raises:
-        ValueError: bad times, tolerance or method; a tolerance below what rounding leaves in the dtype (``"auto"`` then
-            takes selected inversion where memory allows); a time so large that colouring would take about as many
-            vectors as there are nodes; a mesh on which ``"auto"`` would take more than 8 GB; no `Colouring` under
-            `jax.jit`.
-        TypeError: colouring on a mesh.
+        ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error (``"auto"``
+            then uses selected inversion if memory suffices), if a time is so large that colouring takes about as many
+            vectors as nodes, if ``"auto"`` takes more than 8 GB on a mesh, or if `jax.jit` lacks a `Colouring`.
+        TypeError: if colouring is used on a mesh.
     """
     pencil, origin = from_lower_bound(_read_as_unknowns(pencil_of(domain, boundary, mass)))
     times = checked_times(times, pencil.parts[0].stiffness.dtype)
@@ -71,7 +70,7 @@ def hks_spectrum_free(
     settings = choose_method(pencil, times, method, tolerance)
     scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
     values = [_diagonal(part, times, settings, scale, checked=given) for part in pencil.parts]
-    # On a doubled domain, heat that starts at a node is even and odd by halves.
+    # On a doubled domain a point source is half the sum of an even and an odd function.
     return jnp.mean(jnp.stack(values), axis=0)
 
 
@@ -84,22 +83,21 @@ def colouring(
     memory: float = 2e9,
     slack: float = 1.0,
 ) -> Colouring:
-    """Choose spacing and degree for `hks_spectrum_free`, whose arguments these are, from the error bound.
+    """Choose spacing and degree from the error bound, for these arguments of `hks_spectrum_free`.
 
-    Needs concrete values.
+    Values must be concrete.
 
     Args:
-        memory: bytes that the working vectors may take; fewer vectors at once where it is short.
-        slack: ≥ 1: be prepared for a spectrum and a reach so many times as large, as fields have that are still to
-            come (in a fit, say).
+        memory: the maximum size of the working vectors in bytes, which limits the number of vectors at once.
+        slack: a factor ≥ 1 by which spectrum and reach may grow, for example in later fields of a fit.
 
     Returns:
-        The settings, static, with the error bound at each time.
+        The static settings, with the error bound at each time.
 
     Raises:
-        ValueError: bad arguments, a tolerance below what rounding leaves in the dtype, values that are traced, or
-            about as many vectors as nodes.
-        TypeError: a mesh.
+        ValueError: if arguments are invalid, if the tolerance is below the rounding error, if values are traced, or if
+            about as many vectors as nodes are needed.
+        TypeError: if the domain is a mesh.
     """
     pencil = _read_as_unknowns(pencil_of(domain, boundary, mass))
     require_grid(pencil)
@@ -115,8 +113,8 @@ def colouring(
 def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
     if any(part.row_sums is not None for part in pencil.parts):
         raise ValueError(
-            'domain: got a pencil of the quadrature "cancelling", from whose unknowns values are read that this method '
-            'does not compute; expected "gauss". Or compute eigenpairs, and the signature from them'
+            'domain: got a pencil with the quadrature "cancelling", whose nodal values this method cannot compute; '
+            'expected "gauss". Or compute the signature from eigenpairs'
         )
     return pencil
 
@@ -124,7 +122,7 @@ def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
 def _diagonal(
     part: Pencil, times: Float[Array, " m"], settings: Colouring | None, scale: Float[Array, " m"], checked: bool
 ) -> Float[Array, "m *shape"]:
-    # Scales come before NaN outside, which would reach their derivatives as 0·NaN.
+    # Scale before NaN is inserted, because NaN would enter the derivatives of the scales as 0·NaN.
     space = part.space
     if settings is None:
         return space.extend(
@@ -132,7 +130,7 @@ def _diagonal(
         )
     values = scale.reshape(-1, *[1] * len(space.node_shape)) * _by_colours(settings, part, times)
     if checked:
-        # A factor, so that the derivatives are NaN too.
+        # Multiplication makes the derivatives NaN as well.
         fits = _fits(settings, *jax.lax.stop_gradient((part, times)))
         values = values * nan_outside(jnp.ones_like(values), fits)
     return nan_outside(jnp.where(space.free, values, 0), space.domain)
@@ -146,7 +144,7 @@ def _by_colours(settings: Colouring, part: Pencil, times: Float[Array, " m"]) ->
 
 
 def _fits(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Array:
-    """Tell whether given settings were made for this pencil and these times, or larger ones."""
+    """Return whether the settings are valid for this pencil and these times."""
     low = jnp.asarray(settings.low, times.dtype)
     actual, rounding = bounds(part, low, settings.mass_degree), 1.001
     fits = actual.top <= rounding * settings.top

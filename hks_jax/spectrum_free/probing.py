@@ -1,4 +1,4 @@
-"""The diagonal of exp(−tM⁻¹K)M⁻¹ by Chebyshev polynomials on coloured sources, and its derivative."""
+"""The diagonal of exp(−tM⁻¹K)M⁻¹ by Chebyshev polynomials applied to coloured sources, and its derivative."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,9 +23,10 @@ T = TypeVar("T")
 def coloured_diagonal(
     settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Float[Array, "m terms"]
 ) -> Float[Array, "m *shape"]:
-    """Return Σₙ cₙ Tₙ(2A/top − 1) P at the sources, A = PK, for every row of coefficients; 0 where there is no colour.
+    """Return Σₙ cₙ Tₙ(2A/top − 1) P with A = PK at the sources, for every row of coefficients.
 
-    The colours (*shape) are 0, 1, … or −1; the vector of a colour is 1 at all its nodes.
+    The colours (*shape) are 0, 1, …, or −1 for no colour, where the result is 0. The vector of a colour is 1 at its
+    nodes.
     """
     stiffness, solve_mass = _products(settings, pencil)
 
@@ -42,17 +43,15 @@ def coloured_diagonal(
     return _sum_of_blocks(settings, colours, term, start)
 
 
-# y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with  = 2PK/top − 1, and the result is Σₙ cₙ v∘yₙ. Taking P for M⁻¹, of
-# which dM⁻¹ = −M⁻¹ dM M⁻¹, the tangents of aₙ = PKyₙ are P(dK yₙ + K dyₙ − dM aₙ), and dy₀ = −P dM y₀.
-#
-# Transposed: with the cotangent g, pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂, sₙ = Σₜ cₙ(t) g(t), f₀ = 1, fₙ = 2, from the
-# last n down to 0 (Clenshaw's recurrence), and the cotangents are
+# y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with  = 2PK/top − 1, and the result is Σₙ cₙ v∘yₙ. P approximates M⁻¹, and dM⁻¹
+# = −M⁻¹ dM M⁻¹. So the tangents of aₙ = PKyₙ are P(dK yₙ + K dyₙ − dM aₙ), and dy₀ = −P dM y₀.
+# The transpose with the cotangent g is Clenshaw's recurrence pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂ from the last n down to 0,
+# where sₙ = Σₜ cₙ(t) g(t), f₀ = 1 and fₙ = 2. The cotangents are
 #
 #     of K: Σₙ (2fₙ/top) pₙ₊₁ ⊗ yₙ,    of M: −p₀ ⊗ y₀ − Σₙ (2fₙ/top) pₙ₊₁ ⊗ aₙ,    of cₙ(t): Σ g(t)∘v∘yₙ.
-#
-# The yₙ are wanted in the order n = N − 1 … 0, and yₙ₋₁ = 2Âyₙ − yₙ₊₁ gives them in that order from the last two:
-# three-term recurrences run as well backwards as forwards, rounding grows like |Uₙ| ≤ n + 1 either way. So nothing
-# is stored that grows with the degree.
+# The yₙ are needed in the order n = N − 1 … 0, and yₙ₋₁ = 2Âyₙ − yₙ₊₁ computes them in this order from the last two.
+# The three-term recurrence is as stable backwards as forwards: rounding errors grow like |Uₙ| ≤ n + 1 in both
+# directions. So the memory does not grow with the degree.
 @coloured_diagonal.defjvp
 def _coloured_diagonal_jvp(
     settings: Colouring, colours: StaticArray, primals: tuple, tangents: tuple
@@ -133,7 +132,7 @@ def _cotangent(
 
 
 def _scaled(top: float, image: Array, y: Array) -> Array:
-    """Return Ây, of the image PKy and y."""
+    """Return Ây, given y and its image PKy."""
     return (2 / top) * image - y
 
 
@@ -145,7 +144,7 @@ def _products(settings: Colouring, pencil: NodalPencil) -> tuple[Callable[[Array
 def _sum_of_blocks(
     settings: Colouring, colours: StaticArray, term: Callable[[Float[Array, "*shape b"], T], T], total: T
 ) -> T:
-    """Return the total after the terms of all blocks of colours, each told the vectors of its colours."""
+    """Return the total after adding the term of each block of colours, a function of the vectors of its colours."""
     numbers, dtype = jnp.arange(settings.columns, dtype=jnp.int32), jax.tree.leaves(total)[0].dtype
 
     def step(number: Array, total: T) -> T:

@@ -1,6 +1,6 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by rational approximation and selected inversion.
 
-exp(−x) ≈ Re Σ w/(x − z) by the Carathéodory–Fejér method, so the diagonal is that of Re Σ w (tK − zM)⁻¹.
+The Carathéodory–Fejér method gives exp(−x) ≈ Re Σ w/(x − z). The diagonal is then that of Re Σ w (tK − zM)⁻¹.
 """
 
 from functools import lru_cache
@@ -22,16 +22,16 @@ _TERMS, _SAMPLES, _SCALE = 75, 1024, 9.0
 
 @lru_cache(maxsize=8)
 def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np.ndarray, " p"]]:
-    """Return poles z and weights w with exp(−x) ≈ Re Σ w/(x − z) for all x ≥ 0, one of each conjugate pair.
+    """Return poles z and weights w with exp(−x) ≈ Re Σ w/(x − z) for all x ≥ 0, one for each conjugate pair.
 
-    The error falls by 9.289² = 86 with every pair: 1.3e-2, 1e-4, 2e-6, …, 1e-13 for seven. Trefethen, Weideman and
-    Schmelzer, Talbot quadratures and rational approximations (2006), section 4: the half-line is mapped to the unit
-    circle, the function there is expanded in Chebyshev polynomials, and a singular vector of the Hankel matrix of its
-    coefficients has, but for a tiny remainder, the poles of the best approximation as zeros.
+    The error falls by 9.289² = 86 with every pair: 1.3e-2, 1e-4, 2e-6, …, 1e-13 for seven. The source is Trefethen,
+    Weideman and Schmelzer, Talbot quadratures and rational approximations (2006), section 4. The half-line is mapped to
+    the unit circle, and the function is expanded in Chebyshev polynomials. The zeros of a singular vector of the Hankel
+    matrix of its coefficients are very close to the poles of the best approximation.
     """
     degree = 2 * pairs
     circle = np.exp(2j * np.pi * np.arange(_SAMPLES) / _SAMPLES)
-    # u in [−1, 1] stands for x = −scale (u − 1)/(u + 1).
+    # u in [−1, 1] represents x = −scale (u − 1)/(u + 1).
     u = circle.real
     with np.errstate(divide="ignore"):
         samples = np.where(u > -1, np.exp(_SCALE * (u - 1) / np.maximum(u + 1, 1e-16)), 0)
@@ -39,7 +39,7 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
     left, values, right = np.linalg.svd(hankel(coefficients[1 : _TERMS + 1]))
     value, first, last = values[degree], left[::-1, degree], right[degree]
     analytic = np.polyval(coefficients[_TERMS::-1], circle)
-    # The extended approximation: the analytic part less σ times a quotient of modulus one on the circle.
+    # The extended approximation is the analytic part minus σ times a quotient of modulus one on the circle.
     quotient = np.fft.fft(first, _SAMPLES) / np.fft.fft(last, _SAMPLES)
     extended = analytic - value * circle**_TERMS * quotient
     zeros = np.roots(last)
@@ -48,7 +48,7 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
     numerator = np.fft.fft(extended * np.polyval(np.poly(outside), circle)).real[degree::-1] / _SAMPLES
     apart = [np.prod(q - np.delete(outside, i)) for i, q in enumerate(outside)]
     residues = np.polyval(numerator, outside) / np.array(apart)
-    # Back from the circle to x ≤ 0, where both q and 1/q land on one pole.
+    # Map the circle back to x ≤ 0, where q and 1/q have the same image.
     poles = _SCALE * ((outside - 1) / (outside + 1)) ** 2
     weights = 4 * residues * poles / (outside**2 - 1)
     upper = poles.imag > 0
@@ -57,7 +57,7 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
 
 
 def pole_pairs(dtype: Any) -> int:
-    """Return how many pairs of poles approximate the exponential to rounding."""
+    """Return the number of pole pairs that approximates the exponential to rounding."""
     return 7 if jnp.finfo(dtype).bits > 32 else 4
 
 
@@ -65,11 +65,11 @@ def pole_pairs(dtype: Any) -> int:
 def selected_inversion(
     stiffness: PatternedOperator, mass: Operator, times: Float[Array, " m"], dissection: Dissection
 ) -> Float[Array, "m n_dof"]:
-    """Return the diagonal at each time; M has no entries where K has none, whose pattern is dissected."""
+    """Return the diagonal at each time. The sparsity pattern of K, which includes that of M, is dissected."""
     poles, weights = exponential_poles(pole_pairs(times.dtype))
     complex_type = np.result_type(times.dtype, np.complex64)
 
-    # One pole at a time, also in the transpose: what it needs is computed again.
+    # Process one pole at a time, also in the transpose, where intermediate results are recomputed.
     @jax.checkpoint
     def term(inputs: tuple[Array, Array, Array]) -> Array:
         time, pole, weight = inputs

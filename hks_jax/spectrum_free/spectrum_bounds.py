@@ -1,4 +1,4 @@
-"""Bounds on the spectra that polynomials are built for, and on how fast heat travels along an axis."""
+"""Bounds on the spectra for the polynomials and on the speed of heat along an axis."""
 
 from dataclasses import replace
 from functools import partial
@@ -19,17 +19,17 @@ _STEPS, _MASS_STEPS = 50, 200
 
 
 class Bounds(NamedTuple):
-    """What a pencil's polynomials must be fit for; once known, NumPy's numbers in double precision.
+    """Bounds for the polynomials of a pencil; for concrete values, NumPy numbers in double precision.
 
     Attributes:
         top: an upper bound on the eigenvalues of PK.
-        low: a lower bound on those of D⁻¹M, D the row sums of M; 1 if lumped.
-        reach: (d,) per axis, a bound on the eigenvalues of D⁻¹ times the couplings of K across the axis. The discrete
-            counterpart of 2 gᵃᵃ/h².
-        across: (d,) per axis, the least β for which the couplings C of M across the axis satisfy −C ⪯ βM; 0 if lumped.
-            It is 1 for a constant metric.
+        low: a lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M; 1 if the mass is lumped.
+        reach: (d,) for each axis a bound on the eigenvalues of D⁻¹ times the couplings of K across the axis. It is the
+            discrete counterpart of 2 gᵃᵃ/h².
+        across: (d,) for each axis the least β such that the couplings C of M across the axis satisfy −C ⪯ βM. It is 1
+            for a constant metric, and 0 if the mass is lumped.
         least_mass: the least entry of D.
-        greatest_mass: the greatest.
+        greatest_mass: the greatest entry of D.
     """
 
     top: Any
@@ -59,7 +59,7 @@ def mass_bound(pencil: Pencil) -> Float[Array, ""]:
 def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     """Return the bounds of a pencil on a grid, given `mass_bound`.
 
-    The top is Gershgorin's where that is less than a Lanczos estimate with its margin.
+    The upper bound is the smaller of Gershgorin's bound and a Lanczos estimate with a safety margin.
     """
     nodal, d = nodal_pencil(pencil), pencil.space.dimension
     entries, sums = nodal.stiffness.coefficients, nodal.lumped_or_zero
@@ -73,7 +73,7 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
         apply = replace(nodal.stiffness, coefficients=matrix).of_columns()
         return lanczos_bound(apply, solve_mass, sums[..., None], pencil.space.n_dof, _STEPS)
 
-    # One after the other: side by side they would be compiled as many times.
+    # A sequential map compiles the computation only once.
     top, *greatest = jax.lax.map(largest, measured)
     if nodal.mass.is_diagonal:
         top, across = jnp.minimum(top, gershgorin(entries, 1 / nodal.lumped)), jnp.zeros(d, sums.dtype)
@@ -84,9 +84,10 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     return Bounds(top, low, reach, across, jnp.min(jnp.where(nodal.free, sums, jnp.inf)), jnp.max(sums))
 
 
-# M − C, the couplings within the lines of nodes that cross the axis at right angles, is a diagonal of blocks of M and
-# so not negative, and −C = (M − C) − M ⪯ βM with 1 + β the greatest eigenvalue of M⁻¹(M − C).
+# M − C has the couplings within the layers of nodes that are perpendicular to the axis. It consists of diagonal blocks
+# of M and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest eigenvalue of M⁻¹(M −
+# C).
 def _within_lines(mass: Float[Array, "offsets *shape"], offsets: np.ndarray) -> Float[Array, "d offsets *shape"]:
-    """Return the M − C of each axis for a consistent mass."""
+    """Return the matrix M − C of each axis for a consistent mass."""
     d = offsets.shape[1]
     return jnp.where((offsets.T == 0).reshape(d, -1, *[1] * d), mass, 0)

@@ -247,15 +247,15 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
         assert main([*command, *more]) == 2
         assert message in capsys.readouterr().err
 
-    refused("--noise: it is of tensors, which", "--noise", "0.1")
-    refused("--noise: got 'roughness'; for tensors at the vertices", *of_tensors, "--noise", "roughness")
-    refused("--metric: a mesh has the metric of space unless --array names tensors", "--metric", "tensor")
-    refused("--interpolation: a mesh has the metric of space", "--interpolation", "log-euclidean")
-    refused("--metric: choose the metric of the tensors at the vertices", "--array", "D")
-    refused("--array: got 'E'; the arrays at the vertices are D", "--array", "E", "--metric", "tensor")
-    refused("--slice: it is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
-    refused("--boundary: got 'mirror'; a mesh takes one of neumann, dirichlet, mean", "--boundary", "mirror")
-    refused("--array: 'D' has 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
+    refused("--noise: this option needs tensors, which", "--noise", "0.1")
+    refused("--noise: got 'roughness'; expected a number", *of_tensors, "--noise", "roughness")
+    refused("--metric: this option needs tensors, but without --array", "--metric", "tensor")
+    refused("--interpolation: this option needs tensors", "--interpolation", "log-euclidean")
+    refused("--metric: the tensors at the vertices need a metric", "--array", "D")
+    refused("--array: got 'E'; expected an array at the vertices: D", "--array", "E", "--metric", "tensor")
+    refused("--slice: this option is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
+    refused("--boundary: got 'mirror'; expected neumann, dirichlet, mean", "--boundary", "mirror")
+    refused("--array: got 'D' with 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
 
 
 def test_signature_of_a_surface_without_some_vertices(tmp_path):

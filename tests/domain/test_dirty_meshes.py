@@ -162,7 +162,7 @@ def with_cap(height):
 @pytest.mark.parametrize("height", [3e-10, 0.0])
 def test_a_thin_triangle_is_named_and_its_edge_flipped_if_asked(height, tmp_path):
     vertices, faces = with_cap(height)
-    what = "so thin that float64 knows no metric of them" if height else "have no area"
+    what = "so thin that their metric is lost to rounding in float64" if height else "have no area"
     with pytest.raises(ValueError, match=rf"1 of 34 triangles (are )?{what} \(the first is face 31"):
         hj.SurfaceMesh(vertices, faces)
     with pytest.warns(UserWarning, match="1 edges through a vertex flipped$"):
@@ -178,7 +178,7 @@ def test_a_thin_triangle_is_named_and_its_edge_flipped_if_asked(height, tmp_path
 def test_what_float32_does_not_resolve_is_fine_in_float64():
     vertices, faces = with_cap(1e-5)
     assert np.isfinite(eigenvalues(hj.SurfaceMesh(vertices, faces))).all()
-    with pytest.raises(ValueError, match=r"so thin that float32 knows no metric .*, or use float64"):
+    with pytest.raises(ValueError, match=r"so thin that their metric is lost to .* float32 .*, or use float64"):
         hj.SurfaceMesh(vertices.astype(np.float32), faces)
 
 

@@ -191,7 +191,7 @@ def test_assembly_batches_like_a_loop(rng):
             "boundary: got 'robin'; expected one of 'neumann', 'dirichlet', 'mean', 'periodic', 'mirror'",
         ),
         ({"boundary": ("neumann",) * 4}, r"boundary: got .* expected one name, or a tuple of 2"),
-        ({"boundary": (("neumann", "periodic"), "neumann")}, "bind both sides"),
+        ({"boundary": (("neumann", "periodic"), "neumann")}, "on both sides"),
         ({"boundary": None}, "boundary: got None; expected one name"),
         ({"boundary": (("neumann",) * 3, "neumann")}, r"boundary: got .* for one axis; expected a name or a pair"),
         ({"mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),

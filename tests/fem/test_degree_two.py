@@ -154,8 +154,8 @@ def test_fields_and_forms_of_degree_two(rng):
     ("settings", "message"),
     [
         ({"degree": 3}, "degree: got 3; expected 1 or 2"),
-        ({"midpoints": on_sphere}, "midpoints: got with degree=1"),
-        ({"degree": 2, "mass": "lumped"}, "whose row sums vanish at the vertices"),
+        ({"midpoints": on_sphere}, "midpoints: got positions with degree=1"),
+        ({"degree": 2, "mass": "lumped"}, "row sums at the vertices are not positive"),
         ({"degree": 2, "midpoints": np.zeros((3, 3))}, r"midpoints: got shape \(3, 3\); expected \(120, 3\)"),
     ],
 )
@@ -168,5 +168,5 @@ def test_cells_turned_inside_out_are_refused():
     mesh = hj.examples.ball_mesh(1)
     places = middles(mesh)
     places[0] += [3.0, 0.0, 0.0]
-    with pytest.raises(ValueError, match="midpoints: they fold cells, or turn them inside out"):
+    with pytest.raises(ValueError, match="midpoints: got positions that fold or invert cells"):
         hj.assemble(mesh, degree=2, midpoints=places)

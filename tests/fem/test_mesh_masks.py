@@ -96,7 +96,7 @@ def test_bad_triangles_and_unused_vertices_are_left_out():
     icosahedron = hj.examples.sphere_mesh(1)
     vertices = np.concatenate([icosahedron.vertices, [[9.0, 9, 9]]])
     faces = np.concatenate([icosahedron.faces, [[0, 0, 1]]])
-    with pytest.raises(ValueError, match=r"vertices: 1 of 13 belong to no face .* or leave them out by a mask"):
+    with pytest.raises(ValueError, match=r"vertices: 1 of 13 belong to no face .* or exclude them by a mask"):
         hj.SurfaceMesh(vertices, faces)
     mesh = hj.SurfaceMesh(vertices, faces, mask=np.arange(21) < 20)
     values = hj.eigenpairs(mesh, 4).eigenvalues

@@ -187,7 +187,7 @@ def test_rows_over_time():
         plot.time_rows(rows, [0.1, 1], grid)
     with pytest.raises(ValueError, match="shared: got 'all'"):
         plot.time_rows(rows, [0.1, 1, 10], grid, shared="all")
-    with pytest.raises(ValueError, match="rows: got none"):
+    with pytest.raises(ValueError, match="rows: got no scalars"):
         plot.time_rows({}, [0.1], grid)
 
 

@@ -234,7 +234,7 @@ def test_ellipse_errors():
         ellipses(ax, field, sizes="big")
     with pytest.raises(ValueError, match=r"fill: got 1.5"):
         ellipses(ax, field, fill=1.5)
-    with pytest.raises(ValueError, match=r"every: got 0; expected positive integers"):
+    with pytest.raises(ValueError, match=r"every: got 0; expected one positive integer"):
         ellipses(ax, field, every=0)
 
 
@@ -425,7 +425,7 @@ def test_sensitivity_refuses_what_it_cannot_draw():
     ax = new_figure(3, 3).subplots()
     with pytest.raises(ValueError, match=r"gradient: got shape \(6, 6\); expected \(6, 6, 2, 2\)"):
         sensitivity(ax, Grid((6, 6)), np.zeros((6, 6)))
-    with pytest.raises(ValueError, match="gradient: 36 of 36 tensors drawn are NaN or infinite"):
+    with pytest.raises(ValueError, match="gradient: got 36 NaN or infinite tensors of 36"):
         sensitivity(ax, Grid((6, 6)), np.full((6, 6, 2, 2), np.nan), every=1)
 
 

@@ -101,5 +101,5 @@ def test_errors():
         volume_panels(holed[None], [1.0], GRID, node=(1, 2, 3))
     with pytest.raises(ValueError, match="axes: got 1; expected 3"):
         orthogonal_slices(new_figure(3, 3).subplots(1, 1, squeeze=False)[0], ramp(), GRID)
-    with pytest.raises(ValueError, match="inside: no node"):
+    with pytest.raises(ValueError, match="inside: got no node"):
         middle_node(np.zeros((2, 2, 2), bool))

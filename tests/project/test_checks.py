@@ -150,5 +150,5 @@ COMPLEX = {
 
 @pytest.mark.parametrize("case", COMPLEX)
 def test_complex_numbers_are_refused(case):
-    with pytest.raises(ValueError, match=f"^{case.split()[0]}: got complex numbers; expected real ones"):
+    with pytest.raises(ValueError, match=f"^{case.split()[0]}: got complex numbers; expected real numbers"):
         COMPLEX[case]()

@@ -151,14 +151,15 @@ def test_potentials_from_every_solver(rng):
     np.testing.assert_allclose(K, np.asarray(pencil.stiffness.to_dense()) + np.diag(V), rtol=1e-13)
     exact = scipy.linalg.eigvalsh(K, M)[:8]
     assert exact[0] < 0
-    for solver in ("auto", "dense", "block-lanczos"):
+    for solver in ("auto", "dense", "shift-invert", "block-lanczos"):
         pairs = hj.eigenpairs(moved, 8, solver=solver)
         np.testing.assert_allclose(pairs.eigenvalues, exact, rtol=1e-9)
         assert pairs.converged.all()
         assert pairs.complete_below >= pairs.eigenvalues[-1]
-    for solver in ("shift-invert", "chebyshev-filter"):
-        with pytest.raises(ValueError, match=f"solver: got '{solver}', which needs a positive semidefinite stiffness"):
-            hj.eigenpairs(moved, 8, solver=solver)
+    with pytest.raises(
+        ValueError, match="solver: got 'chebyshev-filter', which needs a positive semidefinite stiffness"
+    ):
+        hj.eigenpairs(moved, 8, solver="chebyshev-filter")
     with pytest.raises(ValueError, match=r"null_vectors: the stiffness does not annihilate vector 0: .*with_stiffness"):
         hj.eigenpairs(eqx.tree_at(lambda p: p.stiffness, pencil, moved.stiffness), 8)
 
@@ -216,7 +217,7 @@ def test_a_geometry_that_is_lacking_is_named():
             signature()
     with pytest.raises(ValueError, match="problem: got one without dimension or volume"):
         hj.weyl_count(pairs, [1.0])
-    with pytest.raises(ValueError, match="domain: nothing is known of the null space"):
+    with pytest.raises(ValueError, match="domain: got a stiffness K with an unknown null space"):
         hj.hks(pairs, TIMES, method="spectrum-free")
 
 
@@ -230,7 +231,7 @@ def test_what_sparse_pencil_refuses():
     bad[1, 1] = 2
     with pytest.raises(ValueError, match=r"null_vectors: the stiffness does not annihilate vector 1: ‖Kv‖ is 0\.\d+"):
         hj.sparse_pencil(K, M, null_vectors=bad)
-    with pytest.raises(ValueError, match="null_vectors: they depend on each other"):
+    with pytest.raises(ValueError, match="null_vectors: got dependent vectors"):
         hj.sparse_pencil(K, M, null_vectors=rigid[[0, 1, 0]])
     with pytest.raises(ValueError, match=r"null_vectors: got shape \(36,\); expected \(m, 36\)"):
         hj.sparse_pencil(K, M, null_vectors=rigid[0])
@@ -363,7 +364,7 @@ def test_pairs_in_an_interval_stay_so_in_files(tmp_path):
     pencil = sparse_path(30)
     read = load_pairs(save_pairs(tmp_path / "pairs.npz", hj.eigsh(pencil, interval=(0.1, 0.95))), pencil)
     assert not read.lowest
-    with pytest.raises(ValueError, match="pairs: these lie in an interval"):
+    with pytest.raises(ValueError, match="pairs: got eigenpairs in an interval"):
         hj.truncation_map(read, [1.0])
     moved = hj.sparse_pencil(path(30) + sp.diags(np.linspace(-1, 1, 30)))
     file = save_pairs(tmp_path / "moved.npz", hj.eigsh(moved, k=3))

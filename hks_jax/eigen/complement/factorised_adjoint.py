@@ -6,7 +6,6 @@ by Weyl's law eigenvalues are spread evenly enough for that. The factorisations 
 all products with a Jacobian at one point.
 """
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.compilation import jit_quickly, known_here
 from hks_jax.eigen.complement import adjoint as complement
 from hks_jax.eigen.complement.adjoint import Adjoint, Columns, OfRows, Rows, Scalar, Shifts, Values, Vectors
 from hks_jax.eigen.inertia import LocatedPencil
@@ -56,11 +56,18 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     def prepare(self, pencil: SymmetricPencil, values: Values, k: int) -> Shifted:
         """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
+        if known_here((pencil, values)):
+            # One after another: the solver has compiled that.
+            dissection = jax.device_put(dissection)
+            shifts = self._shifts(pencil, np.asarray(values), self.groups(dissection, len(values), k, values.dtype))
+            each = [factorise(dissection, pencil.shifted(jnp.asarray(shift))) for shift in shifts]
+            stacked = jax.tree.map(lambda *x: np.stack(x), *((f.downward, f.upward, f.pivots) for f in each))
+            return Factorisation(dissection, *jax.device_put(stacked)), jax.device_put(shifts)
         # Compiled without the dissection: what a compiled function hands through is copied.
         factors, shifts = self._factorise(dissection, pencil, values, k)
         return Factorisation(dissection, *factors), shifts
 
-    @partial(jax.jit, static_argnames="k")
+    @jit_quickly(static_argnames="k")
     def _factorise(
         self, dissection: Dissection, pencil: SymmetricPencil, values: Values, k: int
     ) -> tuple[tuple[Any, ...], Shifts]:
@@ -68,7 +75,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
         return (factors.downward, factors.upward, factors.pivots), shifts
 
-    @jax.jit
+    @jit_quickly()
     def solve(self, prepared: Shifted, pencil: SymmetricPencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         factors, shifts = prepared

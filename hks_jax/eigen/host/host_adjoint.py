@@ -23,6 +23,7 @@ from hks_jax.eigen.complement.adjoint import Adjoint, Rows, Values, Vectors
 from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
+from hks_jax.traced import is_traced
 
 _BLOCK = 16
 """Columns solved at once: enough for fast products, few enough for the cache."""
@@ -59,8 +60,11 @@ class HostAdjoint(Adjoint[Pencil]):
                 warn_of_accuracy(complement.unsolved(failed, len(x)))
             return x.astype(rhs.dtype)
 
+        inputs = *data, values, vectors, rhs
+        if not is_traced(inputs):
+            return jax.device_put(on_host(*inputs))
         shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
-        return jax.pure_callback(on_host, shape, *data, values, vectors, rhs, vmap_method="sequential")
+        return jax.pure_callback(on_host, shape, *inputs, vmap_method="sequential")
 
 
 def _solve(

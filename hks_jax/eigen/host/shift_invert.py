@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
 from threadpoolctl import threadpool_limits
@@ -78,8 +79,7 @@ class ShiftInvert(Eigensolver[Pencil]):
         if is_traced(inputs):
             shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))
             return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
-        # Where JAX differentiates, `asarray` leaves them NumPy's, and the barrier makes JAX's arrays of them.
-        return jax.lax.optimization_barrier(tuple(map(jnp.asarray, solve(*inputs))))
+        return jax.device_put(solve(*inputs))  # `asarray` leaves them NumPy's where JAX differentiates
 
     def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float, report: Report) -> HostPairs:
         n = K.shape[0]
@@ -152,3 +152,14 @@ def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: flo
         np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
         complete_below,
     )
+
+
+def lower_bound(pencil: Pencil) -> Float[Array, ""]:
+    """Return a number below which inertia finds no eigenvalue; NaN where it is not certain."""
+    data, matrices = host_matrices(pencil)
+    K, M = matrices(*data)
+    typical = float(np.median(np.abs(K.diagonal()) / M.diagonal())) or 1.0
+    for below in 1e-3 * typical * 4.0 ** np.arange(25):
+        if inertia_on_host(K, M, -below) == (0, True):
+            return jax.device_put(np.asarray(-below, pencil.stiffness.dtype))
+    return jax.device_put(np.asarray(np.nan, pencil.stiffness.dtype))

@@ -1,3 +1,3 @@
-"""A page to explore signatures in a browser: one file, without a server, a network or another library."""
+"""A single-file page to explore signatures in a browser, without a server, a network or other libraries."""
 
 from hks_jax.plot.explore.page import explore as explore

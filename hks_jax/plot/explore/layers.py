@@ -1,4 +1,4 @@
-"""The page's further maps: scalars and directions of the tensors, and regions."""
+"""Additional maps of the page: scalars and directions of the tensors, and regions."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,12 +9,12 @@ from jaxtyping import Bool, Float, Integer, Real
 
 
 class Layer(NamedTuple):
-    """A map beside the signature.
+    """A map that is shown beside the signature.
 
     Attributes:
         name: its heading.
-        kind: ``"scalar"``, or ``"direction"`` of vectors without a sign.
-        values: (n_nodes,), or (n_nodes, 3) of directions, at the nodes of the domain; float32.
+        kind: ``"scalar"``, or ``"direction"`` for vectors without a sign.
+        values: (n_nodes,), or (n_nodes, 3) for directions, at the nodes of the domain, in float32.
     """
 
     name: str
@@ -23,28 +23,28 @@ class Layer(NamedTuple):
 
 
 class Regions(NamedTuple):
-    """A label at every node of the domain, 0 for none, and the names of those that occur."""
+    """A label at every node of the domain, or 0 for none, and the names of the labels that occur."""
 
     values: Integer[np.ndarray, " n_nodes"]
     names: dict[int, str]
 
 
 def tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarray, "*shape"]) -> list[Layer]:
-    """Return mean eigenvalue, anisotropy and principal direction, the latter as long as the anisotropy is large.
+    """Return mean eigenvalue, anisotropy and principal direction, whose length is the anisotropy.
 
     Raises:
-        ValueError: tensors of another shape, or that are not finite inside.
+        ValueError: if the tensors have another shape or are not finite inside.
     """
     array, d = np.asarray(tensors), inside.ndim
     if array.shape != (*inside.shape, d, d):
         raise ValueError(f"tensors: got shape {array.shape}; expected (*shape, d, d) = {(*inside.shape, d, d)}")
     array = array[inside].astype(np.float64)
     if not np.isfinite(array).all():
-        raise ValueError("tensors: some inside the domain are not finite; leave these nodes out by the grid's mask")
+        raise ValueError("tensors: got NaN or infinite ones inside the domain; exclude their nodes by the mask")
     values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
     mean = values.mean(axis=-1)
     spread = np.sqrt(np.sum(np.square(values - mean[:, None]), axis=-1))
-    # Both are 0 for multiples of the identity and 1 where only one eigenvalue is not 0.
+    # Both are 0 for multiples of the identity, and 1 if only one eigenvalue is nonzero.
     size = np.abs(values.sum(axis=-1)) / np.sqrt(2) if d == 2 else np.sqrt(np.sum(values**2, axis=-1) / 1.5)
     anisotropy = spread / np.where(size > 0, size, 1)
     largest = np.argmax(np.abs(values), axis=-1)
@@ -58,7 +58,7 @@ def tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarra
 
 
 def scalar_layers(maps: Mapping[str, Any], inside: Bool[np.ndarray, "*shape"]) -> list[Layer]:
-    """Return maps that are given by name; raise ValueError for those of another shape."""
+    """Return maps that are given by name; raise ValueError if a map has another shape."""
     for name, values in maps.items():
         if np.shape(values) != inside.shape:
             raise ValueError(f"maps[{name!r}]: got shape {np.shape(values)}; expected the grid's shape {inside.shape}")
@@ -68,10 +68,10 @@ def scalar_layers(maps: Mapping[str, Any], inside: Bool[np.ndarray, "*shape"]) -
 def regions(
     labels: Real[ArrayLike, "*shape"], names: Mapping[int, str] | None, inside: Bool[np.ndarray, "*shape"]
 ) -> Regions:
-    """Return the labels inside, and their names, or their numbers where there are none.
+    """Return the labels inside, and their names or, without names, their numbers.
 
     Raises:
-        ValueError: labels of another shape, or that are no whole numbers; none inside.
+        ValueError: if labels have another shape, are not integers, or are all 0 inside.
     """
     array = np.asarray(labels)
     if array.shape != inside.shape:
@@ -79,10 +79,10 @@ def regions(
     inner = array[inside]
     whole = np.rint(inner).astype(np.int32)
     if not np.array_equal(whole, inner):
-        raise ValueError("labels: got numbers with a fraction inside the domain; expected whole numbers, 0 for none")
+        raise ValueError("labels: got fractional numbers inside the domain; expected integers, 0 for no region")
     present = [int(label) for label in np.unique(whole) if label != 0]
     if not present:
-        raise ValueError("labels: 0 everywhere inside the domain; expected the number of a region at some of its nodes")
+        raise ValueError("labels: got 0 at all nodes of the domain; expected a region's number at some nodes")
     given = {} if names is None else names
     return Regions(whole, {label: str(given.get(label, f"label {label}")) for label in present})
 

@@ -1,4 +1,4 @@
-"""From a signature to the page: numbers in base64, and the page's own files around them."""
+"""The construction of the page from a signature, with its numbers in base64."""
 
 import base64
 import html
@@ -26,10 +26,10 @@ from hks_jax.signatures.hks import Normalisation
 from hks_jax.storage import atomic_path
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
-"""The page's scripts, in the order in which they need one another."""
+"""The page's scripts in the order of their dependencies."""
 COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_r", "grey": "gray"}
 LIMIT = 256 * 1024**2
-"""Bytes of numbers in a page at most. They are a text a third longer, and browsers hold no text of over 512 MiB."""
+"""The maximum bytes of numbers in a page. Their text is a third longer, and browsers limit a text to 512 MiB."""
 
 
 def explore(
@@ -51,64 +51,65 @@ def explore(
     length_unit: str = "",
     world: Real[ArrayLike, "3 d_and_1"] | None = None,
 ) -> Path:
-    """Write a page to explore a signature on a grid or a surface: an HTML file for any browser, without a network.
+    """Write an HTML page to explore a signature on a grid or a surface in any browser, without a network.
 
-    It shows the signature with sliders for t and, of a volume, the slice; beside it maps of the tensors. A point that
-    is chosen, by a click or with the arrow keys, draws its signature over t, and colours all others by the distance of
-    their curves to its own (Sun, Ovsjanikov and Guibas 2009): the root mean square over log t of the difference of the
-    two signatures, each relative to the mean over the domain. Two points can be compared; a lasso, the points alike, or
-    a label give a region's mean curve and its spread. Curves can be saved as CSV.
+    The page shows the signature with sliders for t and, for a volume, the slice, and maps of the tensors beside it. A
+    click or the arrow keys choose a point, whose signature is drawn over t. All other points are coloured by the
+    distance between their curves and the curve of this point (Sun, Ovsjanikov and Guibas 2009): the root mean square
+    over log t of the difference of the two signatures, each relative to the mean over the domain. Two points can be
+    compared. A lasso, a maximum distance or a label defines a region, whose mean curve and spread are drawn. Curves can
+    be saved as CSV.
 
-    The numbers are in the file in single precision: 4 bytes and a third for each node inside, time and map.
+    The file contains the numbers in single precision, with 5⅓ bytes for each inside node at each time and in each map.
 
     Args:
-        values: (n_times, *shape), as `hks_jax.hks` returns them; nodes that are not finite are left out. On a surface
-            (n_times, V), all finite; what follows is then (V,) where it is (*shape) here.
-        times: (n_times,), positive and increasing.
-        grid: the grid of the values, 2D or 3D, or the surface.
-        path: the page; its folder is made.
-        deviation: (n_times, *shape), the standard deviation that noise gives the values (`hks_jax.uncertainty`): the
-            curves of points have a band of it, and what noise could make of flat space, or of the mean, fades.
-        tensors: (*shape, d, d), as they were measured, such as diffusivities: their mean eigenvalue, anisotropy and
-            principal direction (as red, green and blue for x, y and z) are shown. Not on surfaces.
-        maps: more maps (*shape) by name.
-        labels: (*shape), whole numbers, 0 for none: regions.
+        values: (n_times, *shape) the result of `hks_jax.hks`; nodes that are not finite are omitted. On a surface,
+            (n_times, V) finite values; (V,) then replaces (*shape) below.
+        times: (n_times,) in increasing order, positive.
+        grid: the 2D or 3D grid of the values, or the surface.
+        path: the file of the page; its folder is created.
+        deviation: (n_times, *shape) the values' standard deviation due to noise (`hks_jax.uncertainty`). Curves of
+            points then have a band, and deviations from flat space or the mean within the noise fade.
+        tensors: (*shape, d, d) measured tensors such as diffusivities, on grids only. The page shows their mean
+            eigenvalue, anisotropy and principal direction (as red, green and blue for x, y and z).
+        maps: additional maps (*shape) by name.
+        labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
-        normalisation: that of the values. ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which is 1 where space
-            is flat and has no boundary, with colours that diverge from 1.
+        normalisation: the normalisation of the values. ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which is
+            1 for flat space without boundary, with colours that diverge from 1.
         title: the page's title.
-        facts: what else the page should say of the data, by name.
+        facts: further facts about the data, by name.
         unit: the unit of t.
-        lengths: (n_times,), how far heat has spread at each time, such as √(Dt): said beside t.
+        lengths: (n_times,) the distance of heat spread at each time, such as √(Dt), which is shown beside t.
         length_unit: the unit of lengths, in the grid or in `world`.
-        world: (3, d + 1), node indices to coordinates in space, the last column those of node 0: positions are then
-            given there, and the sides of the images named by L and R, P and A, I and S, for coordinates that grow to
-            the right, the front and the top, as NIfTI's do.
+        world: (3, d + 1), maps node indices to coordinates in space, with node 0 in the last column. Positions are then
+            shown in these coordinates. The sides of images have the letters L and R, P and A, I and S, for coordinates
+            that increase to the right, front and top, as in NIfTI.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: shapes that do not agree, times that do not increase, nothing finite, an unknown normalisation, or
-            more numbers than a browser can open.
+        ValueError: if shapes disagree, if times do not increase, if no node is finite, if the normalisation is unknown,
+            or if there are more numbers than a browser can open.
     """
     shape, d = ((len(grid.vertices),), 2) if isinstance(grid, SurfaceMesh) else (grid.shape, grid.dimension)
     t = checked_times(times, shape, values=values, deviation=deviation)
     if not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
-        raise ValueError(f"times: got {times}; expected positive numbers that increase")
+        raise ValueError(f"times: got {times}; expected positive numbers in increasing order")
     if normalisation not in get_args(Normalisation):
         raise ValueError(f"normalisation: got {normalisation!r}; expected one of {', '.join(get_args(Normalisation))}")
     array: np.ndarray = np.asarray(values, dtype=np.float64)
     inside, surface, place = np.isfinite(array).all(axis=0), {}, {}
     if isinstance(grid, SurfaceMesh):
         if not (inside.all() and tensors is None and world is None):
-            raise ValueError("values, tensors, world: on a surface values must be finite, and the others left out")
+            raise ValueError("values, tensors, world: expected finite values, no tensors and no world for a surface")
         surface = {"vertices": np.asarray(grid.vertices, "<f4"), "faces": grid.faces.astype("<i4")}
     else:
         inside &= grid.inside
         place = {"spacing": grid.spacing, "origin": grid.origin}
     if not inside.any():
-        raise ValueError("values: nothing is finite inside the grid's mask at all times; nothing to show")
+        raise ValueError("values: got no node inside the mask that is finite at all times; expected one")
     spread = None if lengths is None else np.asarray(lengths, dtype=np.float64)
     if spread is not None and (spread.shape != t.shape or not np.isfinite(spread).all()):
         raise ValueError(f"lengths: got shape {spread.shape}; expected {t.shape}, one finite number per time")
@@ -123,7 +124,7 @@ def explore(
             f"{LIMIT // 1024**2}, which a browser can open. Show fewer times, one slice, or part of the domain"
         )
     flat = (4 * math.pi * t) ** (d / 2)
-    # (4πt)^(d/2)·HKS is of order 1 in any unit: no float32 is too small for it.
+    # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow.
     scale = flat[:, None] if normalisation == "raw" else 1.0
     shown = {"values": scale * array[:, inside]} | ({} if noise is None else {"deviation": scale * noise[:, inside]})
     box = bounding_box(inside, margin=0)
@@ -156,7 +157,7 @@ def explore(
 
 
 def _deep_node(inside: Bool[np.ndarray, "*shape"]) -> list[int]:
-    """Return the node to start with: inside, in the middle slice, as far from the boundary as any there."""
+    """Return the initial node, which is the node of the middle slice furthest from the boundary."""
     from scipy import ndimage
 
     depth = ndimage.distance_transform_edt(np.pad(inside, 1))[(slice(1, -1),) * inside.ndim]
@@ -167,12 +168,12 @@ def _deep_node(inside: Bool[np.ndarray, "*shape"]) -> list[int]:
 
 
 def _in_space(world: Any, d: int) -> dict[str, Any]:
-    """Return where the nodes are, and the names of the grid's sides, each by the world axis that it is nearest to."""
+    """Return the positions of the nodes, and the names of the grid's sides by the nearest world axes."""
     if world is None:
         return {"world": None, "ends": None}
     matrix = np.asarray(world, dtype=np.float64)
     if matrix.shape != (3, d + 1) or not np.isfinite(matrix).all():
-        raise ValueError(f"world: got shape {matrix.shape}; expected (3, d + 1) = {(3, d + 1)}, finite")
+        raise ValueError(f"world: got shape {matrix.shape}; expected finite numbers (3, d + 1) = {(3, d + 1)}")
     ends = []
     for direction in matrix[:, :d].T:
         axis = int(np.argmax(np.abs(direction)))
@@ -203,7 +204,7 @@ def _assemble(
     numbers |= {name: _base64(array) for name, array in surface.items()}
     own = files(__package__)
     scripts = "\n".join((own / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
-    # No text can end the script that it is in: "<" is written as JSON also writes it.
+    # "<" is escaped as JSON allows, so that no text can close its script element.
     described = json.dumps(about, allow_nan=False).replace("<", "\\u003c")
     blocks = [f'<script type="application/json" id="about">{described}</script>']
     blocks += [f'<script type="text/plain" id="{name}">{text}</script>' for name, text in numbers.items()]
@@ -214,7 +215,7 @@ def _assemble(
         "SCRIPT": f'(() => {{\n"use strict";\n{scripts}}})();',
     }
     pieces = (own / "page.html").read_text(encoding="utf-8").split("@@")
-    # What is filled in is not looked at again: a title may hold any of these words.
+    # Inserted texts are not scanned again, because a title may contain any of these words.
     return "".join(filled[piece] if i % 2 else piece for i, piece in enumerate(pieces))
 
 
