@@ -170,7 +170,7 @@ def _lowest(
         pairs = solve_lowest(widened(pencil, solvers, size + extra).parts[0], solvers[0], size, extra, throw, report)
         found = jax.lax.stop_gradient(pairs)
         doubtful = solver == "auto" and isinstance(solvers[0], ShiftInvert) and not pencil.bounded
-        if doubtful and (found.unconfirmed or not found.converged.all()):  # as where k cuts many copies
+        if doubtful and (found.unconfirmed or not found.converged.all()):  # for example, if k cuts a large multiplet
             pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
     return truncate(pairs, k, multiplet)
 

@@ -80,7 +80,7 @@ def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
 
 
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
-    """Return about the largest eigenvalue: 4·max|Kᵢᵢ/Mᵢᵢ| is λ_max on a uniform grid in 2D and 3D."""
+    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D."""
     matrices = pencil.stiffness, pencil.mass
     if not known_and_few(matrices):
         return _largest_by_jax(*matrices)

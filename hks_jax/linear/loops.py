@@ -51,7 +51,7 @@ def one_by_one(function: Callable[..., Any], settings: tuple[Hashable, ...], *ar
     object in every call, so that it is compiled once. Settings are static.
     """
     if not is_traced(args):
-        # Of a derivative taken plainly, JAX would compile the known part anew.
+        # Otherwise, JAX would compile the primal part of a derivative again outside `jit`.
         with contextlib.nullcontext() if is_staged() else jax.core.eval_context():
             return function(*settings, *args)
     # `custom_vmap` supports no static arguments, so that each call defines a rule; its body is compiled only once.

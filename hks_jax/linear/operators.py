@@ -20,9 +20,9 @@ Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 
 _PLACES = 1 << 12
-"""Places whose products are computed together: what is gathered for them stays in the cache."""
+"""The number of entries of an outer product that are computed together: their operands fit into the cache."""
 ROUNDING = 1000
-"""By how many units of rounding of the largest entry a matrix may differ from its transpose."""
+"""The largest accepted asymmetry of a matrix, in units of ε times its largest entry."""
 
 
 class Operator(eqx.Module):
@@ -47,7 +47,7 @@ class Operator(eqx.Module):
 
     @abstractmethod
     def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "Operator":
-        """Return pxᵀ where the matrix has entries, by NumPy: the derivative of Σ p·Ax by A."""
+        """Return pxᵀ on the sparsity pattern, by NumPy: the derivative of Σ p·Ax with respect to A."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -104,7 +104,7 @@ class PatternedOperator(Operator):
         """Return the matrix with other entries at the same places."""
 
     def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "PatternedOperator":
-        """Return pxᵀ where the matrix has entries, by NumPy."""
+        """Return pxᵀ on the sparsity pattern, by NumPy."""
         where, rows, cols = self.pattern.places()
         entries = np.zeros(self.pattern.n_entries, x.dtype)
         for start in range(0, where.size, _PLACES):
