@@ -311,8 +311,7 @@ def _exact_null_modes(
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
     """Replace the solver's approximations of the null vectors by the known null vectors.
 
-    Their eigenvalue becomes exactly 0 instead of about ±1e-13. The other vectors are orthogonalised against the null
-    vectors.
+    Their eigenvalue becomes exactly 0 instead of about ±1e-13. Other vectors become orthogonal to the null vectors.
     """
     if not known_and_few((pencil.mass, values, vectors)):
         return _exact_by_jax(pencil, values, vectors)

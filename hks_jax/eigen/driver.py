@@ -58,8 +58,7 @@ def eigenpairs(
         mass: ``"consistent"`` or ``"lumped"``; a given pencil already has it.
         multiplet: the treatment of a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns.
             ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8 additional pairs and includes
-            the missing ones, or drops the eigenvalue if 8 are too few. Excluded pairs stay in the arrays (see
-            ``.kept``).
+            the missing ones, or drops the eigenvalue if 8 are too few. ``.kept`` marks the included pairs.
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge, also under
             `jit`, by a callback to the host. Otherwise ``.result`` has the code and derivatives are NaN; concrete
             values also cause a warning.

@@ -1,8 +1,7 @@
 """Decisions that depend on whether computations run on an accelerator.
 
 On an accelerator, each kernel launch takes at least about 4 µs. A host that reads a number waits for all earlier
-kernels. So programs for accelerators have few kernels and static loop lengths, at the cost of some additional
-arithmetic.
+kernels. So programs for accelerators have few kernels and static loop lengths, at the cost of additional arithmetic.
 """
 
 import warnings

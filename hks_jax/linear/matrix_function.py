@@ -31,8 +31,7 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
     by a small gap occurs. `jax.vmap` over parameters of f computes eigenpairs once. Third derivatives raise an error.
 
     The function takes O(n³) time, mainly for the eigenpairs, and O(n²) memory; a gradient takes about as much again.
-    Second derivatives evaluate f'' 89 times for each of n³ triples of eigenvalues, and are thus only for small
-    matrices.
+    Second derivatives evaluate f'' 89 times for each of n³ triples of eigenvalues, and so are for small matrices.
 
     Args:
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
@@ -96,8 +95,7 @@ def _function(f: Function, parameters: Any, others: Any, a: Matrix) -> tuple[Mat
 #
 # with divided differences of f, which are smooth at equal eigenvalues. Both formulas are independent of the chosen
 # basis of an eigenspace. But differentiating the first formula term by term would not give the second at a multiple
-# eigenvalue, because Λ and V have no derivatives there. So each formula has its own rule, which treats eigenpairs as
-# constants.
+# eigenvalue, because Λ and V have no derivatives there. So each formula has its own rule, with eigenpairs as constants.
 #
 # If parameters of f also change, let ∂f and ∂'f be the derivatives of f along their two changes. The derivatives are
 #

@@ -2,9 +2,9 @@
 
 Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
 eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
-indefinite on the whole space. Preconditioned with K − σM, the matrix K − λᵢM has a spectrum between 1 and (Λ − λᵢ)/(Λ −
-σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice
-for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those in JAX, and
+indefinite on the whole space. Preconditioned with K − σM, the spectrum of K − λᵢM lies between 1 and (Λ − λᵢ)/(Λ − σ).
+So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice for
+fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those in JAX, and
 `FilteredAdjoint` a polynomial.
 """
 
@@ -54,8 +54,7 @@ class Adjoint(eqx.Module, Generic[P]):
 
     Attributes:
         warns: whether `solve` itself warns of rows that do not converge, even if values are traced.
-        tolerance: the error in the energy norm, relative to the largest row. Rounding of the eigenvectors is a lower
-            bound.
+        tolerance: the error in the energy norm, relative to the largest row. Rounding of eigenvectors is a lower bound.
     """
 
     warns: ClassVar[bool] = False

@@ -127,8 +127,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return complement.amplification(values, k)
 
     # If r has a component along φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ). This factor is
-    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the other φⱼ follow at the end or at a
-    # restart.
+    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the others follow at the end or a restart.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:

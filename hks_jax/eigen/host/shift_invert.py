@@ -33,7 +33,7 @@ class ShiftInvert(Eigensolver[Pencil]):
     """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M, factorised by SuperLU, in float64 on the host.
 
     The inertia of a second factorisation checks that no eigenvalue below the last was missed. Under `jit` and `vmap`,
-    the solver runs in a host callback, one problem at a time. Outside `jit`, the solver can be interrupted, and reports
+    the solver runs in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports
     progress.
 
     Attributes:

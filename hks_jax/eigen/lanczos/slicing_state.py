@@ -50,8 +50,8 @@ class Plan(NamedTuple):
     def window(self) -> int:
         """The number of known eigenvectors to which a slice stays orthogonal, so that it does not find them again.
 
-        Lanczos finds nearer eigenvectors first, so remote ones may be omitted; but a slice finds only a part of a large
-        multiplet.
+        Remote eigenvectors may be omitted, because Lanczos finds near ones first. A large multiplet is found only in
+        part.
         """
         size = max(self.slice_size // 4, min(self.slice_size // 2, 48))
         return -(-size // self.block) * self.block
