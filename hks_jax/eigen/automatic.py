@@ -38,7 +38,7 @@ _SMALL = 1500
 #
 # Compilation takes about five seconds for any size. So up to n·k = 5 million no solver is the fastest both in the first
 # and in later calls. The choice minimises the larger of the two factors lost, except for small volumes in float32.
-# Block Lanczos in float32 also factorises in float32. So slices are searched repeatedly, and some pairs fail.
+# Block Lanczos in float32 also factorises in float32. So it searches repeatedly, and some pairs do not converge.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 """The least n·k for which a solver in JAX is chosen. The second value is for 2D grids in single precision."""
 

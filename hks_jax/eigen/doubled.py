@@ -120,7 +120,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
 # Let part B's trial functions include those of part A. Then the j-th eigenvalue of A is not below the j-th of B. If the
 # two are equal, rounding may swap them, and A would have more pairs than `MirrorPencil.including` allows.
 def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
-    """Return each part's eigenvalues, raised to those of equal index of the parts that include it."""
+    """Return each part's eigenvalues, raised to at least those of equal index of each part that includes it."""
     keys: list[Array] = []
     for pairs, including in zip(solved, pencil.including, strict=True):
         own = pairs.eigenvalues

@@ -26,7 +26,7 @@ def weyl(count: float, volume: Volume, dimension: int) -> Volume:
 
 
 def weyl_number(values: Real, volume: float, dimension: int, rim: float = 0.0) -> Real:
-    """Estimate the number of eigenvalues below λ ≥ 0. ``rim`` is the measure of the natural minus the Dirichlet rim."""
+    """Estimate the number of eigenvalues below λ ≥ 0. ``rim``: natural minus Dirichlet measure of the rim."""
     if dimension == 2:
         return (volume * values + rim * values**0.5) / (4 * math.pi)
     return volume * values**1.5 / (6 * math.pi**2) + rim * values / (16 * math.pi)

@@ -59,7 +59,7 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
     # The width is at least 1 (only padding if no front is coupled), except on the first level, which has no parent.
     width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
-    # For each boundary node of a level: its front, and its place among the own and boundary nodes of the parent.
+    # List each boundary node's front, and the node's place among the own and boundary nodes of the parent.
     placed = [(keys // n, slot[keys % n]) for keys in boundaries]
     for below, (at, place) in enumerate(placed[1:]):
         nodes = boundaries[below + 1] % n

@@ -29,7 +29,7 @@ class SymmetricPencil(eqx.Module):
     Attributes:
         stiffness: K; use ``@`` for products, ``.to_scipy()`` and ``.to_dense()`` for conversion.
         mass: M, an operator like K. Its pattern is contained in K's.
-        null_space: the null space of K ⪰ 0. None if it is unknown; then K may be indefinite.
+        null_space: the null space of K ⪰ 0. None means unknown; then K may be indefinite.
     """
 
     stiffness: PatternedOperator
