@@ -1,4 +1,4 @@
-"""Compiling for CPUs in half the time, or not at all."""
+"""Faster compilation for CPUs, and computations by NumPy without compilation."""
 
 import inspect
 import os
@@ -19,14 +19,15 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
-"""XLA's older code generator for fused loops takes half as long, for code as fast as far as measured here."""
+"""XLA's older code generator for fused loops compiles twice as fast. The measured speed of its code is the same."""
 
 
 OnHost = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
-"""What NumPy computes of all arguments, of changes x of some, and of cotangents y of the leaves of the result.
+"""Computes by NumPy, given all arguments, changes x of some arguments, and cotangents y of the result's leaves.
 
-With neither it is what the function returns, with x the change of that, and with y the cotangents of x, which then has
-shapes alone. Of a function that is linear in x, x is no longer among the arguments. None: it is to be compiled.
+Without x and y it returns the function's result, with x the change of the result, and with y the cotangents of x, where
+x has only shapes. If the function is linear in x, the arguments do not include x. None means that the function must be
+compiled.
 """
 
 
@@ -39,15 +40,15 @@ def jit_quickly(
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Return a decorator like `jax.jit`, or `equinox.filter_jit`, for functions that take long to compile.
 
-    XLA compiles a computation as a whole: within another one these functions are as that is. Where the environment
-    variable XLA_FLAGS sets one of the options, they are left as it says.
+    XLA compiles a computation as a whole, so these options have no effect within another computation. If the
+    environment variable XLA_FLAGS sets one of the options, none is changed.
 
     Args:
-        jit: what compiles.
-        linear: names of arguments in which the function is linear, jointly.
-        like: what has the shapes of the result, given all arguments, where it is linear.
-        on_host: what computes instead where values are known, and few, on a CPU.
-        settings: for ``jit``.
+        jit: the function that compiles.
+        linear: the names of arguments in which the function is jointly linear.
+        like: a function that returns the shapes of the result, given all arguments of a linear function.
+        on_host: a function that computes instead if values are concrete and few, on a CPU.
+        settings: the settings of ``jit``.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
@@ -88,14 +89,14 @@ def jit_quickly(
 
 
 _FEW = 1 << 19
-"""Numbers that NumPy computes with in less time than it takes to compile a program for them, even for many calls."""
+"""The number of values up to which NumPy is faster than compiling a program, even for many calls."""
 
 
 def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Return a decorator for functions that take the module of arrays, NumPy's or JAX's, first.
+    """Return a decorator for functions whose first argument is the array module, NumPy's or JAX's.
 
-    With concrete values on a CPU, if they are few, NumPy computes, for which nothing is compiled; else `jax.jit` with
-    the settings. What comes out are JAX's arrays.
+    NumPy computes with few concrete values on a CPU, so nothing is compiled. Otherwise `jax.jit` with the settings
+    compiles the function. The results are JAX arrays in both cases.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -111,23 +112,23 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
 
 def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
-    """Return what a function makes of NumPy's arrays in place of JAX's, as JAX's arrays."""
+    """Apply a function to NumPy arrays instead of JAX arrays; return its result as JAX arrays."""
     known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
     with np.errstate(all="ignore"):
-        # `asarray` leaves them NumPy's where JAX differentiates.
+        # `jnp.asarray` would return NumPy arrays while JAX differentiates.
         return jax.device_put(jax.tree.map(np.asarray, function(*known)))
 
 
 def known_and_few(args: Any) -> bool:
-    """Return whether values are `known_here` and few: then NumPy computes.
+    """Return whether values are `known_here` and few, so that NumPy computes with them.
 
-    It depends on shapes and devices alone, so that a computation has the same rounding each time.
+    The answer depends only on shapes and devices, so that repeated computations have the same rounding errors.
     """
     return known_here(args) and sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= _FEW
 
 
 def known_here(args: Any) -> bool:
-    """Return whether values are concrete, and on one CPU of this process alone."""
+    """Return whether values are concrete and on a single CPU of the only process."""
     if is_staged() or is_traced(args) or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return False
     return all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(args) if isinstance(leaf, jax.Array))
@@ -135,7 +136,7 @@ def known_here(args: Any) -> bool:
 
 @cache
 def _understood() -> bool:
-    """Return whether computations run on a CPU whose compiler has these options, and leaves them to us."""
+    """Return whether the default device is a CPU whose compiler accepts the options, none of which XLA_FLAGS sets."""
     if jax.default_backend() != "cpu" or any(option in os.environ.get("XLA_FLAGS", "") for option in _OPTIONS):
         return False
     try:
@@ -146,7 +147,7 @@ def _understood() -> bool:
 
 
 class _Program(NamedTuple):
-    """A function of a flat list of arrays, with its static arguments; equal ones share what is compiled."""
+    """A function of a flat list of arrays with its static arguments. Equal programs share their compilation."""
 
     function: Callable[..., Any]
     fixed: tuple[Any, ...]
@@ -154,7 +155,7 @@ class _Program(NamedTuple):
     host: OnHost | None
 
     def __call__(self, *leaves: Any) -> Any:
-        """Return what the function returns."""
+        """Return the result of the function."""
         return self.function(*self.args(*leaves))
 
     def args(self, *leaves: Any) -> list[Any]:
@@ -162,24 +163,24 @@ class _Program(NamedTuple):
         return [known if x is None else eqx.combine(known, x) for known, x in zip(*self.split(*leaves), strict=True)]
 
     def split(self, *leaves: Any) -> tuple[list[Any], list[Any]]:
-        """Return the arguments that are known, and the others."""
+        """Return the concrete arguments and the others."""
         known, x = jax.tree.unflatten(self.structure, leaves)
         return [own if fixed is None else fixed for own, fixed in zip(known, self.fixed, strict=True)], x
 
     def on_host(self, *leaves: Any) -> Any:
-        """Return by NumPy what the function returns, or None."""
+        """Return the result of the function by NumPy, or None."""
         return _on_host(self.host, self.args(*leaves), None, None)
 
 
 class _Map(NamedTuple):
-    """A linear map, or its transpose: of arrays that are known, and then of those that it is linear in.
+    """A linear map or its transpose. Its arguments are concrete arrays, followed by those in which it is linear.
 
     Attributes:
-        program: what is linear in its last arguments.
-        at: or, if true, its derivative by these, which then come twice: as they are, and their changes.
-        x: the shapes of what it is linear in.
-        y: those of what it returns.
-        transposed: whether it is the transpose.
+        program: a program that is linear in its last arguments.
+        at: whether to take the program's derivative by these arguments, whose values and changes are then given.
+        x: the shapes of the arguments in which the map is linear.
+        y: the shapes of the results.
+        transposed: whether to transpose the map.
     """
 
     program: _Program
@@ -189,12 +190,12 @@ class _Map(NamedTuple):
     transposed: bool = False
 
     def split(self, leaves: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-        """Return what is known, and the rest."""
+        """Return the concrete arguments and the rest."""
         n = len(leaves) - len(self.y if self.transposed else self.x)
         return list(leaves[:n]), list(leaves[n:])
 
     def __call__(self, *leaves: Any) -> list[Any]:
-        """Return what the map makes of arrays."""
+        """Apply the map to arrays."""
         known, rest = self.split(leaves)
 
         def forward(*x: Any) -> list[Any]:
@@ -206,7 +207,7 @@ class _Map(NamedTuple):
         return list(jax.linear_transpose(forward, *self.x)(rest)) if self.transposed else forward(*rest)
 
     def on_host(self, *leaves: Any) -> Any:
-        """Return by NumPy what the map makes of arrays, or None."""
+        """Apply the map to arrays by NumPy, or return None."""
         known, rest = self.split(leaves)
         x, y = (self.x, [np.asarray(each) for each in rest]) if self.transposed else (rest, None)
         args, change = self.program.split(*known[: len(known) - self.at * len(x)], *x)
@@ -239,11 +240,11 @@ def _shapes(leaves: Sequence[Any]) -> tuple[jax.ShapeDtypeStruct, ...]:
     return tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
 
 
-# JAX takes no compiler options for the programs that it makes itself where it differentiates, and makes several of one.
-# A derivative that is taken outside of `jax.jit`, where its values are known, is one program here, and its transpose
-# another. Wherever else it comes to be computed it consists of JAX's operations, as it would without.
+# JAX takes no compiler options for the programs that it generates for derivatives, and generates several for one
+# derivative. Here a derivative outside of `jax.jit`, where values are concrete, is one program, and its transpose is
+# another. Everywhere else a derivative consists of JAX's operations, as without this module.
 def _differentiable(program: _Program, known: list[Any], x: list[Any]) -> Any:
-    """Return what a program does, to be differentiated by x."""
+    """Return the result of a program so that it is differentiable by x."""
 
     @jax.custom_jvp
     def call(*x: Any) -> Any:

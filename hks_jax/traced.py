@@ -1,4 +1,4 @@
-"""Whether values are there to be looked at, or stand for those of a computation to come."""
+"""Tests whether values are concrete or traced."""
 
 from typing import Any
 
@@ -12,5 +12,5 @@ def is_traced(tree: Any) -> bool:
 
 
 def is_staged() -> bool:
-    """Return whether all operations are part of a computation to come: nothing comes of one but a tracer."""
+    """Return whether every operation is staged for a later computation, so that it returns a tracer."""
     return is_traced(jnp.zeros(()))

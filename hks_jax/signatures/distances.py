@@ -167,8 +167,8 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
 # Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
 # kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To
 # first order in h² the error of the squared distance is d²h² (d² − 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped
-# mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which is h²/12t ·
-# log 1/k with d² = 4t log 1/k.
+# mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which is
+# h²/12t · log 1/k with d² = 4t log 1/k.
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:

@@ -331,7 +331,7 @@ def test_bad_times(pairs, times, message):
 @pytest.mark.parametrize(
     ("sources", "message"),
     [
-        ((0, 8), r"sources: 1 of 1 are outside the mask \(the first is \(0, 8\)\)"),
+        ((0, 8), r"sources: got 1 of 1 nodes outside the mask \(the first is \(0, 8\)\)"),
         ((0, 9), "sources: got indices 0 … 9; expected nodes of shape"),
         ((0.0, 1.0), "expected integer node indices"),
         ([1, 2, 3], r"sources: got shape \(3,\); expected \(s, 2\) node indices"),
