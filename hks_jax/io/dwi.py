@@ -21,9 +21,9 @@ from hks_jax.optional import optional
 from hks_jax.storage import existing, reading
 
 _LENGTH = 0.05
-"""By how much the length of a direction may differ from 1: it is rounding then."""
+"""The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
-"""The share of an image's noise that its residual has at least, to tell it."""
+"""The least share 1 − h of an image's noise variance in its residual for which the residual is used."""
 
 
 class ExampleBrain(NamedTuple):
@@ -65,26 +65,26 @@ def fit_dwi(
     """Fit diffusion tensors to diffusion-weighted images by weighted least squares on log signals (DIPY's TensorModel).
 
     Args:
-        path: NIfTI (nx, ny, nz, n). Voxels where a signal is NaN or infinite are left out.
-        bval: text file of the n b-values, in s/mm² unless `unit` says otherwise.
-        bvec: text file of the n directions, 3 × n or n × 3, of length 1; those at b = 0 mean nothing.
-        mask: a file (see `read_mask`) or a bool array (nx, ny, nz): fit inside only; outside, tensors are zero. None:
-            what DIPY's median_otsu takes for the brain in the mean of the unweighted images, as a note says.
-        b_max: leave out images with larger b, in s/mm²; None: use all. A tensor describes b ≲ 1000–1500 s/mm² only.
-        bvec_frame: the axes of the directions: ``"fsl"``, voxel axes, the first reversed where the affine's determinant
-            is positive, as dcm2niix and FSL write them; ``"voxel"``, the voxel axes; ``"world"``, the scanner's, as
-            MRtrix has them.
-        unit: of diffusivity, whose reciprocal is the b-values' unit: ``"m2/s"`` for b-values in s/m², ``"um2/ms"`` for
-            ms/µm². None: mm²/s.
-        noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
-            ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
-            for n images; these also tell what voxels share of an image's noise (24 bytes for each voxel and image).
-            None: no covariance.
+        path: a NIfTI image (nx, ny, nz, n). Voxels with a NaN or infinite signal are left out.
+        bval: a text file of the n b-values, in s/mm² unless `unit` is given.
+        bvec: a text file of the n directions of length 1, 3 × n or n × 3. Directions at b = 0 are ignored.
+        mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If None, DIPY's
+            median_otsu finds the brain in the mean of the unweighted images, and a note reports this.
+        b_max: the largest b-value used, in s/mm²; None uses all images. A tensor is a model for b ≲ 1000–1500 s/mm².
+        bvec_frame: the axes of the directions. ``"fsl"`` is the convention of dcm2niix and FSL: the voxel axes, the
+            first reversed if the affine's determinant is positive. ``"voxel"`` means the voxel axes. ``"world"`` means
+            the scanner's axes, as in MRtrix.
+        unit: a unit of diffusivity whose reciprocal is the unit of the b-values: ``"m2/s"`` for b-values in s/m²,
+            ``"um2/ms"`` for ms/µm². None means mm²/s.
+        noise: the standard deviation of the images' noise, in the images' unit, from which the tensors' covariance is
+            computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit, which have
+            n − 7 degrees of freedom, and also keeps the noise of an image that voxels share (24 bytes for each voxel
+            and image). If None, no covariance is computed.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s, and with `noise` theirs, to first order (`TensorVolume.noise`). DIPY
-        replaces eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at
-        the rim: erode the mask).
+        Tensors along the voxel axes, in mm²/s, and with `noise` their noise to first order (`TensorVolume.noise`). DIPY
+        raises eigenvalues that are not positive to about 1e-9 mm²/s, and a note reports the number of such voxels. Most
+        of them are at the boundary of the mask, so eroding the mask removes them.
 
     Raises:
         ImportError: DIPY or nibabel is missing.
@@ -127,7 +127,7 @@ def fit_dwi(
         covariance, modes = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
     notes = [
-        f"tensors fitted by weighted least squares to {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g})",
+        f"weighted least-squares fit to {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
         *remarks,
         *found,
         *nifti.placement_notes(image),
@@ -159,9 +159,9 @@ def _covariance(
     frame: str,
     affine: Float[np.ndarray, "4 4"],
 ) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
-    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask.
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, which is zero outside the mask.
 
-    And, from residuals, the part of each image in the noise of the tensors.
+    From residuals, also return the contribution of each image to the noise of these components, or else None.
     """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
@@ -194,10 +194,10 @@ def _covariance(
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
         return covariance, None
-    # An image that its own unknown follows, as the only one without weighting, has no residual: a sign by chance.
+    # The fit follows some images exactly, such as a single unweighted one; a random ±σ replaces their residual 0.
     unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
     modes = np.zeros((*inside.shape, len(design), 6), np.float32)
-    for i, x in enumerate(design):  # to need no more memory than the result
+    for i, x in enumerate(design):  # a loop saves memory
         change = inverse @ x * np.sqrt(weights[:, i, None])
         rest = 1 - np.sqrt(weights[:, i]) * (change @ x)
         size = np.where(rest > _SEEN, left[:, i] / np.sqrt(np.maximum(rest, _SEEN)), unseen[:, i])

@@ -181,7 +181,7 @@ def test_plot_of_a_volume(tmp_path, capsys):
         (["--cmap", "rainbows"], ["--cmap: got 'rainbows'"]),
         (["--points", "90,90"], ["points: (90.0, 90.0) lies outside"]),
         (["--points", "6.5,4"], ["outside the grid or its mask"]),
-        (["--slice", "z=1"], ["slice already"]),
+        (["--slice", "z=1"], ["is a slice"]),
         (["--array", "wks"], ["the arrays eigenvalues, hks", "expected wks"]),
         (["-o", "picture.docx"], ["--output: got picture.docx", "png"]),
     ],

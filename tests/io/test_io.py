@@ -476,7 +476,7 @@ def test_fit_recovers_the_tensors_of_a_perfect_scan(scan, volume):
     np.testing.assert_allclose(fit.tensors[volume.mask], volume.tensors[volume.mask], rtol=1e-5, atol=1e-8)
     assert not fit.tensors[~volume.mask].any()
     np.testing.assert_allclose(fit.spacing, volume.spacing, rtol=1e-6)
-    assert fit.notes[0] == "tensors fitted by weighted least squares to 15 of 25 images (b ≤ 800)"
+    assert fit.notes[0] == "weighted least-squares fit to 15 of 25 images (b ≤ 800 s/mm²)"
 
 
 @pytest.mark.parametrize("flip", [1, -1])

@@ -184,7 +184,7 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
     np.save(tmp_path / "labels.npy", np.zeros((3, 3)))
     assert "got labels of shape (3, 3)" in error(result, "--labels", tmp_path / "labels.npy")
     np.save(tmp_path / "labels.npy", np.full(SHAPE, 0.5))
-    assert "not whole" in error(result, "--labels", tmp_path / "labels.npy")
+    assert "got fractional numbers" in error(result, "--labels", tmp_path / "labels.npy")
     assert "pass --labels too" in error(result, "--names", tmp_path / "names.tsv")
     assert "ends in .html" in error(result, "-o", tmp_path / "page.png")
     assert "no such file" in error(tmp_path / "nowhere")
