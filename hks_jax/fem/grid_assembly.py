@@ -25,7 +25,7 @@ from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator
 
 _ON_HOST = 1 << 17
-"""Numbers in the tensors up to which NumPy integrates, in milliseconds, for which nothing is compiled."""
+"""The largest size of the tensors for which NumPy integrates; it takes milliseconds, without a compilation."""
 
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
@@ -73,7 +73,7 @@ def _points_from(
 
 
 def _on_host(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return by NumPy the integrals of the Laplace–Beltrami operator, their change, or cotangents of the tensors."""
+    """Return from NumPy the integrals of the Laplace–Beltrami operator, their tangents, or the tensors' cotangents."""
     tensors, domain, elements, couplings, gradients, weights, _, _, fields, periodic, interpolation, operator = args
     plain = operator == WeakForm(lumped=operator.lumped) and interpolation == "linear" and not fields
     if not plain or tensors.size > _ON_HOST or (x is not None and len(jax.tree.leaves(x)) > 1):
@@ -102,7 +102,7 @@ def _on_host(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         lumped = mass.sum(axis=0)
         return np.where(coupled, stiffness, 0), np.where(coupled, mass, 0), lumped, lumped.sum()
 
-    # Integrated are √|T| T⁻¹ and √|T|, whose changes are √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and ½√|T| tr(T⁻¹dT).
+    # The integrands are √|T| T⁻¹ and √|T|. Their changes are √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and ½√|T| tr(T⁻¹dT).
     metric = inside(nodes)
     root, inverse = np.sqrt(spd.determinant(metric)), spd.inverse(metric)
     flux, across = root[..., None, None] * inverse, np.swapaxes(inverse, -1, -2)

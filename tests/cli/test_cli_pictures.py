@@ -179,7 +179,7 @@ def test_plot_of_a_volume(tmp_path, capsys):
         (["--range", "3,1"], ["--range: got '3,1'"]),
         (["--quantiles", "1,2"], ["--quantiles", "from 0 to 1"]),
         (["--cmap", "rainbows"], ["--cmap: got 'rainbows'"]),
-        (["--points", "90,90"], ["points: (90.0, 90.0) lies outside"]),
+        (["--points", "90,90"], ["points: got (90.0, 90.0) outside"]),
         (["--points", "6.5,4"], ["outside the grid or its mask"]),
         (["--slice", "z=1"], ["is a slice"]),
         (["--array", "wks"], ["the arrays eigenvalues, hks", "expected wks"]),

@@ -83,7 +83,7 @@ def test_region_statistics_are_those_of_the_regions_alone(rng):
 @pytest.mark.parametrize(
     ("labels", "words"),
     [
-        (np.zeros((6, 5)), "0 everywhere"),
+        (np.zeros((6, 5)), "got 0 at all nodes"),
         (np.full((6, 5), 0.5), "fractional numbers"),
         (np.ones((5, 6)), r"got shape \(5, 6\)"),
     ],

@@ -118,10 +118,10 @@ def eigenvalues(mesh, k=6):
 def test_triangles_that_are_there_twice(tmp_path):
     vertices, faces = square()
     for again in (faces[5], faces[5][[1, 2, 0]], faces[5][::-1]):
-        with pytest.raises(ValueError, match=r"1 of 33 triangles are there twice \(the first are faces 5 and 32"):
+        with pytest.raises(ValueError, match=r"1 of 33 triangles occur twice \(the first are faces 5 and 32"):
             hj.SurfaceMesh(vertices, np.concatenate([faces, [again]]))
     path = save_off(tmp_path / "m.off", vertices, np.concatenate([faces, faces[:7]]))
-    with pytest.raises(ValueError, match=r"7 of 39 triangles are there twice .* clean=True repairs"):
+    with pytest.raises(ValueError, match=r"7 of 39 triangles occur twice .* clean=True repairs"):
         read_mesh(path)
     with pytest.warns(UserWarning, match=r"m\.off: 7 duplicate triangles removed$"):
         mesh = read_mesh(path, clean=True)
