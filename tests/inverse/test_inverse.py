@@ -368,11 +368,7 @@ def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
     with pytest.raises(ValueError, match=r"checkpoint: .* belongs to another fit"):
         hj.fit_metric(FLAT, 2 * target, TIMES, "conformal", k=K, checkpoint=file)
     (tmp_path / "notes.txt").write_text("no checkpoint")
-<<<<<<< HEAD
     with pytest.raises(ValueError, match=r"checkpoint: .*notes.txt: the file is damaged or not a readable npz archive"):
-=======
-    with pytest.raises(ValueError, match=r"checkpoint: .*notes.txt: expected a readable npz archive"):
->>>>>>> words-io
         hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, checkpoint=tmp_path / "notes.txt")
 
 
