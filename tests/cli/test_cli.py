@@ -457,7 +457,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["-k", "0"], ["k: got 0", "expected an integer of at least 1"]),
+        (["-k", "0"], ["k: got 0", "expected an integer from 1"]),
         (["-k", "5000"], ["k: got 5000", "number of degrees of freedom"]),
         (["--times", "0", "1"], ["--times", "'0 1'", "expected positive numbers, or auto"]),
         (["--times", "auto:no"], ["--times", "auto:N"]),
