@@ -27,7 +27,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     """Compute the diffusion distance d_t(x_s, x)² = Σᵢ exp(−2λᵢt) (φᵢ(x_s) − φᵢ(x))² (Coifman and Lafon 2006).
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         times: (n_times,) positive.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
@@ -42,7 +42,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
     """Compute the biharmonic distance d(x_s, x)² = Σᵢ (φᵢ(x_s) − φᵢ(x))² / λᵢ² over λᵢ > 0 (Lipman et al. 2010).
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Returns:
@@ -172,7 +172,7 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
-    """Return the least normalised kernel that the pairs resolve, and the least that the grid resolves."""
+    """Return the least normalised kernels that the pairs and the grid resolve."""
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:

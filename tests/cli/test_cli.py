@@ -457,14 +457,14 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["-k", "0"], ["k: got 0", "expected an integer of at least 1"]),
+        (["-k", "0"], ["k: got 0", "expected an integer from 1"]),
         (["-k", "5000"], ["k: got 5000", "number of degrees of freedom"]),
         (["--times", "0", "1"], ["--times", "'0 1'", "expected positive numbers, or auto"]),
         (["--times", "auto:no"], ["--times", "auto:N"]),
         (["--slice", "14"], ["--slice", "such as z=14"]),
         (["--slice", "z=1"], ["slice", "expected a volume with three axes"]),
         (["--boundary", "robin"], ["boundary: got 'robin'", "'neumann'"]),
-        (["--boundary", "neumann,neumann,neumann,neumann"], ["expected one name, a tuple of 2"]),
+        (["--boundary", "neumann,neumann,neumann,neumann"], ["expected one name, or a tuple of 2"]),
         (["--metric", "euclid"], ["--metric", "invalid choice", "inverse"]),
         (["--order", "fsl"], ["order", "npz holds whole matrices"]),
         (["--erode", "40"], ["removes all"]),

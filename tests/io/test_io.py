@@ -212,7 +212,7 @@ def test_unreadable_files(tmp_path, tensors):
         hj.io.read_tensors(tmp_path / "t.mha")
     for name in ("t.nii", "t.nii.gz", "t.npz"):
         (tmp_path / name).write_bytes(b"not what the name says")
-        with pytest.raises(ValueError, match="damaged or not a readable"):
+        with pytest.raises(ValueError, match="not a readable"):
             hj.io.read_tensors(tmp_path / name)
     whole = write_components(tmp_path / "w.nii.gz", pack(tensors, "nifti")[..., None, :], np.eye(4), intent=True)
     (tmp_path / "cut.nii").write_bytes(gzip.decompress(whole.read_bytes())[:800])
