@@ -74,12 +74,12 @@ def solved(
 # on both sides: at most half of them lie below the origin, and the others follow the k pairs.
 #
 # Within a multiple eigenvalue, the coefficient of φⱼ in dφᵢ (j ≠ i, λᵢ = λⱼ) is a gauge, because every basis of the
-# eigenspace is valid. The rule sets it to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. Gaps below √ε (λ
-# − λ₀), where λ₀ is the lowest computed eigenvalue, are treated likewise, because division by such a gap would lose all
-# digits. So dφᵢ is a derivative only if λᵢ is simple; the dλᵢ of equal eigenvalues are meaningful only in their sum.
-# Quantities that are independent of the basis, such as spectral functions, must not use this gauge, and `of_simple`
-# hides the gauge from users. Such quantities use the frame instead: its derivative contains only the sum over j > k,
-# which is the same for every basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py).
+# eigenspace is valid. The rule sets it to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. If a gap is below
+# √ε (λ − λ₀), where λ₀ is the lowest computed eigenvalue, the rule does the same, because division by such a gap would
+# lose all digits. So dφᵢ is a derivative only if λᵢ is simple; of the dλᵢ of equal eigenvalues, only the sum has a
+# meaning. Quantities that are independent of the basis, such as spectral functions, must not use this gauge, and
+# `of_simple` hides the gauge from users. Such quantities use the frame instead: its derivative contains only the sum
+# over j > k, which is the same for every basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py).
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver,

@@ -321,7 +321,7 @@ def test_what_is_true_of_the_laplacian_alone_is_left_out():
     own = hj.assemble(euclidean(5, 4.0), stiffness=lambda u, v, w: u.value * v.value)
     with pytest.raises(ValueError, match="solver: got 'chebyshev-filter', which needs a positive semidefinite"):
         hj.eigenpairs(own, 3, solver="chebyshev-filter")
-    with pytest.raises(ValueError, match="nothing is known of the null space"):
+    with pytest.raises(ValueError, match="unknown null space"):
         hj.hks_spectrum_free(own, [0.1])
     without = hj.hks_spectrum_free(pencil, [0.1, 0.3], method="selected-inversion")
     np.testing.assert_allclose(without, hj.hks(hj.eigenpairs(pencil, 17**2), [0.1, 0.3]), rtol=1e-8)

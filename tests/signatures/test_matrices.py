@@ -213,7 +213,7 @@ def test_a_geometry_that_is_lacking_is_named():
         (lambda: hj.shape_dna(pairs), "dimension"),
         (lambda: hj.truncation(pairs, TIMES), "dimension"),
     ):
-        with pytest.raises(ValueError, match=f"without the {lacking} .* needs. Use `sparse_pencil"):
+        with pytest.raises(ValueError, match=rf"without the {lacking} of .*`sparse_pencil\("):
             signature()
     with pytest.raises(ValueError, match="problem: got one without dimension or volume"):
         hj.weyl_count(pairs, [1.0])
