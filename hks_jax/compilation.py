@@ -23,11 +23,11 @@ _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "
 
 
 OnHost = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
-"""Computes by NumPy, given all arguments, changes x of some arguments, and cotangents y of the result's leaves.
+"""A function that computes by NumPy, given all arguments, changes x of some, and cotangents y of the result's leaves.
 
-Without x and y it returns the function's result, with x the change of the result, and with y the cotangents of x, where
-x has only shapes. If the function is linear in x, the arguments do not include x. None means that the function must be
-compiled.
+If x and y are None, it returns the function's result. If only x is given, it returns the change of the result. If y is
+given, it returns the cotangents of x, where x has only shapes. If the function is linear in x, the arguments do not
+include x. None means that the function must be compiled.
 """
 
 

@@ -56,9 +56,9 @@ def fit_metric(
             `Parametrisation`, or `Free` parameters of a function.
         data: the kind of signature, the measure of differences, and the weights and noise of entries.
         regularisers: penalties from `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
-        k: the number of eigenpairs. By default, a share of 1e-6 of the heat trace at the smallest time lies beyond them
-            by Weyl's law, or all are computed. It grows if the fit reaches a field of more volume. For a wave kernel
-            signature they reach to 2σ above the largest energy.
+        k: the number of eigenpairs. By default a share of 1e-6 of the heat trace at the smallest time lies beyond k by
+            Weyl's law, or k is maximal. It grows if the fit reaches a field of more volume. For a wave kernel signature
+            they reach to 2σ above the largest energy.
         boundary: the same as for `eigenpairs`.
         solver: the eigensolver; ``"auto"`` chooses one for many products with the same Jacobian.
         search: the settings of the optimisation and its stopping criteria.

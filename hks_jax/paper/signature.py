@@ -40,7 +40,7 @@ def signature(
 def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0) -> int:
     """Return k such that exp(−λₖt) is about exp(−exponent), by Weyl's law for a square.
 
-    A mirror has four times the area and no boundary.
+    The mirrored square has four times the area and no boundary.
     """
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors)))
     area = float(np.sum(density[field.grid.inside]) * np.prod(field.grid.spacing))

@@ -31,7 +31,7 @@ LABELS = {
 LEAST_RANGE = 0.01
 """The least range of the colours relative to the values, below which contrast is not enhanced."""
 RIM = 5
-"""The least distance, in nodes, of values that set the colours from the boundary, which can raise the HKS fourfold."""
+"""The least distance from the boundary, in nodes, of values that set the colours. The HKS is higher near it."""
 
 
 def signature_panels(

@@ -40,7 +40,7 @@ def boundary_influence(
         domain: a metric in 2D or 3D, a mesh, or eigenpairs with the boundary ``"mean"``, which contain both problems.
         times: (n_times,) positive, in (metric length)².
         k: the number of eigenpairs of each problem; to be omitted if eigenpairs are given.
-        boundary: ``"neumann"`` or ``"mean"``, which mean the same here. On grids also ``"periodic"``, either one value
+        boundary: ``"neumann"`` or ``"mean"``, which are equivalent here. Grids also accept ``"periodic"``, as one value
             for all axes or one per axis. To be omitted if eigenpairs are given.
         solver: the same as for `eigenpairs`.
 
@@ -55,7 +55,7 @@ def boundary_influence(
     """
     if isinstance(domain, Eigenpairs):
         if k is not None or boundary != "neumann":
-            raise ValueError("k, boundary: got values, but the eigenpairs determine both; omit them")
+            raise ValueError("k, boundary: got values for eigenpairs, which determine both; omit these arguments")
         if len(domain.pencil.parts) != 2:
             raise ValueError('domain: got eigenpairs of another boundary; compute them with boundary="mean"')
         times = resolved_times(domain, times)

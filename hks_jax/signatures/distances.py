@@ -94,7 +94,7 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
 MARGIN = 10.0
 """The least ratio of a kernel to its truncation error. The error of its logarithm is then at most about 0.1."""
 GRID_LIMIT = 0.1
-"""The largest relative error of a squared distance that is accepted from the grid spacing."""
+"""The largest accepted relative error of a squared distance due to the grid spacing."""
 
 
 def varadhan_distance(

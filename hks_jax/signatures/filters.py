@@ -68,7 +68,7 @@ def _mean_or_quotient(
 ) -> Float[Array, "*n"]:
     """Return the mean if two quadrature rules and the quotient agree to within their errors, otherwise the quotient.
 
-    The quotient is the change over the gap. The change is the difference of two terms of the given size.
+    The quotient is the change divided by the gap. The change is the difference of two terms of the given size.
     """
     eps = jnp.finfo(gap.dtype).eps
     apart = gap > 0

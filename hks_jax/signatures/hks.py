@@ -184,8 +184,7 @@ def hks_auto(
 def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, values: Array) -> Array:
     if normalisation == "heat-trace":
         raise ValueError(
-            'normalisation: "heat-trace" needs all eigenvalues; expected "raw", "volume" or "flat", or '
-            'method="spectral"'
+            'normalisation: got "heat-trace", which needs eigenvalues; use "raw", "volume", "flat" or method="spectral"'
         )
     return values * normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
 

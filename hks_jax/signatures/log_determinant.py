@@ -107,7 +107,7 @@ def log_determinant(
 
     Raises:
         ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if pairs are in an interval,
-            if no or a negative eigenvalue is found, or if the dimension is not known.
+            if an eigenvalue is negative or none is positive, or if the dimension is not known.
 
     Warns:
         AccuracyWarning: if the estimated error exceeds 0.01.

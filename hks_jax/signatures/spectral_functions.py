@@ -87,7 +87,7 @@ def sum_of(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"])
 @jax.custom_jvp
 def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
     """Return the contraction of the kernels Φ f(Λ) Φᵀ of m filters."""
-    # JAX differentiates this body, not the rule, in the outer of two derivatives, which is not supported.
+    # In a second derivative JAX differentiates this body instead of the rule, which is not supported.
     pairs = first_order_only(pairs)
     return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
 

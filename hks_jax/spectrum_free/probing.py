@@ -146,7 +146,7 @@ def _products(settings: Colouring, pencil: NodalPencil) -> tuple[Callable[[Array
 def _sum_of_blocks(
     settings: Colouring, colours: StaticArray, term: Callable[[Float[Array, "*shape b"], T], T], total: T
 ) -> T:
-    """Return the total after adding the term of each block of colours, a function of the vectors of its colours."""
+    """Add the terms of all blocks of colours to a total. A term is a function of the vectors of a block."""
     numbers, dtype = jnp.arange(settings.columns, dtype=jnp.int32), jax.tree.leaves(total)[0].dtype
 
     def step(number: Array, total: T) -> T:

@@ -1,7 +1,6 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by rational approximation and selected inversion.
 
-The Carathéodory–Fejér method gives exp(−x) ≈ Re Σ w/(x − z). So the diagonal of Re Σ w (tK − zM)⁻¹ approximates the one
-sought.
+With exp(−x) ≈ Re Σ w/(x − z) by the Carathéodory–Fejér method, it is about the diagonal of Re Σ w (tK − zM)⁻¹.
 """
 
 from functools import lru_cache

@@ -464,7 +464,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
         (["--slice", "14"], ["--slice", "such as z=14"]),
         (["--slice", "z=1"], ["slice", "expected a volume with three axes"]),
         (["--boundary", "robin"], ["boundary: got 'robin'", "'neumann'"]),
-        (["--boundary", "neumann,neumann,neumann,neumann"], ["expected one name, or a tuple of 2"]),
+        (["--boundary", "neumann,neumann,neumann,neumann"], ["expected one name"]),
         (["--metric", "euclid"], ["--metric", "invalid choice", "inverse"]),
         (["--order", "fsl"], ["order", "npz holds whole matrices"]),
         (["--erode", "40"], ["removes all"]),

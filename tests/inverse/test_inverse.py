@@ -477,8 +477,8 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
     ("changes", "message"),
     [
         ({"target": lambda t: t[:, 1:]}, r"target: got shape \(4, 9, 10\); expected .* \(4, 10, 10\)"),
-        ({"target": lambda t: np.where(t == t[0, 0, 0], np.nan, t)}, r"target: 1 of 400 observed values are NaN"),
-        ({"target": lambda t: t - 100}, r"target: \d+ of 400 observed values are not positive \(the first at \(0, 0, "),
+        ({"target": lambda t: np.where(t == t[0, 0, 0], np.nan, t)}, "target: got 1 of 400 observed .* are NaN"),
+        ({"target": lambda t: t - 100}, r"target: got \d+ of 400 .* not positive \(the first is .* at \(0, 0, "),
         ({"times": [0.1, -1.0, 1.0, 2.0]}, "times: got -1.0; expected positive"),
         ({"times": np.array([1e-5, 0.1, 0.2, 0.3])}, "times: got 1e-05, which takes about .* Use times from about"),
         ({"parametrisation": "spherical"}, "parametrisation: got 'spherical'; expected 'log-euclidean'"),

@@ -40,7 +40,7 @@ def tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarra
         raise ValueError(f"tensors: got shape {array.shape}; expected (*shape, d, d) = {(*inside.shape, d, d)}")
     array = array[inside].astype(np.float64)
     if not np.isfinite(array).all():
-        raise ValueError("tensors: got NaN or infinite ones inside the domain; exclude their nodes by the mask")
+        raise ValueError("tensors: got NaN or infinite values in the domain; exclude their nodes by the mask")
     values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
     mean = values.mean(axis=-1)
     spread = np.sqrt(np.sum(np.square(values - mean[:, None]), axis=-1))
