@@ -1,4 +1,4 @@
-"""Compiling for CPUs in half the time, or not at all."""
+"""Faster compilation for CPUs, and computation by NumPy without compilation."""
 
 import inspect
 import os
@@ -19,35 +19,35 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
-"""XLA's older code generator for fused loops takes half as long, for code as fast as far as measured here."""
+"""XLA's older code generator for fused loops compiles in half the time; in measurements, its code was as fast."""
 
+NumPyRule = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
+"""A function of (primals, x, y) that evaluates a function or its derivative by NumPy, or returns None to compile.
 
-OnHost = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
-"""What NumPy computes of all arguments, of changes x of some, and of cotangents y of the leaves of the result.
-
-With neither it is what the function returns, with x the change of that, and with y the cotangents of x, which then has
-shapes alone. Of a function that is linear in x, x is no longer among the arguments. None: it is to be compiled.
+The primals are all arguments, x are tangents of some arguments, and y are cotangents of the leaves of the result. If x
+and y are None, it returns the result. If y is None, it returns the tangent of the result. Otherwise, it returns the
+cotangents of x, and x contains only shapes. For a linear function, None replaces the linear arguments in the primals.
 """
 
 
 def jit_quickly(
     jit: Callable = jax.jit,
     linear: tuple[str, ...] = (),
-    like: Callable[..., Any] = lambda *args: None,
-    on_host: OnHost | None = None,
+    shapes: Callable[..., Any] = lambda *args: None,
+    numpy_rule: NumPyRule | None = None,
     **settings: Any,
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Return a decorator like `jax.jit`, or `equinox.filter_jit`, for functions that take long to compile.
+    """Return a decorator like `jax.jit`, or `equinox.filter_jit`, that compiles faster on CPUs.
 
-    XLA compiles a computation as a whole: within another one these functions are as that is. Where the environment
-    variable XLA_FLAGS sets one of the options, they are left as it says.
+    The options apply only to calls outside `jax.jit`, because XLA compiles an enclosing function as a whole. If the
+    environment variable XLA_FLAGS sets one of the options, the decorator sets none.
 
     Args:
-        jit: what compiles.
-        linear: names of arguments in which the function is linear, jointly.
-        like: what has the shapes of the result, given all arguments, where it is linear.
-        on_host: what computes instead where values are known, and few, on a CPU.
-        settings: for ``jit``.
+        jit: the decorator that compiles.
+        linear: the names of the arguments in which the function is jointly linear.
+        shapes: maps all arguments to a pytree with the shapes of the result, for linear functions.
+        numpy_rule: evaluates the function and its derivatives by NumPy for concrete arguments on a CPU.
+        settings: the keyword arguments of ``jit``.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
@@ -66,7 +66,7 @@ def jit_quickly(
                 return usual(*args, **kwargs)
             bound = signature.bind(*args, **kwargs)
             if not linear and not is_traced((args, kwargs)):
-                found = _on_host(on_host, bound.args, None, None)
+                found = _apply(numpy_rule, bound.args, None, None)
                 return quick(*args, **kwargs) if found is None else found
             given = {name: None if name in static else x for name, x in bound.arguments.items()}
             moved = [jax.tree.map(partial(is_moved, name), x) for name, x in given.items()]
@@ -75,12 +75,12 @@ def jit_quickly(
             if whole or is_traced(known) or not all(map(_is_inexact, x)):
                 return usual(*args, **kwargs)
             fixed = tuple(bound.arguments[name] if name in static else None for name in given)
-            program = _Program(usual, fixed, jax.tree.structure(parts), on_host)
+            program = _Program(usual, fixed, jax.tree.structure(parts), numpy_rule)
             if not linear:
                 return _differentiable(program, known, x)
-            results, structure = jax.tree.flatten(like(*bound.args))
-            of = _Map(program, False, _shapes(x), _shapes(results))
-            return jax.tree.unflatten(structure, _linear.bind(*known, *x, of=of))
+            results, structure = jax.tree.flatten(shapes(*bound.args))
+            linear_map = _LinearMap(program, False, _shapes(x), _shapes(results))
+            return jax.tree.unflatten(structure, _linear.bind(*known, *x, linear_map=linear_map))
 
         return call
 
@@ -88,14 +88,14 @@ def jit_quickly(
 
 
 _FEW = 1 << 19
-"""Numbers that NumPy computes with in less time than it takes to compile a program for them, even for many calls."""
+"""The largest number of array entries for which NumPy is faster than compilation, even for many calls."""
 
 
 def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Return a decorator for functions that take the module of arrays, NumPy's or JAX's, first.
+    """Return a decorator for functions whose first argument is the array module, `numpy` or `jax.numpy`.
 
-    With concrete values on a CPU, if they are few, NumPy computes, for which nothing is compiled; else `jax.jit` with
-    the settings. What comes out are JAX's arrays.
+    If the arguments are concrete, small and on a CPU, NumPy evaluates the function without compilation. Otherwise, the
+    function is compiled by `jax.jit` with the settings. The results are JAX arrays in both cases.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -111,23 +111,23 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
 
 def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
-    """Return what a function makes of NumPy's arrays in place of JAX's, as JAX's arrays."""
+    """Evaluate a function with NumPy arrays in place of JAX arrays; return its result as JAX arrays."""
     known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
     with np.errstate(all="ignore"):
-        # `asarray` leaves them NumPy's where JAX differentiates.
+        # `device_put`, because `jnp.asarray` returns NumPy arrays during differentiation.
         return jax.device_put(jax.tree.map(np.asarray, function(*known)))
 
 
 def known_and_few(args: Any) -> bool:
-    """Return whether values are `known_here` and few: then NumPy computes.
+    """Return whether values are `known_here` and have at most `_FEW` entries, so that NumPy computes.
 
-    It depends on shapes and devices alone, so that a computation has the same rounding each time.
+    The decision depends only on shapes and devices, so repeated computations have the same rounding.
     """
     return known_here(args) and sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= _FEW
 
 
 def known_here(args: Any) -> bool:
-    """Return whether values are concrete, and on one CPU of this process alone."""
+    """Return whether all values are concrete, and each is on one CPU device of a single process."""
     if is_staged() or is_traced(args) or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return False
     return all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(args) if isinstance(leaf, jax.Array))
@@ -135,7 +135,7 @@ def known_here(args: Any) -> bool:
 
 @cache
 def _understood() -> bool:
-    """Return whether computations run on a CPU whose compiler has these options, and leaves them to us."""
+    """Return whether the backend is a CPU whose compiler accepts the options, and XLA_FLAGS sets none of them."""
     if jax.default_backend() != "cpu" or any(option in os.environ.get("XLA_FLAGS", "") for option in _OPTIONS):
         return False
     try:
@@ -146,71 +146,71 @@ def _understood() -> bool:
 
 
 class _Program(NamedTuple):
-    """A function of a flat list of arrays, with its static arguments; equal ones share what is compiled."""
+    """A function of a flat list of arrays, with its static arguments. Equal instances share one compilation."""
 
     function: Callable[..., Any]
     fixed: tuple[Any, ...]
     structure: jax.tree_util.PyTreeDef
-    host: OnHost | None
+    numpy_rule: NumPyRule | None
 
     def __call__(self, *leaves: Any) -> Any:
-        """Return what the function returns."""
+        """Evaluate the function."""
         return self.function(*self.args(*leaves))
 
     def args(self, *leaves: Any) -> list[Any]:
-        """Return the arguments."""
+        """Return the arguments of the function."""
         return [known if x is None else eqx.combine(known, x) for known, x in zip(*self.split(*leaves), strict=True)]
 
     def split(self, *leaves: Any) -> tuple[list[Any], list[Any]]:
-        """Return the arguments that are known, and the others."""
+        """Return the constant arguments, and the arguments for differentiation; None replaces all others in each."""
         known, x = jax.tree.unflatten(self.structure, leaves)
         return [own if fixed is None else fixed for own, fixed in zip(known, self.fixed, strict=True)], x
 
-    def on_host(self, *leaves: Any) -> Any:
-        """Return by NumPy what the function returns, or None."""
-        return _on_host(self.host, self.args(*leaves), None, None)
+    def by_numpy(self, *leaves: Any) -> Any:
+        """Evaluate the function by NumPy, or return None."""
+        return _apply(self.numpy_rule, self.args(*leaves), None, None)
 
 
-class _Map(NamedTuple):
-    """A linear map, or its transpose: of arrays that are known, and then of those that it is linear in.
+class _LinearMap(NamedTuple):
+    """A linear map, or its transpose, as a function of constant arrays followed by the linear inputs.
 
     Attributes:
-        program: what is linear in its last arguments.
-        at: or, if true, its derivative by these, which then come twice: as they are, and their changes.
-        x: the shapes of what it is linear in.
-        y: those of what it returns.
-        transposed: whether it is the transpose.
+        program: the function, which must be linear in its last arguments if `tangent` is false.
+        tangent: whether the map is the tangent map by the last arguments, whose values are then the last constants.
+        x: the shapes of the inputs of the map without transposition.
+        y: the shapes of the results of the map without transposition.
+        transposed: whether to apply the transpose.
     """
 
     program: _Program
-    at: bool
+    tangent: bool
     x: tuple[jax.ShapeDtypeStruct, ...]
     y: tuple[jax.ShapeDtypeStruct, ...]
     transposed: bool = False
 
     def split(self, leaves: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-        """Return what is known, and the rest."""
+        """Return the constants, and the linear inputs."""
         n = len(leaves) - len(self.y if self.transposed else self.x)
         return list(leaves[:n]), list(leaves[n:])
 
     def __call__(self, *leaves: Any) -> list[Any]:
-        """Return what the map makes of arrays."""
+        """Apply the map."""
         known, rest = self.split(leaves)
 
         def forward(*x: Any) -> list[Any]:
-            if not self.at:
+            if not self.tangent:
                 return jax.tree.leaves(self.program(*known, *x))
             n = len(known) - len(x)
             return jax.tree.leaves(jax.jvp(lambda *x: self.program(*known[:n], *x), known[n:], x)[1])
 
         return list(jax.linear_transpose(forward, *self.x)(rest)) if self.transposed else forward(*rest)
 
-    def on_host(self, *leaves: Any) -> Any:
-        """Return by NumPy what the map makes of arrays, or None."""
+    def by_numpy(self, *leaves: Any) -> Any:
+        """Apply the map by NumPy, or return None."""
         known, rest = self.split(leaves)
         x, y = (self.x, [np.asarray(each) for each in rest]) if self.transposed else (rest, None)
-        args, change = self.program.split(*known[: len(known) - self.at * len(x)], *x)
-        return _on_host(self.program.host, self.program.args(*known) if self.at else args, change, y)
+        args, change = self.program.split(*known[: len(known) - self.tangent * len(x)], *x)
+        return _apply(self.program.numpy_rule, self.program.args(*known) if self.tangent else args, change, y)
 
 
 def _is_inexact(leaf: Any) -> bool:
@@ -222,16 +222,16 @@ def _quick(function: Callable[..., Any], *leaves: Any) -> Any:
     return function(*leaves)
 
 
-def _on_host(host: OnHost | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
-    if host is None or not known_here((known, others)):
+def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
+    if rule is None or not known_here((known, others)):
         return None
     with np.errstate(all="ignore"):
-        return jax.device_put(host(list(known), *others))
+        return jax.device_put(rule(list(known), *others))
 
 
-def _computed(function: _Program | _Map, *leaves: Any) -> Any:
+def _computed(function: _Program | _LinearMap, *leaves: Any) -> Any:
     with jax.core.eval_context():
-        found = function.on_host(*leaves)
+        found = function.by_numpy(*leaves)
         return _quick(function, *leaves) if found is None else found
 
 
@@ -239,11 +239,11 @@ def _shapes(leaves: Sequence[Any]) -> tuple[jax.ShapeDtypeStruct, ...]:
     return tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
 
 
-# JAX takes no compiler options for the programs that it makes itself where it differentiates, and makes several of one.
-# A derivative that is taken outside of `jax.jit`, where its values are known, is one program here, and its transpose
-# another. Wherever else it comes to be computed it consists of JAX's operations, as it would without.
+# JAX accepts no compiler options for the programs that it generates for derivatives, and splits a derivative into
+# several programs. If the values are concrete, as outside `jax.jit`, the tangent map is one program here, and its
+# transpose is another. Otherwise, the derivative consists of JAX's own operations.
 def _differentiable(program: _Program, known: list[Any], x: list[Any]) -> Any:
-    """Return what a program does, to be differentiated by x."""
+    """Evaluate a program with a custom derivative rule with respect to x."""
 
     @jax.custom_jvp
     def call(*x: Any) -> Any:
@@ -255,20 +255,21 @@ def _differentiable(program: _Program, known: list[Any], x: list[Any]) -> Any:
         leaves, structure = jax.tree.flatten(result)
         if not (leaves and all(map(_is_inexact, leaves))):
             return jax.jvp(lambda *x: program(*known, *x), x, change)
-        of = _Map(program, True, _shapes(x), _shapes(leaves))
-        return result, jax.tree.unflatten(structure, _linear.bind(*known, *x, *change, of=of))
+        linear_map = _LinearMap(program, True, _shapes(x), _shapes(leaves))
+        return result, jax.tree.unflatten(structure, _linear.bind(*known, *x, *change, linear_map=linear_map))
 
     return call(*x)
 
 
 _linear = Primitive("linear_program")
 _linear.multiple_results = True
-_linear.def_impl(lambda *leaves, of: jax.tree.leaves(_computed(of, *leaves)))
+_linear.def_impl(lambda *leaves, linear_map: jax.tree.leaves(_computed(linear_map, *leaves)))
 
 
 @_linear.def_abstract_eval
-def _abstract(*leaves: Any, of: Any) -> list[Any]:
-    return [jax.core.ShapedArray(shape.shape, shape.dtype) for shape in (of.x if of.transposed else of.y)]
+def _abstract(*leaves: Any, linear_map: Any) -> list[Any]:
+    results = linear_map.x if linear_map.transposed else linear_map.y
+    return [jax.core.ShapedArray(result.shape, result.dtype) for result in results]
 
 
 def _full(changes: Sequence[Any]) -> list[Any]:
@@ -279,31 +280,32 @@ def _full(changes: Sequence[Any]) -> list[Any]:
     return list(map(full, changes))
 
 
-def _transpose(cotangents: list[Any], *leaves: Any, of: _Map) -> list[Any]:
-    known, x = of.split(leaves)
-    results = _linear.bind(*known, *_full(cotangents), of=of._replace(transposed=not of.transposed))
+def _transpose(cotangents: list[Any], *leaves: Any, linear_map: _LinearMap) -> list[Any]:
+    known, x = linear_map.split(leaves)
+    transpose = linear_map._replace(transposed=not linear_map.transposed)
+    results = _linear.bind(*known, *_full(cotangents), linear_map=transpose)
     wanted = map(ad.is_undefined_primal, x)
     return [None] * len(known) + [result if each else None for result, each in zip(results, wanted, strict=True)]
 
 
-def _jvp(leaves: tuple[Any, ...], change: tuple[Any, ...], of: _Map) -> tuple[list[Any], list[Any]]:
-    (known, _), (d_known, d_rest) = of.split(leaves), of.split(change)
+def _jvp(leaves: tuple[Any, ...], change: tuple[Any, ...], linear_map: _LinearMap) -> tuple[list[Any], list[Any]]:
+    (known, _), (d_known, d_rest) = linear_map.split(leaves), linear_map.split(change)
     if all(isinstance(d, ad.Zero) for d in d_known):
-        return _linear.bind(*leaves, of=of), _linear.bind(*known, *_full(d_rest), of=of)
+        return _linear.bind(*leaves, linear_map=linear_map), _linear.bind(*known, *_full(d_rest), linear_map=linear_map)
     moved = {i: d for i, d in enumerate(change) if not isinstance(d, ad.Zero)}
 
-    def of_moved(*some: Any) -> list[Any]:
-        return of(*(dict(enumerate(leaves)) | dict(zip(moved, some, strict=True))).values())
+    def of_varied(*some: Any) -> list[Any]:
+        return linear_map(*(dict(enumerate(leaves)) | dict(zip(moved, some, strict=True))).values())
 
-    return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moved.values()))
+    return jax.jvp(of_varied, tuple(leaves[i] for i in moved), tuple(moved.values()))
 
 
-def _batch(leaves: tuple[Any, ...], axes: tuple[Any, ...], of: _Map) -> tuple[list[Any], list[int]]:
-    results = jax.vmap(lambda *leaves: of(*leaves), in_axes=tuple(axes))(*leaves)
+def _batch(leaves: tuple[Any, ...], axes: tuple[Any, ...], linear_map: _LinearMap) -> tuple[list[Any], list[int]]:
+    results = jax.vmap(lambda *leaves: linear_map(*leaves), in_axes=tuple(axes))(*leaves)
     return results, [0] * len(results)
 
 
 ad.primitive_transposes[_linear] = _transpose
 ad.primitive_jvps[_linear] = _jvp
 batching.primitive_batchers[_linear] = _batch
-mlir.register_lowering(_linear, mlir.lower_fun(lambda *leaves, of: of(*leaves), multiple_results=True))
+mlir.register_lowering(_linear, mlir.lower_fun(lambda *leaves, linear_map: linear_map(*leaves), multiple_results=True))

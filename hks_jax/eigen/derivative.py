@@ -1,4 +1,4 @@
-"""Eigenpairs of a pencil, the lowest or those from an origin, and their derivatives by stiffness and mass."""
+"""The lowest eigenpairs of a pencil, or those above an origin, and their derivatives by stiffness and mass."""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,10 +27,10 @@ from hks_jax.linear.products import inner_products, matmul
 from hks_jax.traced import is_traced
 
 Telling = Literal["nothing", "warning", "error"]
-"""What follows where the derivative does not converge, besides NaN."""
+"""The report, in addition to NaN, if the linear solves of a derivative do not converge."""
 
 _ON_HOST = 1 << 23
-"""Numbers in the eigenvectors up to which NumPy differentiates, in about the same time, and compiles nothing."""
+"""The largest number of entries of the eigenvectors for which NumPy differentiates; it needs no compilation."""
 
 Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
 Followed = tuple[
@@ -48,12 +48,12 @@ def solved(
     throw: bool,
     report: Report = silent,
 ) -> Followed:
-    """Return k eigenvalues, their eigenvectors, these again as the frame, the next eigenvalue, and a bound.
+    """Return k eigenvalues, the eigenvectors, the same vectors as the frame, the next eigenvalue, and a bound.
 
-    The pairs are the lowest ones or, if ``interior``, the first from the origin of a `LocatedPencil` upwards. The
-    derivative of the frame is that of the eigenvectors without what rotates them among the k. The next eigenvalue is
-    infinite unless one ``extra`` is asked for; the bound is the solver's. Both are constants to derivatives. Where the
-    derivative does not converge it is NaN: an error, if ``throw``; else a warning where values are concrete.
+    The pairs are the k lowest or, if ``interior``, the first k from the origin of a `LocatedPencil` upwards. The
+    derivative of the frame is dφᵢ without its components in the k eigenvectors. The next eigenvalue is infinite if
+    ``extra`` is 0; the bound is that of the solver. Both have the derivative zero. If the linear solves do not
+    converge, the derivative is NaN; with ``throw`` an error is raised, otherwise a warning for concrete values.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)
@@ -64,22 +64,22 @@ def solved(
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #
-# The sum is over all j. Over the computed pairs it is taken as it stands; the rest of it, xᵢ, is what solves
+# The sum is over all j. Its terms for the computed pairs are evaluated directly; the remainder xᵢ is the solution of
 #
 #     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
 #
 # on the M-orthogonal complement of the computed Φ, where K − λᵢM is positive definite. The map fᵢ ↦ xᵢ is symmetric,
-# which gives reverse mode. The solver computes some guard pairs beyond k, so that λᵢ keeps a distance from what is
-# left to the linear solve. In the interior of a spectrum eigenvalues are left on both sides, and there are guards on
-# both sides: the origin is lowered past at most half of them, and the rest are those that follow the k.
+# so reverse mode uses the same solve. The solver computes some guard pairs beyond k, which separate λᵢ from the
+# remaining eigenvalues of the linear system. For pairs in the interior of the spectrum, there are guards on both sides:
+# lowering the origin adds at most half of the guards, and the other guards follow the k pairs.
 #
-# Within a multiple eigenvalue the rotation (j ≠ i, λᵢ = λⱼ) is a matter of gauge: a perturbation may choose any basis
-# there. The rule takes −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN; and so it does where the gap is
-# below √ε (λ − λ₀), λ₀ the lowest computed, because dividing by it would leave no digits. So dφᵢ is the derivative of
-# an eigenvector only where λᵢ is simple, and dλᵢ within a multiple eigenvalue only in the sum over its copies. What
-# does not depend on the basis, such as every spectral function, must not be computed from that gauge, and `of_simple`
-# keeps it from users. For it there is the frame: its derivative has the sum over j > k alone, which no basis of the
-# first k changes (hks_jax/signatures/spectral_functions.py).
+# In a multiple eigenspace the coefficients with j ≠ i and λᵢ = λⱼ depend on the choice of a basis, the gauge. The rule
+# uses −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. It also uses this value if the gap is less than
+# √ε (λ − λ₀), where λ₀ is the lowest computed eigenvalue, because the quotient would have no correct digits. Therefore
+# dφᵢ is the derivative of an eigenvector only if λᵢ is simple. For a multiple eigenvalue, only the sum of the dλᵢ is
+# correct. Quantities that do not depend on the basis, such as spectral functions, must not use the gauge; `of_simple`
+# hides it from users. They use the frame, whose derivative contains only the terms with j > k. These terms do not
+# depend on the basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py).
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver,
@@ -106,9 +106,9 @@ def _solved_jvp(
     return (eigenvalues, functions, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
-# The transpose keeps what its arguments have, needed or not.
+# The transpose stores all its arguments, including arrays that it does not need.
 def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
-    """Return a pencil without what serves estimates alone."""
+    """Return a pencil without the metric, which only error estimates need."""
     if not isinstance(pencil, Pencil) or pencil.metric is None:
         return pencil
     return eqx.tree_at(lambda p: p.metric, pencil, None)
@@ -117,7 +117,7 @@ def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
 def _computed(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
 ) -> RawPairs:
-    """Return k pairs and some spare ones."""
+    """Return k + spare computed eigenpairs, and the bound of the solver."""
     if interior:
         return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
     values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
@@ -127,29 +127,29 @@ def _computed(
 
 @numpy_where_known(static_argnums=2)
 def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    """Return the first k pairs, and the eigenvalue after them."""
+    """Return the first k pairs, and the next eigenvalue, or infinity."""
     return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
 
 
-# Apart from the tangents, so that many products with one Jacobian share it.
+# Separate from `tangents_of`, so that many products with one Jacobian share the preparation.
 def prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Array, " p"]) -> Any:
-    """Return what the adjoint needs for the first k of p computed pairs; None where it has nothing to solve."""
+    """Prepare the adjoint for the first k of p computed pairs; return None if no linear system must be solved."""
     return one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
 
 
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
-    """Return whether derivatives of the first k of p computed pairs have parts in other eigenvectors."""
+    """Return whether derivatives of the first k pairs have components outside the p computed eigenvectors."""
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _like(*args: Any) -> tuple[Any, Any, Any]:
-    """Return what has the shapes of the tangents."""
+def _shapes(*args: Any) -> tuple[Any, Any, Any]:
+    """Return the shapes and dtypes of the tangents."""
     functions = args[-1]
     return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions, functions
 
 
-def _on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the tangents, or the cotangents of the change, by NumPy."""
+def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return the tangents of the pairs, or the cotangents of the change of the pencil, by NumPy."""
     adjoint, telling, prepared, pencil, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
     if vectors.size > _ON_HOST or x is None:
@@ -176,7 +176,7 @@ def _on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         into, frame = force @ functions.T, onto(force)
         within = np.where(apart[:, :k], inverse[:, :k] * into, -(moved @ functions.T) / 2)
         return np.diagonal(into), within @ functions + frame, frame
-    # Of all this the transpose.
+    # The transpose of the steps above.
     of_values, of_vectors, of_frame = y
     within = of_vectors @ functions.T
     into = np.where(apart[:, :k], inverse[:, :k] * within, 0) + np.diag(of_values)
@@ -188,7 +188,7 @@ def _on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
 def change_of(
     change: SymmetricPencil, x: Float[np.ndarray, "b n_dof"], *p: Float[np.ndarray, "b n_dof"]
 ) -> SymmetricPencil:
-    """Return a pencil of zeros, but for Σ pxᵀ in place of the entries of stiffness and mass, given p for each."""
+    """Return a pencil of zeros, except Σ pxᵀ at the entries of stiffness and mass, for the given p of each."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     columns = np.ascontiguousarray(x.T)
     matrices = tuple(
@@ -199,15 +199,15 @@ def change_of(
 
 
 def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
-    """Return which of the p eigenvalues differ from each of the first k, and 1/(λᵢ − λⱼ), or 0: (k, p)."""
+    """Return a mask (k, p) of distinct eigenvalues λᵢ, i < k, and λⱼ, and 1/(λᵢ − λⱼ) there, 0 elsewhere."""
     gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
     least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
     apart = xp.abs(gap) > xp.maximum(least, rounding)
     return apart, xp.where(apart, 1 / xp.where(apart, gap, 1), 0)
 
 
-# Without the checkpoint, the transpose would keep copies of the eigenvectors.
-@jit_quickly(static_argnames=("adjoint", "telling"), linear=("change",), like=_like, on_host=_on_host)
+# Without the checkpoint, the transpose would store copies of the eigenvectors.
+@jit_quickly(static_argnames=("adjoint", "telling"), linear=("change",), shapes=_shapes, numpy_rule=_numpy_rule)
 @partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(
     adjoint: Adjoint,
@@ -219,17 +219,17 @@ def tangents_of(
     vectors: Float[Array, "p n_dof"],
     functions: Float[Array, "k n_dof"],
 ) -> Lowest:
-    """Return dλ, dφ and the derivative of the frame, of the first k of p computed pairs.
+    """Return dλ, dφ and the derivative of the frame for the first k of p computed pairs.
 
-    The pairs come in the order that the adjoint expects, for which it is prepared; the eigenvectors of the first k come
-    alone as well, so that they need not be copied.
+    The pairs have the order for which the adjoint is prepared. The first k eigenvectors are passed twice, in `vectors`
+    and as `functions`, to avoid a copy.
     """
     k = len(functions)
     eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     apart, inverse = _gaps(jnp, values, k, indistinct(pencil, values.dtype))
-    # Apart from the guards: reverse mode of the frame needs the product with these alone.
+    # The guards have a separate product, because reverse mode of the frame needs only that one.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
     frame = _onto(guards, inverse[:, k:], force)
@@ -239,7 +239,7 @@ def tangents_of(
     return jnp.diagonal(into), d_vectors, frame
 
 
-# Symmetric, it is its own transpose; the one that JAX makes is several times as slow.
+# The map is symmetric, so it equals its transpose; the transpose that JAX derives is several times slower.
 def _onto(
     guards: Float[Array, "g n_dof"], factors: Float[Array, "k g"], force: Float[Array, "k n_dof"]
 ) -> Float[Array, "k n_dof"]:
@@ -269,15 +269,15 @@ def _outside(
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return _told(telling, one_by_one(_solve, (adjoint,), prepared, pencil, values, vectors, b))
 
-    # No force acts on null vectors that every perturbation annihilates. In reverse mode, where their rows are
-    # cotangents, it is their solutions that do not count.
+    # The force on null vectors that every perturbation annihilates is zero. In reverse mode, the rows of these null
+    # vectors are cotangents, and their solutions are set to zero.
     def moved(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return jnp.where(np.arange(len(x))[:, None] < n_fixed, 0, x)
 
     return moved(jax.lax.custom_linear_solve(matvec, moved(rhs), solve, symmetric=True))
 
 
-# What `one_by_one` calls are functions of the module, not methods, so that they are the same objects in every call.
+# The arguments of `one_by_one` are module functions and not methods, so that each call passes the same object.
 def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
     return solver.lowest(pencil, k, report)
 
@@ -291,7 +291,7 @@ def _solve(adjoint: Adjoint, *args: Any) -> Float[Array, "k n_dof"]:
 
 
 def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-    """Return x; where rows of it are NaN, warn or raise."""
+    """Return x; if a row of x contains NaN, warn or raise an error as `telling` states."""
     failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
     if telling == "error":
         return eqx.error_if(x, failed > 0, unsolved("some", len(x)))
@@ -309,9 +309,9 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
 def _exact_null_modes(
     pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    """Put the null vectors, which the stiffness annihilates exactly, in place of the solver's approximations to them.
+    """Replace the solver's approximate null vectors by the null vectors of the stiffness, with the eigenvalue 0.
 
-    Their eigenvalue is 0 and not the ±1e-13 of a solver; what rounding left of them in the other vectors is taken out.
+    The other eigenvectors are projected onto the M-orthogonal complement of the null vectors, which removes rounding.
     """
     if not known_and_few((pencil.mass, values, vectors)):
         return _exact_by_jax(pencil, values, vectors)
@@ -330,7 +330,7 @@ def _exact_by_jax(
     pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
     assert pencil.null_space is not None
-    # The barrier keeps XLA from computing with long constants while it compiles.
+    # The barrier prevents XLA from folding long constants during compilation.
     nulls = jax.lax.optimization_barrier(pencil.null_space.vectors)
     return _with_null_modes(jnp, pencil.mass.apply, lapack.inverse_cholesky, nulls, values, vectors)
 
@@ -356,9 +356,9 @@ def _with_null_modes(
 def frame_of_chosen(
     vectors: Float[Array, "k n_dof"], mass: Operator, chosen: Bool[Array, " k"]
 ) -> Float[Array, "k n_dof"]:
-    """Return the vectors as a frame: their derivative without what rotates them among those that are chosen.
+    """Return the vectors as a frame: the derivative of the result has no components in the chosen vectors.
 
-    The frame of all the vectors leaves out rotations into those that are not chosen, too.
+    The derivative of the frame of `solved`, in contrast, has no components in any of the k vectors.
     """
     return vectors
 
@@ -371,9 +371,9 @@ def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]
     return vectors, change - matmul(inside, vectors)
 
 
-# The transpose that JAX makes of these products is one with the transposed vectors, which takes twice as long.
+# The transpose that JAX derives multiplies by the transposed vectors, which takes twice as long.
 def products_with_constants(images: Float[Array, "b n_dof"], vectors: Float[Array, "k n_dof"]) -> Float[Array, "b k"]:
-    """Return the inner products, linear in the images: the vectors are constants to derivatives."""
+    """Return the inner products, as a linear map of the images; derivatives treat the vectors as constants."""
     return with_transpose(partial(inner_products, vectors), lambda mix: matmul(mix, vectors), images)
 
 
@@ -386,12 +386,12 @@ def of_simple(
     part: Int[Array, " k"] | None,
     pencil: AnyPencil,
 ) -> Float[Array, "k n_dof"]:
-    """Return the vectors; their derivatives become NaN, where they count, unless the eigenvalue is simple and kept."""
+    """Return the vectors; nonzero derivatives become NaN unless the eigenvalue is simple and kept."""
     return vectors
 
 
-# In Σᵢ f(λᵢ) φᵢ(x)² the copies of an eigenvalue mix by Gᵢⱼ f'(λ) φᵢ φⱼ. The derivatives of f(λᵢ) hold the diagonal of
-# it alone, and equal f(λᵢ) take from dφᵢ whatever rotates copies: no dφᵢ that is finite makes the sum right.
+# In the derivative of Σᵢ f(λᵢ) φᵢ(x)², a multiple eigenvalue λ has the terms Gᵢⱼ f'(λ) φᵢ φⱼ. The derivatives of f(λᵢ)
+# contribute only the terms with i = j, and rotations in dφᵢ cancel for equal f(λᵢ). No finite dφᵢ gives the right sum.
 @of_simple.defjvp
 def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, values, following, kept, part, pencil = primals
@@ -409,11 +409,11 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def _is_multiple(
     xp: Any, values: Any, following: Any, kept: Any, part: Any | None, rounding: list[Any], fixed: bool
 ) -> Any:
-    """Return which pairs (k) are left out, cut, or copies of an eigenvalue that perturbations mix."""
+    """Return a mask of pairs that are not kept, or whose eigenvalue is multiple in the kept or following pairs."""
     size = xp.maximum(xp.abs(values), values - values[:1])
     least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))
     near = xp.abs(values[:, None] - values[None]) <= least[:, None]
     if part is not None:
         near &= part[:, None] == part[None]
-    mixed = (xp.sum(near, axis=1) > 1) & ~((values == 0) & fixed)  # no perturbation moves or mixes those that are fixed
+    mixed = (xp.sum(near, axis=1) > 1) & ~((values == 0) & fixed)  # no perturbation changes fixed pairs
     return mixed | (following - values <= least) | ~kept

@@ -21,9 +21,9 @@ from hks_jax.optional import optional
 from hks_jax.storage import existing, reading
 
 _LENGTH = 0.05
-"""By how much the length of a direction may differ from 1: it is rounding then."""
+"""The tolerance for the length of a direction; a smaller deviation from 1 is due to rounding."""
 _SEEN = 0.01
-"""The share of an image's noise that its residual has at least, to tell it."""
+"""The least ratio of a residual's variance to the variance of the noise for which the residual is used."""
 
 
 class ExampleBrain(NamedTuple):
@@ -65,31 +65,31 @@ def fit_dwi(
     """Fit diffusion tensors to diffusion-weighted images by weighted least squares on log signals (DIPY's TensorModel).
 
     Args:
-        path: NIfTI (nx, ny, nz, n). Voxels where a signal is NaN or infinite are left out.
+        path: NIfTI file (nx, ny, nz, n). Voxels with a NaN or infinite signal are excluded.
         bval: text file of the n b-values, in s/mm² unless `unit` says otherwise.
-        bvec: text file of the n directions, 3 × n or n × 3, of length 1; those at b = 0 mean nothing.
-        mask: a file (see `read_mask`) or a bool array (nx, ny, nz): fit inside only; outside, tensors are zero. None:
-            what DIPY's median_otsu takes for the brain in the mean of the unweighted images, as a note says.
-        b_max: leave out images with larger b, in s/mm²; None: use all. A tensor describes b ≲ 1000–1500 s/mm² only.
-        bvec_frame: the axes of the directions: ``"fsl"``, voxel axes, the first reversed where the affine's determinant
-            is positive, as dcm2niix and FSL write them; ``"voxel"``, the voxel axes; ``"world"``, the scanner's, as
-            MRtrix has them.
-        unit: of diffusivity, whose reciprocal is the b-values' unit: ``"m2/s"`` for b-values in s/m², ``"um2/ms"`` for
-            ms/µm². None: mm²/s.
-        noise: of the images, for the covariance of the tensors: its standard deviation, in the unit of the images; or
-            ``"residuals"``, the root mean square of the fit's residuals in each voxel, with n − 7 degrees of freedom
-            for n images; these also tell what voxels share of an image's noise (24 bytes for each voxel and image).
-            None: no covariance.
+        bvec: text file of the n directions, 3 × n or n × 3, of length 1; directions at b = 0 are ignored.
+        mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors are fitted inside, and are zero outside.
+            None: DIPY's median_otsu computes the mask from the mean of the unweighted images, and a note reports it.
+        b_max: the largest b-value in s/mm² that is used; None uses all. The tensor model holds for b ≲ 1000–1500 s/mm².
+        bvec_frame: the axes of the directions. ``"fsl"``: the voxel axes, with the first axis reversed if the
+            determinant of the affine is positive, as in files of dcm2niix and FSL. ``"voxel"``: the voxel axes.
+            ``"world"``: the scanner axes, as in files of MRtrix.
+        unit: the unit of diffusivity, the reciprocal of the unit of the b-values: ``"m2/s"`` for b-values in s/m²,
+            ``"um2/ms"`` for ms/µm². None: mm²/s.
+        noise: the source of the covariance of the tensors. A number is the standard deviation of the noise of the
+            images, in their unit. ``"residuals"`` uses the root mean square of the residuals in each voxel, with n − 7
+            degrees of freedom for n images, and the correlation of residuals between voxels; it stores 24 bytes per
+            voxel and image. None: no covariance.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s, and with `noise` theirs, to first order (`TensorVolume.noise`). DIPY
-        replaces eigenvalues that are not positive by about 1e-9 mm²/s; a note says how many voxels have one (mostly at
-        the rim: erode the mask).
+        The tensors along the voxel axes, in mm²/s, and with `noise` their first-order noise (`TensorVolume.noise`).
+        DIPY replaces eigenvalues that are not positive by about 1e-9 mm²/s. A note reports the number of such voxels;
+        most are at the rim, and can be removed by eroding the mask.
 
     Raises:
         ImportError: DIPY or nibabel is missing.
-        FileNotFoundError: a file does not exist.
-        ValueError: the numbers of images, b-values and directions differ; the b-values have another unit; a direction
+        FileNotFoundError: A file does not exist.
+        ValueError: The numbers of images, b-values and directions differ; the b-values have another unit; a direction
             of a weighted image does not have length 1; the mask has another shape; there are too few images for the
             fit, or for an estimate of the noise; all residuals of a voxel are zero; there is no signal.
     """
@@ -103,7 +103,7 @@ def fit_dwi(
     if len(image.shape) != 4 or b.shape != (image.shape[-1],) or directions.shape != (b.size, 3):
         raise ValueError(
             f"path, bval, bvec: got an image of shape {image.shape}, {b.size} b-values and directions of shape "
-            f"{directions.shape}; expected (nx, ny, nz, n), n and (n, 3)"
+            f"{directions.shape}; expected an image (nx, ny, nz, n), n b-values and directions (n, 3)"
         )
     b = b / (1.0 if unit is None else UNITS[unit])
     if question := b_value_question(float(b.max())):
@@ -113,8 +113,8 @@ def fit_dwi(
     weighted = int((used & (b > threshold)).sum())
     if weighted < 6 or weighted == used.sum():
         raise ValueError(
-            f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
-            "at least 6 and 1. Raise the limit"
+            f"b_max: got {b_max}, which leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; "
+            "expected at least 6 and 1. Raise the limit"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(name, image)[..., used]
@@ -159,9 +159,9 @@ def _covariance(
     frame: str,
     affine: Float[np.ndarray, "4 4"],
 ) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
-    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, zero outside the mask.
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, and the modes of the residuals.
 
-    And, from residuals, the part of each image in the noise of the tensors.
+    Both are zero outside the mask. The modes are None unless `noise` is ``"residuals"``.
     """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
@@ -194,10 +194,10 @@ def _covariance(
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
         return covariance, None
-    # An image that its own unknown follows, as the only one without weighting, has no residual: a sign by chance.
+    # If one image alone determines an unknown, as a single unweighted image does, its residual is replaced by ±σ.
     unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
     modes = np.zeros((*inside.shape, len(design), 6), np.float32)
-    for i, x in enumerate(design):  # to need no more memory than the result
+    for i, x in enumerate(design):  # one image at a time to save memory
         change = inverse @ x * np.sqrt(weights[:, i, None])
         rest = 1 - np.sqrt(weights[:, i]) * (change @ x)
         size = np.where(rest > _SEEN, left[:, i] / np.sqrt(np.maximum(rest, _SEEN)), unseen[:, i])
@@ -235,10 +235,10 @@ def _inside(
     affine: Float[np.ndarray, "4 4"],
     segmentation: ModuleType,
 ) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
-    """Return the given or found mask, without voxels whose signal is not finite, and notes about it."""
+    """Return the given or computed mask without voxels whose signal is not finite, and notes about the mask."""
     notes, finite = [], np.isfinite(signal)
     if mask is None:
-        # Resampling may leave NaN outside the brain, which counts as no signal here.
+        # Resampling can produce NaN outside the brain; here NaN is replaced by zero signal.
         with np.errstate(invalid="ignore"):  # median_otsu divides by zero if its median filter returns zeros
             _, brain = segmentation.median_otsu(np.where(finite, signal, 0.0)[..., unweighted].mean(axis=-1))
         if not brain.any():
@@ -255,14 +255,14 @@ def _inside(
         which = f"the used images {', '.join(whole)} (from 0) have" if whole else "in each voxel, some image has"
         raise ValueError(f"{name}: {which} no finite signal inside the mask; expected numbers. Leave such images out")
     if lost := int((inside & ~usable).sum()):
-        notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: a signal there is NaN or infinite")
+        notes.append(f"{lost} of {int(inside.sum())} voxels inside are excluded, because a signal is NaN or infinite")
     return usable, notes
 
 
 def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:
     file = existing(path)
     with reading(file, "a table of numbers"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # NumPy warns if a table is empty
+        warnings.simplefilter("ignore", UserWarning)  # NumPy warns about an empty table
         numbers = np.loadtxt(file, dtype=np.float64)
         if not numbers.size or not (may_be_nan or np.isfinite(numbers).all()):
             raise ValueError("got no numbers, or NaN or infinite ones; expected finite numbers")

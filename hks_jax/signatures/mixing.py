@@ -1,4 +1,4 @@
-"""How the derivative of a spectral function mixes eigenvectors: divided differences, and the derivative by NumPy."""
+"""The derivative of spectral functions: divided differences, and its evaluation by NumPy."""
 
 from typing import Any
 
@@ -14,11 +14,11 @@ from hks_jax.signatures.contractions import Contraction, Diagonal
 from hks_jax.signatures.filters import Filter
 
 _ON_HOST = 1 << 23
-"""Numbers in the eigenvectors, and in the matrices of all filters, up to which NumPy differentiates."""
+"""The largest number of entries of all eigenvectors, or of the matrices of all filters, for which NumPy is used."""
 
 
 def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
-    """Return f(λᵢ), zero where the pairs are not kept."""
+    """Return f(λᵢ) for the kept pairs, and zero for the other pairs."""
     return jnp.where(kept, one(values), 0)
 
 
@@ -26,7 +26,7 @@ def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"])
 def mixing(
     filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
-    """Return for each filter f, the divided differences [f] and [λf], and which pairs matter."""
+    """Return the weights f(λᵢ), the matrices [f] and [λf], and the mask of pairs that matter, for each filter f."""
 
     def of_one(one: Filter) -> tuple[Array, Array, Array, Array]:
         weights, (of_f, of_lambda_f) = weights_of(one, values, kept), _divided_differences(one, values, kept, fixed)
@@ -38,7 +38,7 @@ def mixing(
 def _divided_differences(
     one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
-    """Return the matrices [f] and [λf], f being zero where the pairs are not kept."""
+    """Return the divided differences [f] and [λf], where f is zero for pairs that are not kept."""
     rows, columns = values[:, None], values[None]
     low, high = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
     f = weights_of(one, values, kept)
@@ -46,28 +46,28 @@ def _divided_differences(
     quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
     both = kept[:, None] & kept[None]
     of_f = jnp.where(both, one.divided_difference(low, high), quotient)
-    # Between null vectors that every perturbation annihilates G vanishes; and f need not have a derivative at 0.
+    # G is zero between null vectors that every perturbation annihilates, and f may have no derivative at 0.
     of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
-    # f at the larger eigenvalue, where it is small, and not the other way round: no cancellation.
+    # The value of f at the larger eigenvalue is used, where f is small. This avoids cancellation.
     return of_f, jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
 
 
 def _matters(f: Float[Array, " k"], slope: Float[Array, " k"], values: Float[Array, " k"]) -> Bool[Array, " k"]:
-    """Return where f or λf' is not negligible beside what they are elsewhere, the constants apart."""
+    """Return where |f| or |λf'| exceeds machine epsilon times their largest value at a nonzero eigenvalue."""
     size = jnp.maximum(jnp.abs(f), jnp.abs(values * slope))
     largest = jnp.max(jnp.where(values > 0, size, 0))
-    # Between two that are not, [f] is at most f' at one of them, or, if f is not monotone, ε over their relative gap.
+    # Between two negligible pairs, [f] is at most f' at one of them, or, if f is not monotone, ε over the relative gap.
     return ~(size <= jnp.finfo(f.dtype).eps * largest)  # NaN matters
 
 
-def like(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
-    """Return the shape of the derivative."""
+def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
+    """Return the shape and dtype of the derivative."""
     vectors, m = pairs[1], len(jax.tree.leaves(filters)[0])
     return jax.eval_shape(contraction.weighted, jax.ShapeDtypeStruct((m, len(vectors)), vectors.dtype), vectors)
 
 
-def on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the derivative of a diagonal, or the cotangents of the moving frame and of the change, by NumPy."""
+def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return the derivative of a diagonal, or the cotangents of `d_frame` and of the change of the pencil, by NumPy."""
     contraction, filters, pairs, _, selection, fixed, copies, space, _, reader = known
     values, vectors, kept = map(np.asarray, pairs)
     k = len(values) if selection is None else len(selection[0])
@@ -83,7 +83,7 @@ def on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), fixed)
     )
     change = x[8]
-    # Of a sum over i and j only those matter of which one is among the first; where only i is, it counts twice.
+    # Only the first n pairs matter, so the symmetric sum over i and j needs only i < n. Terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
     times = [np.where(np.arange(k) < n, 1, 2) for n in last]
 
@@ -100,7 +100,7 @@ def on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
             result[one] += np.sum(vectors[:n] * (matrix @ vectors), axis=0)
         return result
-    # Of all this the transpose.
+    # The transpose of the steps above.
     stiffness, mass = np.zeros((k, k), vectors.dtype), np.zeros((k, k), vectors.dtype)
     for one, (n, count) in enumerate(zip(last, times, strict=True)):
         outer = (vectors[:n] * y[0][one]) @ vectors.T * count
