@@ -1,4 +1,4 @@
-"""``python -m hks_jax`` is ``hks-jax``."""
+"""``python -m hks_jax`` runs the command ``hks-jax``."""
 
 from hks_jax.cli import run_and_exit
 

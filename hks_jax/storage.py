@@ -162,8 +162,7 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         if isinstance(error, KeyError):
             reason = f"it lacks {reason}"
         raise ValueError(
-            f"{os.fspath(path)}: expected {kind}, but it is damaged or of another kind ({reason}). Copy it again from "
-            "an intact file"
+            f"{os.fspath(path)}: the file is damaged or not {kind} ({reason}). Copy it again from an intact file"
         ) from error
 
 

@@ -71,7 +71,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
     elif args.metric is None and image_suffix(args.init):
         raise ValueError(
-            "--metric: --init has diffusion tensors, so a metric must be chosen: inverse, tensor or adjugate"
+            "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
         )
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation

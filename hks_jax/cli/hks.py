@@ -139,7 +139,7 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that are for grids alone, and for tensors whose metric is open."""
+    """Raise ValueError for options that only grids have, and if the metric of given tensors is not chosen."""
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
@@ -159,7 +159,7 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
 def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
     """Read the mesh in the chosen precision, with the metric of tensors at its vertices if there are any.
 
-    For error bars, return the tensors and their noise, too: those of the volume if the tensors come from one.
+    For error bars, also return the tensors and their noise, at the voxels if the tensors come from a volume.
     """
     use_dtype(args.dtype)
     mesh = read_mesh(args.file, clean=args.clean, in_space=bool(args.tensors))

@@ -96,12 +96,12 @@ file FILE...
     auto, the report lists the times of each method and their agreement
 [noise] error bars
 --noise NOISE
-    of the tensors, for error bars: a number, relative to the mean diffusivity, such as 0.1; residuals, those of the fit
-    to diffusion-weighted images; a second FILE of tensors, from another scan of the subject; or roughness, what
-    neighbours differ by. Adds deviation and bias to the .npz, signal to noise at each t to the report, the column error
-    to tables of regions, and fades in the picture what noise could make; automatic times of one subject begin where
-    signal is
---draws N = 8  noisy maps that error bars are made of
+    noise of the tensors, for error bars: a number relative to the mean diffusivity, such as 0.1; residuals, for the
+    residuals of the fit to diffusion-weighted images; a second FILE of tensors, from another scan of the subject; or
+    roughness, for differences of neighbouring voxels. The option adds deviation and bias to the .npz, the
+    signal-to-noise ratio at each t to the report, the column error to tables of regions, and fades parts of the picture
+    that noise may explain. Automatic times of a single subject begin at a sufficient signal-to-noise ratio
+--draws N = 8  number of noisy maps from which error bars are computed
 [atlas]
 --atlas FILE  integer labels on the image's voxels, with 0 for unlabelled: NIfTI, or .npy of the image's shape
 [names]

@@ -81,7 +81,7 @@ def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> lis
             if "eigenvalues" in arrays and not np.array_equal(arrays["eigenvalues"], eigenvalues):
                 found.append(pairs)
     if derived := [file.name for file in found if file not in own]:
-        progress.note(f"removed files of an earlier signature in {folder}: {', '.join(derived)}")
+        progress.note(f"removed {', '.join(derived)} of an earlier signature in {folder}")
     return found
 
 

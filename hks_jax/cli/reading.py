@@ -110,7 +110,7 @@ def _without_filling(volume: TensorVolume, background: str | None, progress: Pro
     if found is None:
         return volume
     if background is None:
-        progress.warn(f"{found[1]}. Pass --mask or --background outside, or inside if the domain contains these voxels")
+        progress.warn(f"{found[1]}. Pass --mask, or --background outside, or inside to include these voxels")
         return volume
     note = found[1].replace("count as inside", "are left out, as asked")
     return replace(volume.with_mask(~found[0]), notes=(*volume.notes, note))

@@ -50,7 +50,7 @@ def hks_expansion(
         u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120.
 
     These are the coefficients of McKean and Singer (1967), u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, by
-    |Riem|² = 4|Ric|² − R². The expansion ignores the boundary: it holds at distances from it well above 3√t.
+    |Riem|² = 4|Ric|² − R². It ignores the boundary, and holds at distances well above 3√t from it.
 
     If the field was made from a function, the coefficients are exact, from JAX derivatives. Otherwise they are from
     finite differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask. There u₂ is

@@ -21,7 +21,7 @@ def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> 
     """Return the Taylor series of a function at a point, exact to rounding.
 
     Derivatives along a line are those of a function of one variable, and cheap. Those in degree + 1 directions
-    determine mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ, well-conditioned for equidistant angles.
+    determine mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ. For equidistant angles this is well-conditioned.
     """
     angles = np.pi * np.arange(degree + 1) / (degree + 1)
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]

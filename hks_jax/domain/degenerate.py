@@ -27,8 +27,8 @@ class DegeneratePoints(NamedTuple):
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     """Find the points of a 2D field where the eigenvalues are equal, with their index.
 
-    At these points the vector (T₁₁ − T₂₂, 2T₁₂) vanishes. It turns twice as fast as the eigenvectors, and is
-    interpolated bilinearly. A cell around which it turns has one zero with the index ±½, a wedge or a trisector. Nearby
+    At these points the vector (T₁₁ − T₂₂, 2T₁₂) vanishes. The vector turns twice as fast as the eigenvectors,
+    and is interpolated bilinearly. A cell around which it turns has one zero of index ±½, a wedge or a trisector. Close
     zeros are merged into one point with the sum of their indices (Tricoche, Scheuermann and Hagen 2001).
 
     Points of index 0, pairs of opposite index that are closer than `merge`, and points on the rim of the domain are not
@@ -68,7 +68,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # Several cells share a zero on an edge or node. Their shares of its turns are arbitrary, but the sum is not.
+    # Several cells share a zero on an edge or node. The turns in each are arbitrary, but their sum is not.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]

@@ -99,7 +99,7 @@ def _stereographic(x: Float[Array, " 2"], sign: float) -> Float[Array, "2 2"]:
 
 
 def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
-    """Return the unit sphere (K = 1) in its stereographic chart, n × n nodes on (−half_width, half_width)².
+    """Return the unit sphere (K = 1) in its stereographic chart, with n × n nodes on (−half_width, half_width)².
 
     The sides are at the distance 2 arctan(half_width) from the centre; a region around the other pole is missing.
     """
@@ -108,7 +108,7 @@ def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
 
 
 def hyperbolic_field(n: int, half_width: float = 0.6) -> TensorField:
-    """Return the hyperbolic plane (K = −1) in the Poincaré disk, n × n nodes on (−half_width, half_width)²."""
+    """Return the hyperbolic plane (K = −1) in the Poincaré disk, with n × n nodes on (−half_width, half_width)²."""
     if not 0 < half_width < 0.5**0.5:
         raise ValueError(f"half_width: got {half_width}; expected more than 0 and less than 1/√2, to fit into the disk")
     grid = Grid.from_bounds(-half_width, half_width, (n, n))

@@ -18,9 +18,9 @@ def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
 
 
-# Kuhn's subdivision cuts each cube of a lattice into d! simplices: each has the corners of a path of unit steps, one
-# along each axis. The simplices with n ≥ x₁ ≥ … ≥ x_d ≥ 0 subdivide this large simplex into n^d cells. Adjacent large
-# simplices match, because a triangular facet is cut into triangles with edges parallel to its own.
+# Kuhn's subdivision cuts each cube of a lattice into d! simplices. The vertices of a simplex form a path of unit steps,
+# one along each axis. The simplices with n ≥ x₁ ≥ … ≥ x_d ≥ 0 subdivide this large simplex into n^d cells. Large
+# simplices match at a common facet, because it is cut into triangles with edges parallel to its own.
 def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.ndarray, "cells corners"]]:
     """Subdivide a simplex into n^d cells; return n times the barycentric coordinates of the points, and the cells."""
     lattice = np.indices((n + 1,) * dimension).reshape(dimension, -1).T

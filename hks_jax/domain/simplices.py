@@ -110,7 +110,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
     infinite = triangulation.used & ~np.isfinite(vertices).all(axis=1)
     if infinite.any():
         raise ValueError(
-            f"vertices: {int(infinite.sum())} of them are NaN or infinite (the first is {int(np.argmax(infinite))}); "
+            f"vertices: {int(infinite.sum())} are NaN or infinite (the first is vertex {int(np.argmax(infinite))}); "
             "remove them"
         )
     words, cells = WORDS[triangulation.dimension], triangulation.cells
@@ -173,7 +173,7 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
     if again.size:
         a, b = sorted(order[again[0] : again[0] + 2].tolist())
         raise ValueError(
-            f"faces: {again.size} of {len(faces)} triangles are there twice (the first are faces {a} and {b}, with the "
+            f"faces: {again.size} of {len(faces)} triangles occur twice (the first are faces {a} and {b}, with the "
             f"vertices {faces[a].tolist()}), and would count twice; remove the duplicates"
         )
 

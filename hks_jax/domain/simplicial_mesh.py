@@ -57,7 +57,7 @@ class SimplicialMesh(eqx.Module):
     ) -> Mesh:
         """Return the mesh with the metric of tensors D in the axes of space; a surface takes their tangential part.
 
-        The tangential part is D as a quadratic form on the plane of a triangle. For diffusion tensors it describes
+        The tangential part is the quadratic form D on the plane of a triangle. For diffusion tensors it describes
         diffusion within the surface, with the diffusivities that were measured in it. The choice of the metric g has no
         default (see `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``,
         g = |D| D⁻¹. On a surface D stands for its tangential part. If D is the identity, g is the metric of space.

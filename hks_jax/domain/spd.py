@@ -22,7 +22,7 @@ def symmetrise(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 def identity_outside(
     tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
-    """Return the tensors, and the identity at nodes that are not inside."""
+    """Return the tensors, with the identity in their place at nodes that are not inside."""
     return tensors if isinstance(inside, np.ndarray) and inside.all() else _identity_outside(tensors, inside)
 
 
@@ -34,7 +34,7 @@ def _identity_outside(
 
 
 def adjugate(tensors: Any) -> Any:
-    """Return the adjugate ``|T| T⁻¹`` of symmetric matrices (..., d, d), d = 2 or 3, of JAX or NumPy."""
+    """Return the adjugate ``|T| T⁻¹`` of symmetric matrices (..., d, d), d = 2 or 3, in JAX or NumPy."""
     t = tensors
     if t.shape[-1] == 2:
         rows = [[t[..., 1, 1], -t[..., 0, 1]], [-t[..., 1, 0], t[..., 0, 0]]]
@@ -50,7 +50,7 @@ def adjugate(tensors: Any) -> Any:
 
 
 def determinant(tensors: Any) -> Any:
-    """Return the determinants |T| of matrices (..., d, d), d = 2 or 3, of JAX or NumPy."""
+    """Return the determinants |T| of matrices (..., d, d), d = 2 or 3, in JAX or NumPy."""
     t = tensors
     if t.shape[-1] == 2:
         return t[..., 0, 0] * t[..., 1, 1] - t[..., 0, 1] * t[..., 1, 0]
@@ -58,7 +58,7 @@ def determinant(tensors: Any) -> Any:
 
 
 def inverse(tensors: Any) -> Any:
-    """Return T⁻¹ of matrices (..., d, d), d = 2 or 3, of JAX or NumPy."""
+    """Return T⁻¹ of matrices (..., d, d), d = 2 or 3, in JAX or NumPy."""
     return adjugate(tensors) / determinant(tensors)[..., None, None]
 
 

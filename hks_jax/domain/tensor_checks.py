@@ -109,7 +109,7 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
     """Return C = FᵀF of gradients (*shape, m, d), m ≥ d; the identity outside the mask.
 
     Raises:
-        ValueError: wrong shape; square gradients whose determinant is not positive.
+        ValueError: a wrong shape; square gradients whose determinant is not positive.
     """
     gradients = real_array(name, F)
     d = grid.dimension
@@ -122,7 +122,7 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
-        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # the check of the metric finds others
+        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # the check of the metric finds the others
         determinants = np.linalg.det(np.where(finite[..., None, None], known, np.eye(d)))
         bad = finite & (determinants <= 0)
         if bad.any():
@@ -169,7 +169,7 @@ def check_shift(name: str, tensors: Float[np.ndarray, "n d d"], how: PositiveMap
     least = least_eigenvalue(tensors)
     if how == "shift" and not float(number) + least > 0:
         raise ValueError(
-            f"number: got the shift {float(number):g} of {name}, whose least eigenvalue is {least:g}; expected more "
+            f"number: got the shift {float(number):g} of {name} whose least eigenvalue is {least:g}; expected more "
             f"than {-least:g}, so that S + c·I is positive definite"
         )
 

@@ -1,1 +1,1 @@
-"""From matrices to eigenpairs: solvers behind one interface, and the report on what they found."""
+"""Eigensolvers with a common interface, and their results."""

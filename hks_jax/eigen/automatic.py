@@ -1,4 +1,4 @@
-"""Which solver "auto" stands for: the one policy, for `eigenpairs`, fits and the command line."""
+"""The automatic choice of an eigensolver, for `eigenpairs`, fits and the command line."""
 
 from collections.abc import Callable
 
@@ -20,10 +20,10 @@ SOLVERS: dict[str, Callable[[], Eigensolver]] = {
 }
 
 _SMALL = 1500
-"""Unknowns up to which all pairs at once are affordable: n³ whatever k is, and nothing can be missed."""
+"""The largest number of unknowns for which the dense solver is chosen. It takes O(n³) time and misses no eigenvalue."""
 
-# Seconds of the first call in a process, compilation included, and of those that follow, on two cores
-# (benchmarks/first_answer/automatic.py); ours is block Lanczos, in 3D and in float32 on grids the Chebyshev filter:
+# Times in seconds of the first call in a process, which includes compilation, and of later calls, on two cores
+# (benchmarks/first_answer/automatic.py). "ours": the Chebyshev filter on grids in 3D or in float32, else block Lanczos.
 #
 #                            float64                         float32
 #   nodes/pairs   n·k        shift-invert   ours             shift-invert   ours
@@ -36,21 +36,21 @@ _SMALL = 1500
 #   surface/50    0.2 M      1.8    0.2      6.7    0.2      1.7    0.2      6.1    0.3    (4096 vertices)
 #   surface/100   1.6 M      3.5    1.9      7.1    0.7      3.1    1.7      9.5    2.0    (16 384 vertices)
 #
-# Compilation takes some five seconds, whatever the size. So up to some five million no solver is the fastest both the
-# first time and later: what is chosen loses the smaller factor of the two, but for small volumes in float32. Block
-# Lanczos in float32 factorises in float32, which costs it several searches, and pairs that do not converge.
+# Compilation takes about five seconds for any size. So up to n·k = 5 million no solver is the fastest both in the first
+# and in later calls. The choice minimises the larger of the two factors lost, except for small volumes in float32.
+# Block Lanczos in float32 also factorises in float32. So it searches repeatedly, and some pairs do not converge.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
-"""Unknowns times pairs from which on JAX's solvers are chosen; the latter for 2D grids in single precision."""
+"""The least n·k for which a solver in JAX is chosen. The second value is for 2D grids in single precision."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
-    """Return the solver that a name stands for.
+    """Return the solver with the given name.
 
-    ``"auto"`` chooses by the pencil's size, k and dtype. Where values are traced (`jax.jit`, `jax.vmap`) or on an
-    accelerator it never chooses shift-invert, which runs on the host.
+    ``"auto"`` chooses by the pencil's size, k and dtype. Shift-invert runs on the host. So ``"auto"`` never chooses it
+    on an accelerator, or for traced values (`jax.jit`, `jax.vmap`).
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: the name is unknown.
     """
     if isinstance(solver, Eigensolver):
         return solver
@@ -64,9 +64,10 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
 
 
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
-    """Return what ``"auto"`` stands for in a fit, where one linearisation serves many products with the Jacobian.
+    """Return the solver that ``"auto"`` chooses in a fit.
 
-    Factorisations serve them all, which the filter does not have; and as fits are traced, none runs on the host.
+    A fit takes many products with one Jacobian. Block Lanczos reuses its factorisations in these products; the filter
+    has no factorisations. Fits are traced, so that the solver must not run on the host.
     """
     n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()
@@ -82,14 +83,14 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
         ours = BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
         return ShiftInvert() if known and n * k < _LARGE else ours
     exact = pencil.stiffness.dtype == np.float64
-    # In 3D factorisations fill in, and in float32 they lose too many digits.
+    # In 3D factorisations have much fill-in, and in float32 they lose too many digits.
     matrix_free = isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
     ours = ChebyshevFilter() if matrix_free and k < ChebyshevFilter().max_pairs(n) else BlockLanczos()
-    if k >= ours.max_pairs(n):  # one pair more is computed
+    if k >= ours.max_pairs(n):  # the driver computes one additional pair
         ours = Dense()
     if not known:
         return ours
-    # The host's solver has float64 for float32 matrices too.
+    # The host's solver computes in float64, also for float32 matrices.
     suited = ChebyshevFilter if volume or not exact else BlockLanczos
     large = _LARGE if exact or volume else _LARGE_IN_SINGLE
     return ours if isinstance(ours, suited) and n * k >= large else ShiftInvert()

@@ -18,24 +18,24 @@ from hks_jax.linear.pencil import SymmetricPencil
 
 
 class Dense(Eigensolver[SymmetricPencil]):
-    """Cholesky reduction M = LLᵀ to L⁻¹KL⁻ᵀ, then `eigh`: O(n³) time, O(n²) memory, exact multiplicities."""
+    """Dense solver: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ. Takes O(n³) time and O(n²) memory; finds all multiplicities."""
 
     name: ClassVar[str] = "dense"
     tolerance: float = eqx.field(default=1e-8, static=True)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs: where values are concrete by SciPy, for which nothing is compiled."""
+        """Return the k lowest eigenpairs. Concrete values are handed to SciPy, which needs no compilation."""
         if not known_here(pencil):
             return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
         data, matrices = host_matrices(pencil)
         dtype = pencil.stiffness.dtype
         stiffness, mass = (matrix.toarray() for matrix in matrices(*data))
         values, vectors = _on_host(stiffness, mass, k)
-        # `asarray` would leave them NumPy's where JAX differentiates.
+        # `asarray` would return NumPy arrays while JAX differentiates.
         return jax.device_put((values.astype(dtype), vectors.astype(dtype), np.asarray(np.inf, dtype)))
 
     def guards(self, k: int, n_dof: int) -> int:
-        """Return all the pairs beyond k: they cost nothing, and leave no complement to solve on."""
+        """Return n_dof − k: with all pairs computed, derivatives need no linear solve."""
         return n_dof - k
 
 
@@ -48,7 +48,7 @@ def _dense(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"], k: int) ->
 def _on_host(
     stiffness: Float[np.ndarray, "n n"], mass: Float[np.ndarray, "n n"], k: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k n"]]:
-    """Return the k lowest eigenpairs, NaN where K is not finite or M not positive definite."""
+    """Return the k lowest eigenpairs; NaN if K is not finite or M is not positive definite."""
     n = len(stiffness)
     try:
         factor = cholesky(mass, lower=True)

@@ -60,7 +60,7 @@ def solved(
     return values, vectors, vectors, following, complete_below
 
 
-# From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ, with the force fᵢ = (dK − λᵢ dM) φᵢ,
+# Let fᵢ = (dK − λᵢ dM) φᵢ, called the force. From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ it follows that
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #

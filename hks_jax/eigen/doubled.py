@@ -1,4 +1,4 @@
-"""The problems of a doubled domain, reflected or glued along its rim, their spectra merged into one."""
+"""Eigenpairs of a doubled domain: the problems of its parts are solved and their spectra merged."""
 
 import math
 import time
@@ -22,16 +22,16 @@ from hks_jax.traced import is_traced
 def solve_doubled(
     pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, throw: bool, report: Report
 ) -> Eigenpairs:
-    """Solve the mixed problems and return the k lowest pairs of all, and with one ``extra`` the next eigenvalue.
+    """Solve all parts and return the k lowest pairs of the merged spectrum; ``extra`` = 1 adds the next eigenvalue.
 
-    How many come from each part is not known beforehand. Where values are concrete, ask for what Weyl's law says, with
-    a margin, and double it wherever the merged spectrum could still miss a pair; traced, ask for all that there can be.
+    The number of pairs from each part is not known beforehand. If values are concrete, the first guess is Weyl's law
+    plus a margin, doubled for every part that may still miss a pair; otherwise the upper bound is used.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
     traced = is_traced(jax.lax.stop_gradient(pencil))
     wanted = limits if traced else [*map(min, limits, _shares(pencil, total))]
-    # A part may be so small that all of its pairs are needed, which an iterative solver cannot give.
+    # For a small part, all of its pairs may be needed, which an iterative solver cannot compute.
     solvers = [
         solver if limit <= solver.max_pairs(part.size) else Dense(solver.tolerance)
         for solver, part, limit in zip(solvers, parts, limits, strict=True)
@@ -56,13 +56,13 @@ def solve_doubled(
 
 
 def _limits(pencil: MirrorPencil, total: int) -> list[int]:
-    """Return how many of the lowest pairs each part has at most."""
+    """Return, for each part, the largest possible number of pairs among the ``total`` lowest."""
     shares = zip(pencil.including, pencil.parts, strict=True)
     return [min(max(total // len(including), 1), part.size) for including, part in shares]
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
-    """Return what tells which problem is being solved; those to come are taken to last as long as this one."""
+    """Return a report that names the current problem, and estimates the time as if later problems took as long."""
     begin = time.perf_counter()
 
     def tell(text: str) -> None:
@@ -74,10 +74,10 @@ def _of_problem(report: Report, number: int, of: int) -> Report:
     return tell
 
 
-# In units of the spacing a part's volume is its number of nodes, and a rim of r nodes that is Dirichlet and not natural
-# changes the rim's length or area by −2r.
+# In units of the spacing, a part's volume is its number of nodes. If a rim of r nodes has the Dirichlet condition in
+# place of the natural one, the length or area in Weyl's second term changes by −2r.
 def _shares(pencil: MirrorPencil, total: int) -> list[int]:
-    """Return about how many of the lowest pairs come from each part, and some more."""
+    """Return an estimate, plus a margin, of the number of pairs that each part contributes."""
     d, sizes = pencil.space.dimension, [part.space.n_dof for part in pencil.parts]
     mean = sum(sizes) / len(sizes)
     share, margin = total / len(sizes), 2 * math.isqrt(total) + 4
@@ -87,7 +87,7 @@ def _shares(pencil: MirrorPencil, total: int) -> list[int]:
 
 @partial(jax.jit, static_argnames=("k", "extra"))
 def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int) -> Eigenpairs:
-    """Return the k lowest pairs of all parts, and with one ``extra`` the next eigenvalue."""
+    """Merge the parts' pairs and return the k lowest; with ``extra`` = 1 also the next eigenvalue."""
     values, sizes = jnp.concatenate([pairs.eigenvalues for pairs in solved]), [pairs.k for pairs in solved]
     order = jnp.argsort(jnp.concatenate(_sorted_by(pencil, solved)))
     lowest, ends = order[:k], np.cumsum(sizes)[:-1]
@@ -95,7 +95,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
     frames = [frame_of_chosen(p.vectors, part.mass, c) for p, part, c in zip(solved, pencil.parts, chosen, strict=True)]
 
     def together(rows: list[Float[Array, "_ _"]]) -> Float[Array, "k n_dof"]:
-        # An eigenfunction of the doubled domain has unit norm there, hence 1/√2^m of it here.
+        # An eigenfunction has unit norm on the domain doubled m times, hence norm 1/√2^m here.
         of_all = [pairs.space.transfer(own, pencil.space) for pairs, own in zip(solved, rows, strict=True)]
         return jnp.concatenate(of_all)[lowest] / math.sqrt(len(solved))
 
@@ -117,10 +117,10 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
     )
 
 
-# Rounding may put an eigenvalue of a part below that of the same number of a part that includes it, which equals it;
-# then there would be more pairs of a part than `MirrorPencil.including` says.
+# Let part B's trial functions include those of part A. Then the j-th eigenvalue of A is not below the j-th of B. If the
+# two are equal, rounding may swap them, and A would have more pairs than `MirrorPencil.including` allows.
 def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
-    """Return the eigenvalues of each part, none less than that of the same number of a part that includes it."""
+    """Return each part's eigenvalues, raised to at least those of equal index of each part that includes it."""
     keys: list[Array] = []
     for pairs, including in zip(solved, pencil.including, strict=True):
         own = pairs.eigenvalues
@@ -136,8 +136,8 @@ def _complete_below(
 ) -> Float[Array, ""]:
     """Return the bound below which the pairs of all parts are complete.
 
-    Beyond the last of a part nothing is known here; but a part that gave as many as it has at most among those up to a
-    reach has no others below that.
+    A part's certificate may end at its last computed eigenvalue. But if a part already has the largest possible number
+    of pairs up to ``reach``, the part has no further eigenvalue below ``reach``.
     """
     bounds = []
     for pairs, limit in zip(solved, _limits(pencil, total), strict=True):

@@ -1,4 +1,4 @@
-"""The driver: assemble, choose a solver, truncate, report."""
+"""The driver: `eigenpairs` assembles matrices, chooses a solver, and truncates the spectrum."""
 
 from typing import Any, get_args
 
@@ -39,49 +39,46 @@ def eigenpairs(
 ) -> Eigenpairs:
     """Compute the k lowest eigenpairs of the Laplace–Beltrami operator, or of any symmetric pencil Kφ = λMφ.
 
-    Differentiable with respect to the tensors, the vertices, or the matrices' entries, forward and reverse, once. The
-    derivatives of signatures are exact at eigenvalues of any multiplicity, those of single eigenvectors only where
-    the eigenvalue is simple (docs/derivatives.md).
+    The first derivatives with respect to the tensors, the vertices, or the matrices' entries are available in forward
+    and reverse mode. Derivatives of signatures are exact at eigenvalues of any multiplicity. A single eigenvector has a
+    derivative only if its eigenvalue is simple (docs/derivatives.md).
 
     Args:
-        domain: a tensor field; a mesh; a pencil from `assemble` or `sparse_pencil`; or a symmetric matrix K, or a pair
-            (K, M), as `sparse_pencil` takes them.
-        k: how many pairs, 1 … number of degrees of freedom. With an interval it is not needed, but where values are
-            traced: there it must be the number of eigenvalues in the interval (`count_eigenvalues`).
-        boundary: see `assemble`; belongs to the pencil if one is given.
-        solver: ``"auto"`` (by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
-            ``"shift-invert"`` (on the host), ``"block-lanczos"`` (2D and surfaces above all),
-            ``"chebyshev-filter"`` (grids, above all 3D), or a solver with its settings, such as
-            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The choice made is in ``.solver_name``. Matrices and
-            forms of your own that may be indefinite, and intervals, take only ``"dense"`` and ``"block-lanczos"``;
-            the former, where values are concrete, ``"shift-invert"`` too. Derivatives in an interval take the tolerance
-            of the solver's ``adjoint`` alone.
-        mass: ``"consistent"`` or ``"lumped"``; belongs to the pencil if one is given.
-        multiplet: what to do with a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns;
-            ``"drop"`` leaves its copies out of every signature; ``"complete"`` computes 8 pairs more and takes the
-            missing copies in (or drops it, if 8 are too few). What is left out is still in the arrays, and marked in
-            ``.kept``.
-        throw: whether a failure is an error, also under `jit`, where no warning is possible: pairs whose ``.result`` is
-            not successful, and derivatives that do not converge. It takes a callback to the host. Else pairs carry the
-            code and derivatives are NaN, with a warning where values are concrete.
-        progress: called with short texts while it runs, where values are concrete; ``print`` will do.
-        interval: (a, b): all eigenpairs with a ≤ λ < b in place of the lowest.
-        quadrature: see `assemble`; belongs to the pencil if one is given.
+        domain: a tensor field; a mesh; a pencil from `assemble` or `sparse_pencil`; a symmetric matrix K; or a pair
+            (K, M). `sparse_pencil` describes the accepted matrices.
+        k: the number of pairs, from 1 to the number of degrees of freedom. With an interval, leave k out; but if values
+            are traced, k must be the number of eigenvalues in the interval (`count_eigenvalues`).
+        boundary: see `assemble`; a given pencil already has it.
+        solver: ``"auto"`` (chosen by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
+            ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces), ``"chebyshev-filter"``
+            (for grids, mainly in 3D), or a solver object such as ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result
+            names the solver in ``.solver_name``. An interval, or a stiffness that may be indefinite, needs ``"dense"``
+            or ``"block-lanczos"``; for such a stiffness with concrete values, ``"shift-invert"`` works too. Derivatives
+            in an interval use only the tolerance of the solver's ``adjoint``.
+        mass: ``"consistent"`` or ``"lumped"``; a given pencil already has it.
+        multiplet: the treatment of a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns.
+            ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8 additional pairs and includes
+            the missing ones, or drops the eigenvalue if 8 are too few. ``.kept`` marks the included pairs.
+        throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge, also under
+            `jit`, by a callback to the host. Otherwise ``.result`` has the code and derivatives are NaN; concrete
+            values also cause a warning.
+        progress: a function such as ``print`` that receives short texts during a computation with concrete values.
+        interval: (a, b), to compute all eigenpairs with a ≤ λ < b instead of the lowest.
+        quadrature: see `assemble`; a given pencil already has it.
 
     Returns:
-        The pairs with residuals and convergence flags. λ of a null vector (a constant for each natural component) is
-        exactly zero.
+        The pairs with residuals and convergence flags. The eigenvalue of a null vector is exactly zero. (Each component
+        without Dirichlet nodes has a constant null vector.)
 
     Raises:
-        ValueError: k out of range; an unknown solver, boundary or mass; a solver that does not take the pencil; a
-            pencil whose stiffness does not annihilate what it says is its null space; a mass that is not positive
-            definite; an interval that is empty, has an eigenvalue for an end, or holds more eigenpairs than fit into
-            memory (how many there are).
-        RuntimeError: with ``throw``, what failed.
+        ValueError: k is out of range; the solver, boundary or mass is unknown; the solver does not support the pencil;
+            the stiffness does not annihilate the given null vectors; the mass is not positive definite; the interval is
+            empty, ends at an eigenvalue, or contains more eigenpairs than fit into memory.
+        RuntimeError: the computation failed and ``throw`` is set.
 
     Warns:
-        AccuracyWarning: unconverged pairs, a bound that is not confirmed, or a multiple eigenvalue that k cuts (where
-            values are concrete).
+        AccuracyWarning: values are concrete, and pairs did not converge, the solver could not confirm that it missed no
+            eigenvalue, or k cuts a multiple eigenvalue.
     """
     pencil = checked_pencil(domain, boundary, mass, quadrature)
     if multiplet not in get_args(MultipletChoice):
@@ -121,38 +118,38 @@ def eigsh(
 ) -> Eigenpairs:
     """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval, and prove that none is missed.
 
-    ``eigsh(K, M, k)`` is ``eigenpairs(sparse_pencil(K, M), k)``, in the spelling of `scipy.sparse.linalg.eigsh`. It
-    computes what SciPy's does with ``sigma`` below the spectrum and ``which="LM"``, and needs no shift. K may be
+    ``eigsh(K, M, k)`` is ``eigenpairs(sparse_pencil(K, M), k)``. The function corresponds to
+    `scipy.sparse.linalg.eigsh` with ``which="LM"`` and ``sigma`` below the spectrum, but needs no shift. K may be
     singular, with any null space, or indefinite. Eigenvectors are the *rows* of ``.vectors``. Multiple eigenvalues are
-    found with all their copies; where values are traced, one with more than some forty may lack some, which is told.
-    There is no ``which``: for the largest eigenvalues negate K, for those in the middle give the interval. There is no
-    ``LinearOperator`` either: K and M are factorised, by nested dissection.
+    found with their full multiplicity. If values are traced, an eigenvalue of multiplicity above about forty may lack
+    pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the
+    interval. A ``LinearOperator`` is not accepted, because K and M are factorised (by nested dissection).
 
-    Differentiable with respect to the entries of K and M, forward and reverse, once: exactly at any multiplicity, for
-    signatures and for sums of eigenvalues over all copies. Eigenvectors have a derivative where their eigenvalue is
-    simple, and else NaN: in place of Σᵢ f(λᵢ) φᵢ(x)² by hand take `spectral_signature`. Works under `jit` and, with
-    one pattern, `vmap` over the entries (make the pencil with `sparse_pencil` and map over it). Pairs in an interval
-    are differentiated with the interval's ends fixed.
+    First derivatives with respect to the entries of K and M are available in forward and reverse mode. At any
+    multiplicity, derivatives of signatures and of sums over all equal eigenvalues are exact. The derivative of an
+    eigenvector is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ f(λᵢ) φᵢ(x)². The
+    function works under `jit`, and under `vmap` over the entries of one pattern (map over a pencil from
+    `sparse_pencil`). Derivatives in an interval keep its ends fixed.
 
     Args:
-        K: symmetric (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of this
-            package, a full array; or a pencil from `sparse_pencil` or `assemble`, without M.
-        M: symmetric positive definite, likewise, or its diagonal (n,); None is the identity.
-        k: how many, 1 … n. See `eigenpairs` for k with an interval.
-        interval: (a, b): all a ≤ λ < b.
+        K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of
+            this package, or a full array. K may also be a pencil from `sparse_pencil` or `assemble`, without M.
+        M: a symmetric positive definite matrix of such a type, or its diagonal (n,); None is the identity.
+        k: the number of pairs, from 1 to n. See `eigenpairs` for k with an interval.
+        interval: (a, b), to compute all eigenpairs with a ≤ λ < b.
         solver: see `eigenpairs`; None is ``"auto"``.
         throw: see `eigenpairs`.
-        progress: likewise.
+        progress: see `eigenpairs`.
 
     Returns:
-        The pairs with residuals, convergence flags and the certificate. All signatures take them.
+        The pairs with residuals, convergence flags and the certificate. All signatures accept them.
 
     Raises:
-        ValueError: what `sparse_pencil` and `eigenpairs` refuse.
-        RuntimeError: with ``throw``, what failed.
+        ValueError: `sparse_pencil` or `eigenpairs` refuses an argument.
+        RuntimeError: the computation failed and ``throw`` is set.
 
     Warns:
-        AccuracyWarning: pairs that did not converge, a bound that is not confirmed, a multiple eigenvalue that k cuts.
+        AccuracyWarning: see `eigenpairs`.
     """
     return eigenpairs(
         K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress, interval=interval
@@ -165,14 +162,14 @@ def _lowest(
     total = sum(part.size for part in pencil.parts)
     size = min(k + SPARE, total) if multiplet == "complete" else k
     solvers = [choose_solver(solver, part, size) for part in pencil.parts]
-    extra = min(1, total - size)  # to see where the spectrum is cut
+    extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
     if isinstance(pencil, MirrorPencil):
         pairs = solve_doubled(pencil, solvers, size, extra, throw, report)
     else:
         pairs = solve_lowest(widened(pencil, solvers, size + extra).parts[0], solvers[0], size, extra, throw, report)
         found = jax.lax.stop_gradient(pairs)
         doubtful = solver == "auto" and isinstance(solvers[0], ShiftInvert) and not pencil.bounded
-        if doubtful and (found.unconfirmed or not found.converged.all()):  # as where k cuts many copies
+        if doubtful and (found.unconfirmed or not found.converged.all()):  # for example, if k cuts a large multiplet
             pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
     return truncate(pairs, k, multiplet)
 
@@ -186,7 +183,7 @@ def _in_interval(
     report: Report,
 ) -> Eigenpairs:
     if len(pencil.parts) > 1 and k is not None:
-        raise ValueError("k: the problems of a doubled domain are counted one by one; leave k out")
+        raise ValueError(f"k: got {k} with an interval of a doubled domain, whose parts are counted apart; leave k out")
     checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
     traced = is_traced([each.below for each in checked])
@@ -197,10 +194,10 @@ def _in_interval(
 
 
 def _for_interval(solver: str | Eigensolver, pencil: Pencil, interval: Interval) -> BlockLanczos | Dense:
-    """Return the solver for an interval: all pairs at once where the others leave no room for a basis."""
+    """Return the solver for an interval: `Dense` if the interval has too many eigenvalues for a Lanczos basis."""
     chosen = choose_solver(solver, pencil, max(interval.k, 1))
     if solver == "auto" and not isinstance(chosen, BlockLanczos | Dense):
         chosen = BlockLanczos()
     if not isinstance(chosen, BlockLanczos | Dense):
-        raise ValueError(f'solver: got {chosen.name!r}; an interval takes "block-lanczos" or "dense"')
+        raise ValueError(f'solver: got {chosen.name!r}; expected "block-lanczos" or "dense" for an interval')
     return chosen if interval.k + 1 <= chosen.max_pairs(pencil.size) else Dense(chosen.tolerance)

@@ -1,4 +1,4 @@
-"""Eigenpairs, what is known of their quality, and where a spectrum is truncated."""
+"""Eigenpairs, the indicators of their quality, and the truncation of a spectrum."""
 
 from typing import Any, Literal
 
@@ -16,22 +16,22 @@ from hks_jax.fem.space import FunctionSpace
 from hks_jax.traced import is_traced
 
 _ROUNDED = 1e-3
-"""The relative error from which on it is told that eigenvalues have, as tensors are rounded to float32."""
+"""The least relative error of eigenvalues, from rounding tensors to float32, that a message reports."""
 _SAMPLE = 20_000
-"""Tensors that are looked at."""
+"""The number of tensors in the sample that measures anisotropy."""
 
 
 class RESULTS(eqx.Enumeration):
-    """What came of a computation of eigenpairs: a code that is traced, as those of lineax and optimistix."""
+    """The outcome of a computation of eigenpairs: a traceable code like those of lineax and optimistix."""
 
     successful = ""
     not_finite = "The matrices are not finite: tensors are NaN, infinite or not positive definite."
     unconverged = (
-        "Some eigenpairs did not converge (`.converged` says which), or were not found and are NaN. Use float64, fewer "
-        "pairs, or another solver."
+        "Some eigenpairs did not converge (see `.converged`), or were not found and are NaN. Use float64, fewer pairs, "
+        "or another solver."
     )
     unconfirmed = (
-        "The solver could not confirm that it missed no eigenvalue from `.complete_below` on. Use another solver, or a "
+        "The solver could not confirm that it missed no eigenvalue above `.complete_below`. Use another solver, or a "
         "slightly different k."
     )
 
@@ -39,36 +39,36 @@ class RESULTS(eqx.Enumeration):
 class Eigenpairs(eqx.Module):
     """The k lowest eigenpairs of Kφ = λMφ, or those in an interval; a pytree.
 
-    The derivatives of signatures with respect to the matrices run through `pencil` and `frame`, not through
-    `eigenvalues` and `vectors`. Pairs whose arrays were replaced may be differentiated with respect to the replacement
-    alone: rescale times or the pencil instead.
+    The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues` and
+    `vectors`. So do not rescale these arrays: their replacements would be differentiable only with respect to
+    themselves. Rescale times or the pencil instead.
 
     Attributes:
-        eigenvalues: (k,) ascending, in 1/(metric length)²; exactly 0 for null vectors.
-        vectors: (k, n_dof) the eigenfunctions by their unknowns, φᵢᵀMφⱼ = δᵢⱼ (on the doubled domain under "mirror"
-            and "mean", that is 1/√2 of it here, for each doubling).
-        frame: (k, n_dof) the same numbers; only their derivative differs. It leaves out the rotations of the
-            eigenfunctions among themselves, which are singular at multiple eigenvalues and of no use to signatures.
-        residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), λ₁ the first positive eigenvalue. Where nothing is known of
-            the null space, and in an interval, they are relative to the distance of λ from the origin, at least to the
-            mean distance of eigenvalues.
-        converged: (k,) whether the residual meets the solver's tolerance, or what rounding allows if that is more.
-        kept: (k,) which pairs belong to the truncated spectrum. All do, unless a multiple eigenvalue that k cuts was
-            dropped or completed: then signatures leave out the last pairs, those that are not kept.
-        part: (k,) under "mirror" and "mean", which of the pencil's parts a pair belongs to (0: the Neumann problem);
-            else None.
-        next_eigenvalue: the first eigenvalue not kept; infinite if there is none, or none is known, as after an
-            interval. Constant to derivatives.
-        complete_below: the solver's certificate: no eigenvalue below it was missed, by Sylvester's law of inertia, or
-            because all were computed; in an interval, none between its lower end and the bound. NaN where there is
-            none. Constant to derivatives.
-        spectral_origin: where eigenvalues count from: 0 if K ⪰ 0 is known, else the lowest one; the lower end of an
-            interval.
-        multiplet_tolerance: the gap, relative to the distance from that origin, below which neighbouring eigenvalues
-            count as one multiple eigenvalue.
+        eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
+        vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. Under "mirror" and "mean" this holds
+            on the doubled domain; so each doubling divides the norm here by √2.
+        frame: (k, n_dof) the same values as `vectors`, but another derivative. The derivative excludes rotations of the
+            eigenfunctions among themselves, which are singular at multiple eigenvalues and irrelevant to signatures.
+        residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
+            the null space is unknown, max(λ, λ₁) is replaced by the distance of λ from `spectral_origin`, but at least
+            by the mean gap of the eigenvalues.
+        converged: (k,) whether the residual is at most the solver's tolerance, or the level of rounding if larger.
+        kept: (k,) whether each pair belongs to the truncated spectrum. This is false only for the last pairs, if a
+            multiple eigenvalue that k cuts was dropped or completed; signatures then exclude these pairs.
+        part: (k,) under "mirror" and "mean" the index of the pencil's part that each pair belongs to (0 is the Neumann
+            problem); otherwise None.
+        next_eigenvalue: the first eigenvalue not kept; infinite if there is none or if it was not computed, as for an
+            interval. Derivatives treat it as a constant.
+        complete_below: the solver's certificate that it missed no eigenvalue below this bound (in an interval, none
+            between the lower end and the bound). The certificate follows from Sylvester's law of inertia, or all
+            eigenvalues were computed. NaN if there is no certificate. Derivatives treat it as a constant.
+        spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
+            for an interval its lower end.
+        multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
+            eigenvalues count as equal.
         pencil: the matrices.
-        solver_name: the method that found them.
-        lowest: whether these are the lowest pairs, and not those in an interval.
+        solver_name: the name of the solver.
+        lowest: whether the pairs are the lowest; false for an interval.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -114,22 +114,22 @@ class Eigenpairs(eqx.Module):
         return self.eigenvalues.shape[-1]
 
     def of_part(self, number: int) -> "Eigenpairs":
-        """Return the pairs, with those of one part of a doubled domain kept: others count as pairs with f = 0."""
+        """Keep only the pairs of one part of a doubled domain; signatures then ignore the other pairs."""
         return self if self.part is None else eqx.tree_at(lambda p: p.kept, self, self.kept & (self.part == number))
 
     def on(self, pencil: AnyPencil) -> "Eigenpairs":
-        """Return the pairs as those of a pencil on the same nodes, of which others are free; see `on_all_nodes`."""
+        """Return the pairs on another pencil that has the same nodes but other free nodes; see `on_all_nodes`."""
         if pencil is self.pencil:
             return self
         vectors = self.space.transfer(self.vectors, pencil.space)
-        # The frame has the same numbers: it is moved for its derivative alone.
+        # The frame has the same values, and is transferred separately only for its derivative.
         frame = self.space.transfer(self.frame, pencil.space) if is_traced(self.frame) else vectors
         return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (vectors, frame, pencil))
 
     @property
     def null_space_known(self) -> bool:
-        """Whether these are the lowest pairs of pencils whose null spaces are known."""
-        if self.pencil is None:  # those that a fit hands over carry no matrices; it is one of fields
+        """Whether the pairs are the lowest, and the pencils' null spaces are known."""
+        if self.pencil is None:  # pairs inside a fit have no pencil; fits are for fields, whose null spaces are known
             return self.lowest
         return self.lowest and all(part.null_space is not None for part in self.pencil.parts)
 
@@ -138,28 +138,28 @@ class Eigenpairs(eqx.Module):
         """The number of zero eigenvalues among the k.
 
         Raises:
-            ValueError: values are traced, and nothing is known of the null space.
+            ValueError: values are traced and the null space is unknown.
         """
         if self.null_space_known:
             return min(self.k, sum(part.n_null for part in self.pencil.parts))
         values = jax.lax.stop_gradient(self.eigenvalues)
         if is_traced(values):
             raise ValueError(
-                "pairs: how many eigenvalues are zero is not known where values are traced; give `sparse_pencil` the "
+                "pairs: got traced values, which do not show the number of zero eigenvalues; give `sparse_pencil` the "
                 "null vectors"
             )
         return int((values == 0).sum())
 
     @property
     def last_eigenvalue(self) -> Float[Array, ""]:
-        """The largest eigenvalue that is kept; NaN where there is none."""
+        """The largest kept eigenvalue; NaN if there are no pairs."""
         if not self.k:
             return jnp.asarray(np.nan, self.eigenvalues.dtype)
         return _last(self.eigenvalues, self.kept)
 
     @property
     def cut_multiplet(self) -> Array:
-        """How many of the last kept pairs belong to a multiple eigenvalue that the truncation cuts; 0 if none is."""
+        """The number of kept pairs that belong to a multiple eigenvalue cut by the truncation; 0 if it cuts none."""
         known = self.eigenvalues, self.kept, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance
         return _cut_multiplet(*jax.lax.stop_gradient(known)) if self.k else jnp.zeros((), int)
 
@@ -167,7 +167,7 @@ class Eigenpairs(eqx.Module):
     def unconfirmed(self) -> Bool[Array, ""]:
         """Whether the solver's certificate ends before the last eigenvalue.
 
-        Where it is known where the spectrum begins, some solvers have no certificate, and nothing is to be confirmed.
+        If a lower bound of the spectrum is known, the certificate is optional, because some solvers have none.
         """
         if not self.k:
             return jnp.zeros((), bool)
@@ -177,15 +177,15 @@ class Eigenpairs(eqx.Module):
 
     @property
     def result(self) -> RESULTS:
-        """The gravest failure, as a traced code: compare with ``RESULTS.successful``, or call its ``error_if``."""
+        """The most serious failure, a traceable code: compare with ``RESULTS.successful``, or call its ``error_if``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
-        code: Any = RESULTS  # whose members are strings until the class is made
+        code: Any = RESULTS  # mypy sees its members as strings
         result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
         result = code.where(jnp.all(self.converged), result, code.unconverged)
         return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
     def messages(self) -> list[str]:
-        """Say in sentences what limits these pairs; empty if nothing does. Needs concrete values."""
+        """Return sentences that describe the defects of these pairs, if any. Needs concrete values."""
         if not self.k:
             return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
@@ -208,16 +208,16 @@ class Eigenpairs(eqx.Module):
                 f"Use slightly more or fewer pairs, or {other}"
             )
         if cut:
-            remedy = f"Take k = {kept - cut} or a larger one" if cut < kept else "Take a larger k"
+            remedy = f"Take k = {kept - cut} or a larger k" if cut < kept else "Take a larger k"
             sentences.append(
-                f"k = {kept} cuts a multiple eigenvalue: its last {cut} pair(s), at λ = {last:.6g}, have equals "
-                f"beyond k, and which of them are among the k is arbitrary. {remedy}"
+                f"k = {kept} cuts a multiple eigenvalue: the last {cut} pair(s), at λ = {last:.6g}, are an arbitrary "
+                f"part of its eigenspace. {remedy}"
             )
         stretch = _anisotropy(self.pencil) if values.dtype == np.float32 else 1.0
         if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:
             sentences.append(
-                f"the tensors stretch up to {stretch:.1e} times more along one axis than another: rounded to float32, "
-                f"their eigenvalues are others, by up to {rounding:.0e}, which residuals do not show. Use float64"
+                f"the tensors stretch up to {stretch:.1e} times more along one axis than another: rounding them to "
+                f"float32 changes eigenvalues by up to {rounding:.0e}, which residuals do not show. Use float64"
             )
         return sentences
 
@@ -242,7 +242,7 @@ class Eigenpairs(eqx.Module):
 
 
 def _anisotropy(pencil: AnyPencil | None) -> float:
-    """Return the ratio of eigenvalues that few tensors on a grid exceed, by a sample; 1 where none are known."""
+    """Return a high quantile of the eigenvalue ratios of a sample of the grid's tensors; 1 without a grid."""
     metric = None if pencil is None else pencil.parts[0].metric
     if metric is None or metric.spacing is None or not getattr(metric.tensors, "is_fully_addressable", True):
         return 1.0
@@ -256,7 +256,7 @@ def _anisotropy(pencil: AnyPencil | None) -> float:
 
 
 def multiplet_gap(xp: Any, values: Any, origin: Any, tolerance: Any) -> Any:
-    """Return the gaps (*k) up to which the next eigenvalues (*k) count as copies; by NumPy or by JAX."""
+    """Return the largest gaps (*k) to the next eigenvalues at which these count as equal; by NumPy or JAX."""
     finfo = jnp.finfo(values.dtype)
     return tolerance * xp.maximum(xp.maximum(values - origin, finfo.eps * xp.abs(values)), finfo.tiny)
 
@@ -283,14 +283,14 @@ def _cut_multiplet(xp: Any, values: Any, kept: Any, following: Any, origin: Any,
 MultipletChoice = Literal["report", "drop", "complete"]
 
 SPARE = 8
-"""How many pairs beyond k are computed to complete a multiple eigenvalue."""
+"""The number of pairs beyond k that are computed to complete a multiple eigenvalue."""
 
 
 def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpairs:
-    """Keep k pairs, or as many fewer or more as make the last eigenvalue's multiplicity complete.
+    """Keep k pairs, or fewer or more so that no multiple eigenvalue is cut.
 
-    ``"report"`` keeps exactly k; ``"drop"`` leaves out the copies of a multiple eigenvalue that k cuts, unless nothing
-    would be left; ``"complete"`` takes its missing copies in if they are among the pairs beyond k, and else drops it.
+    ``"report"`` keeps exactly k. If k cuts a multiple eigenvalue, ``"drop"`` excludes its pairs, unless no pair would
+    remain; ``"complete"`` includes all its pairs if they were computed, and otherwise drops it.
     """
     known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.spectral_origin, pairs.multiplet_tolerance
     chosen = _choose(*jax.lax.stop_gradient(known), k, multiplet)
@@ -301,7 +301,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
 def _choose(
     xp: Any, values: Any, following: Any, origin: Any, tolerance: Any, k: int, multiplet: MultipletChoice
 ) -> tuple[Any, Any]:
-    """Return which pairs (n) are kept, and the eigenvalue after them."""
+    """Return a mask (n) of the kept pairs, and the eigenvalue after them."""
     size = len(values)
     sequence = xp.append(values, following)
     index = xp.arange(size)

@@ -1,4 +1,4 @@
-"""What inertia says of a spectrum: how many eigenvalues lie below a number, where they begin, how dense they are."""
+"""Counts of eigenvalues by the inertia of factorisations, to locate the lower end of a spectrum and its density."""
 
 import math
 from collections.abc import Callable
@@ -27,21 +27,21 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
-"""How far beside σ, relative, to count where the factorisation at σ itself is not to be trusted."""
+"""Relative distances from σ at which to count if the factorisation at σ itself is too inaccurate."""
 _TRIES = 60
-"""Factorisations before giving up."""
+"""The maximal number of factorisations in a search."""
 _JUST_BELOW = 0.625
-"""The distance from zero at which the count of a singular matrix is still accurate, as a power of ε."""
+"""The exponent of ε in the relative distance below zero at which a count is accurate even if K is singular."""
 _ALIKE = 1e-3
-"""The relative difference of two distances below which the eigenvalues between them count as one multiple one."""
+"""The relative width of a bracket below which the eigenvalues in it count as one multiple eigenvalue."""
 _NARROW = 8
-"""How many times that distance a bracket is not divided any more."""
+"""The width of a bracket, in units of the distance below zero of the first count, at which division stops."""
 
 Scalar = Float[Array, ""]
 Number = Int[Array, ""]
 Flag = Bool[Array, ""]
 Count = tuple[Number, Flag]
-"""How many eigenvalues there are, and whether that is certain."""
+"""The number of eigenvalues, and whether it is certain."""
 
 
 def count_eigenvalues(
@@ -49,30 +49,30 @@ def count_eigenvalues(
 ) -> Number:
     """Count the eigenvalues below a number, with their multiplicities.
 
-    By Sylvester's law of inertia these are the negative eigenvalues of K − σM, which a factorisation LDLᵀ shows: one
-    factorisation certifies that a list of eigenvalues is complete. Each is tried out on random right-hand sides, and
-    counts only where its error is too small to change the inertia. Where it is not, because σ is an eigenvalue or one
-    of a part of the domain, it is counted on both sides of σ. Traceable.
+    By Sylvester's law of inertia, this is the number of negative eigenvalues of K − σM. A factorisation LDLᵀ shows this
+    number. So one factorisation certifies that a list of eigenvalues is complete. Random right-hand sides test whether
+    the error of the factorisation could change its inertia. If σ is an eigenvalue of the domain or of a part of the
+    domain, the error may be too large; then the function counts on both sides of σ. Works under `jit`.
 
     Args:
-        domain: what `eigenpairs` takes: a tensor field, a mesh, a pencil, K, or (K, M).
-        below: σ, in 1/(metric length)²; not itself an eigenvalue, where the count is uncertain.
-        boundary: see `assemble`; belongs to the pencil if one is given.
-        mass: likewise.
+        domain: a tensor field, a mesh, a pencil, K, or (K, M), as in `eigenpairs`.
+        below: σ, in 1/(metric length)². The count is uncertain if σ is an eigenvalue.
+        boundary: see `assemble`; a given pencil already has it.
+        mass: see `assemble`; a given pencil already has it.
 
     Returns:
-        How many eigenvalues are less than σ; traced, −1 where that is uncertain.
+        The number of eigenvalues less than σ; −1 if values are traced and the number is uncertain.
 
     Raises:
-        ValueError: σ is not a finite number, or cannot be told from an eigenvalue, with the counts beside it; what
-            `eigenpairs` refuses of the domain.
+        ValueError: σ is not finite, or too close to an eigenvalue (the message has the counts on both sides);
+            `eigenpairs` refuses the domain.
     """
     require_number("below", below, above=-math.inf)
     return count_below(checked_pencil(domain, boundary, mass), below)
 
 
 def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a domain as a user gives it; an M of the user's own, where concrete, is definite."""
+    """Return the pencil of a user's domain. If the user gave a concrete M, check that M is positive definite."""
     pencil = pencil_of(domain, boundary, mass, quadrature)
     for part in jax.lax.stop_gradient(pencil).parts:
         own = isinstance(part.space, MatrixSpace) or part.volume is None
@@ -84,7 +84,7 @@ def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadratu
         if int(negative) or not sound:
             what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
             name = "M" if isinstance(part.space, MatrixSpace) else "mass"
-            raise ValueError(f"{name}: it has {what}, by the inertia of its factorisation; expected positive definite")
+            raise ValueError(f"{name}: got a matrix with {what}, by its inertia; expected a positive definite matrix")
     return pencil
 
 
@@ -96,7 +96,7 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
         return jnp.where(sound, count, -1)
     if sound:
         return count
-    # σ near zero is compared with the least distance of eigenvalues to expect.
+    # If σ is near zero, the scale of distances is the expected size of the lowest positive eigenvalue.
     volume, dimension = pencil.volume, pencil.space.dimension
     least = 1e-6 * largest(pencil.parts[0]) if volume is None or dimension is None else volume ** (-2 / dimension)
     size = max(abs(float(shift)), float(least))
@@ -107,27 +107,27 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
             if under == over:
                 return under
             raise ValueError(
-                f"below: got {float(shift):.15g}, which cannot be told from an eigenvalue; {int(under)} eigenvalues "
-                f"are below {low:.12g} and {int(over)} below {high:.12g}. Count below one of these"
+                f"below: got {float(shift):.15g}, which is too close to an eigenvalue; {int(under)} eigenvalues are "
+                f"below {low:.12g} and {int(over)} are below {high:.12g}. Count below one of these numbers"
             )
     raise ValueError(
-        f"below: got {float(shift):.15g}, where rounding in {shift.dtype} leaves the count uncertain. "
+        f"below: got {float(shift):.15g}, at which rounding in {shift.dtype} leaves the count uncertain. "
         "Use another number, or float64"
     )
 
 
 def _total(pencil: AnyPencil, shift: Scalar) -> Count:
-    """Return how many eigenvalues of all parts are below, and whether that is certain."""
+
     counts = [certain_count(part, shift) for part in pencil.parts]
     return sum((count for count, _ in counts), jnp.zeros((), int)), jnp.all(jnp.stack([sound for _, sound in counts]))
 
 
 def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
-    """Return how many eigenvalues of one pencil are below σ, and whether that is certain."""
+    """Return the number of eigenvalues of one pencil below σ, and whether this number is certain."""
     return _certain_count(pencil, dissect(pencil.pattern), shift)
 
 
-# The dissection is an argument: as a constant, 74 MB at 1024² nodes, it would be compiled.
+# The dissection is an argument, because XLA would process a constant (74 MB at 1024² nodes) during compilation.
 @jit_quickly()
 def _certain_count(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> Count:
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
@@ -135,11 +135,11 @@ def _certain_count(pencil: SymmetricPencil, dissection: Dissection, shift: Scala
 
 
 class LocatedPencil(SymmetricPencil):
-    """K − σ₀M and M, and what inertia says of the spectrum above the origin σ₀; of null vectors nothing is known."""
+    """The pencil of K − σ₀M and M, with counts of its spectrum near the origin σ₀. Its null space is unknown."""
 
-    negative: Number  # how many eigenvalues lie below the origin
-    first: Scalar  # a number above the origin with about as many eigenvalues below it as were asked for
-    spacing: Scalar  # the mean distance of eigenvalues between the two
+    negative: Number  # the number of eigenvalues below the origin
+    first: Scalar  # the first shift: about the requested number of eigenvalues lie between the origin and it
+    spacing: Scalar  # the mean gap of eigenvalues between the origin and `first`
 
 
 def translated(
@@ -151,22 +151,22 @@ def translated(
 
 
 class _Descent(NamedTuple):
-    """What is known of the eigenvalues next below an origin."""
+    """The state of a search below an origin: the eigenvalues within several distances were counted."""
 
-    near: Scalar  # the largest distance tried within which there are few enough; 0 at first
-    number: Number  # how many those are
-    far: Scalar  # the least distance tried within which there are too many; ∞ before there is one
-    far_number: Number  # how many those are
-    next: Scalar  # what to try next
-    tries: Number  # counts so far
-    going: Flag  # whether to go on
+    near: Scalar  # the largest distance so far that has at most the allowed number of eigenvalues; 0 at first
+    number: Number  # the number of eigenvalues within `near`
+    far: Scalar  # the least distance so far that has too many eigenvalues; ∞ at first
+    far_number: Number  # the number of eigenvalues within `far`
+    next: Scalar  # the next distance to count at
+    tries: Number  # the number of counts so far
+    going: Flag  # whether the search goes on
 
 
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
     """Return a distance by which to lower an origin, and the number of eigenvalues passed: `most`/2 to `most`.
 
-    Fewer only where there are no more, or where the next is a multiple one that would be too many. Each factorisation
-    is tried out on `probes` random right-hand sides.
+    The number is smaller if no more eigenvalues exist, or if a multiple eigenvalue follows that would exceed `most`.
+    Each factorisation is tested with `probes` random right-hand sides.
     """
     count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
 
@@ -182,7 +182,6 @@ def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Numb
 
 @partial(jax.jit, static_argnames="most")
 def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, spacing: Scalar, most: int) -> _Descent:
-    """Return what is known after a count, and where to count next."""
     passed = negative - count
     nearer, farther = sound & (passed <= most), sound & (passed > most)
     near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
@@ -190,7 +189,7 @@ def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, sp
     share = (3 * most // 4 - number) / jnp.maximum(far_number - number, 1)
     between = near + jnp.clip(share.astype(near.dtype), 1 / 8, 7 / 8) * (far - near)
     following = jnp.where(jnp.isfinite(far), between, 4 * near)
-    # Where the count is not to be trusted, try beside.
+    # If the count is uncertain, count at a slightly larger distance.
     following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
     few, narrow = (2 * number < most) & (number < negative), far - near <= _ALIKE * jnp.maximum(near, spacing)
     tries = state.tries + 1
@@ -198,34 +197,34 @@ def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, sp
 
 
 class _Search(NamedTuple):
-    """What is known between two counts."""
+    """The state of a search for the lower end of the spectrum: a bracket [low, high]."""
 
-    low: Scalar  # the highest number tried below which there is no eigenvalue; −∞ before there is one
-    high: Scalar  # the lowest number tried below which there are some; ∞ before there is one
-    number: Number  # how many lie below ``high``
-    first: Scalar  # the highest number tried with as many below it: far from them, solves are accurate
-    next: Scalar  # what to try next
-    tries: Number  # counts so far
-    going: Flag  # whether to go on
+    low: Scalar  # the highest shift so far with no eigenvalue below it; −∞ at first
+    high: Scalar  # the lowest shift so far with eigenvalues below it; ∞ at first
+    number: Number  # the number of eigenvalues below `high`
+    first: Scalar  # the highest shift with this number below it: solves are most accurate far from eigenvalues
+    next: Scalar  # the next shift to count at
+    tries: Number  # the number of counts so far
+    going: Flag  # whether the search goes on
 
 
 def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, Scalar, Number]:
-    """Return an origin below all eigenvalues, a number above some of them, 1 … 2·wanted, and how many that are.
+    """Return an origin below all eigenvalues, a number above the lowest 1 … 2·wanted of them, and their number.
 
-    A bracket is halved, or divided in proportion to the counts, until there are few enough eigenvalues in it. Each
-    factorisation is tried out on `probes` random right-hand sides. Where many eigenvalues are equal within rounding
-    there are more than 2·wanted. NaN where nothing succeeds.
+    A bracket is halved, or divided in proportion to the counts, until it contains few enough eigenvalues. Each
+    factorisation is tested with `probes` random right-hand sides. If many eigenvalues are equal within rounding, the
+    number exceeds 2·wanted. If the search fails, the result is NaN.
     """
     size, count = scale(pencil), _counting(pencil, probes)
     infinite = jnp.full((), jnp.inf, size.dtype)
-    # Just below zero: of a singular K ⪰ 0 there is no eigenvalue below it, and the factorisation is still accurate.
+    # A shift just below zero: a singular K ⪰ 0 has no eigenvalue below it, and the factorisation is still accurate.
     least = jnp.asarray(float(jnp.finfo(size.dtype).eps) ** _JUST_BELOW, size.dtype) * size
     none = jnp.zeros((), int)
 
     def step(state: _Search) -> _Search:
         return _narrowed(state, *count(state.next), size, least, wanted, pencil.size)
 
-    # Step by step, the computations are those of the slices that follow: compiled once for both.
+    # Outside `jit`, the steps call the same compiled functions as the slices that follow.
     start = _Search(-infinite, infinite, none, infinite, -least, none, jnp.ones((), bool))
     state = while_loop(lambda state: state.going, step, start)
     known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
@@ -235,19 +234,18 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
 
 @partial(jax.jit, static_argnames=("wanted", "n"))
 def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: Scalar, wanted: int, n: int) -> _Search:
-    """Return what is known after a count, and where to count next."""
     dtype = size.dtype
     low = jnp.where(sound & (count == 0), jnp.maximum(state.low, state.next), state.low)
     lower = sound & (count > 0) & (state.next < state.high)
     high, number = jnp.where(lower, state.next, state.high), jnp.where(lower, count, state.number)
     first = jnp.where(lower & (count != state.number), state.next, state.first)
     share = jnp.clip(wanted / jnp.maximum(number, 1).astype(dtype), 1 / 16, 1 / 2)
-    # Without a lower end go down, without an upper one up; each time four times as far.
+    # Without a lower end, search downwards; without an upper end, search upwards. Steps grow by a factor of four.
     reach = size * jnp.asarray(4.0, dtype) ** (state.tries - 1).astype(dtype)
     up = jnp.maximum(low, 0) + reach * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)
     following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), -reach, up))
-    # Where the count is not to be trusted, try beside.
+    # If the count is uncertain, count at a slightly larger shift.
     beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
     few, tries = (number <= 2 * wanted) | (high - low <= _NARROW * least), state.tries + 1
     going = ~(bracketed & few) & (tries < _TRIES)
@@ -255,7 +253,7 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
 
 
 def _counting(pencil: SymmetricPencil, probes: int) -> Callable[[Scalar], Count]:
-    """Return how to count eigenvalues below a shift by one factorisation, tried out on random right-hand sides."""
+    """Return a function that counts eigenvalues below a shift by one factorisation, tested with random vectors."""
     dissection = dissected(pencil)
     tried = jax.random.normal(jax.random.key(0), (pencil.size, probes), pencil.stiffness.dtype)
 
@@ -267,14 +265,14 @@ def _counting(pencil: SymmetricPencil, probes: int) -> Callable[[Scalar], Count]
 
 
 def dissected(pencil: SymmetricPencil) -> Dissection:
-    """Return the elimination tree, as arrays of the device where values are concrete."""
+    """Return the elimination tree; if values are concrete, its arrays are put on the device."""
     dissection = dissect(pencil.pattern)
     return dissection if is_traced(pencil) else jax.device_put(dissection)
 
 
 @jit_quickly()
 def scale(pencil: SymmetricPencil) -> Scalar:
-    """Return the size of the largest eigenvalue, roughly: rows of |K| over the diagonal of M; 1 where all are zero."""
+    """Estimate the largest eigenvalue by the row sums of |K| divided by the diagonal of M; return 1 if K is zero."""
     data, (rows, _) = pencil.stiffness.triplets()
     size = jnp.max(jax.ops.segment_sum(jnp.abs(data), rows, pencil.size) / pencil.mass.diagonal())
     return jnp.where(size > 0, size, 1)

@@ -1,4 +1,4 @@
-"""Eigenpairs of one pencil, the lowest or those in an interval, with what is known of their quality."""
+"""Eigenpairs of one pencil, either the lowest or those in an interval, with residuals and convergence flags."""
 
 import os
 from collections.abc import Sequence
@@ -27,32 +27,32 @@ from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 _FAR = 30
-"""How many times the spread of the wanted eigenvalues the origin may lie below them."""
+"""The largest distance of the origin below the wanted eigenvalues, in units of their spread."""
 
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
-    """Return the pencil `on_all_nodes`, which serves every mask; as it is where all pairs are computed."""
+    """Return the pencil `on_all_nodes`, so that all masks share one compilation; unchanged for the dense solver."""
     return pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, k)
 
 
 def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
-    """Return the k lowest pairs, and with one ``extra`` the next eigenvalue; see `solved` for ``throw``."""
+    """Return the k lowest pairs; with ``extra`` = 1 also the next eigenvalue. See `solved` for ``throw``."""
     n_dof = pencil.size
     if isinstance(solver, ShiftInvert) and not pencil.bounded and known_here(jax.lax.stop_gradient(pencil)):
         bound = lower_bound(jax.lax.stop_gradient(pencil))
         pencil = eqx.tree_at(lambda p: p.lower_bound, pencil, bound, is_leaf=lambda leaf: leaf is None)
     if not (pencil.bounded or solver.indefinite):
         raise ValueError(
-            f"solver: {solver.name!r} needs a stiffness that is positive semidefinite, with its null space, and of "
-            'this pencil nothing is known. Use "block-lanczos" or "dense", or give `sparse_pencil` the null vectors'
+            f"solver: got {solver.name!r}, which needs a positive semidefinite stiffness with a known null space; the "
+            'null space is unknown. Use "block-lanczos" or "dense", or give `sparse_pencil` the null vectors'
         )
     if k + extra > solver.max_pairs(n_dof) and pencil.null_space is None:
         solver = Dense(solver.tolerance)
     elif k + extra > solver.max_pairs(n_dof):
         raise ValueError(
-            f"k: the {solver.name} solver gives at most {solver.max_pairs(n_dof)} of {n_dof} pairs, and {k + extra} "
-            "are needed (with one more to see where the spectrum is cut, and the spare ones of multiplet='complete'). "
-            "Use a smaller k or the dense solver"
+            f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
+            f"{solver.name} solver computes at most {solver.max_pairs(n_dof)} of {n_dof} pairs. Use a smaller k "
+            "or the dense solver"
         )
     from_bound = pencil.null_space is None and not solver.indefinite
     if not from_bound and (not isinstance(solver, BlockLanczos) or known_by_weyl(pencil)):
@@ -68,12 +68,12 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         if not is_traced(below) and below > 2 * half:
-            # Of a lowest eigenvalue with more copies than are asked for, all are computed: the count is of all.
+            # If the lowest eigenvalue has a multiplicity above k, compute all its pairs, as `locate` counted all.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
 
     def solve(origin: Scalar, reach: Scalar, spacing: Scalar) -> tuple[SymmetricPencil, tuple[Any, ...]]:
-        if from_bound:  # a solver for K ⪰ 0 finds the pairs of K − σM, σ a lower bound of the spectrum
+        if from_bound:  # a solver for K ⪰ 0 gets K − σM, where σ is a lower bound of the spectrum
             moved: SymmetricPencil = pencil.counted_from(origin)
         else:
             moved = translated(pencil, origin, jnp.zeros((), int), reach, spacing)
@@ -82,7 +82,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
     moved, found = solve(origin, reach, spacing)
     values = jax.lax.stop_gradient(found[0])
     if not is_traced(values) and _is_far(moved, values):
-        # Once more, from an origin nearer to the spectrum: distances from one so far below would lose their digits.
+        # Solve again from an origin nearer to the spectrum, because distances from a remote origin lose digits.
         spread = values[-1] - values[0]
         origin = origin + values[0] - spread
         moved, found = solve(origin, 2 * spread, spread / number)
@@ -94,7 +94,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
 
 
 def _is_far(pencil: SymmetricPencil, values: Values) -> bool:
-    """Return whether eigenvalues, distances from an origin, lose digits by that; copies of one have none to lose."""
+    """Return whether eigenvalues lose digits because their origin is remote; equal eigenvalues have none to lose."""
     spread = values[-1] - values[0]
     return bool((spread > indistinct(pencil, values.dtype)) & (values[0] > _FAR * spread))
 
@@ -102,11 +102,11 @@ def _is_far(pencil: SymmetricPencil, values: Values) -> bool:
 class Interval(NamedTuple):
     """An interval of the spectrum of one pencil."""
 
-    low: Scalar  # its lower end, which belongs to it
-    high: Scalar  # its upper end, which does not
-    below: Int[Array, ""]  # how many eigenvalues lie under ``low``
-    held: Int[Array, ""]  # how many lie in it
-    k: int  # how many to compute; the same where values are concrete
+    low: Scalar  # the lower end, included
+    high: Scalar  # the upper end, excluded
+    below: Int[Array, ""]  # the number of eigenvalues below `low`
+    held: Int[Array, ""]  # the number of eigenvalues in the interval
+    k: int  # the number of pairs to compute; equal to `held` if values are concrete
 
 
 def solve_interval(
@@ -125,13 +125,13 @@ def solve_interval(
 
 
 def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | None) -> Interval:
-    """Return an interval that a user gives, checked as `eigenpairs` says, with what inertia counts; also traced."""
+    """Check a user's interval, as `eigenpairs` documents, and count its eigenvalues; also under `jit`."""
     low, high = (jnp.asarray(end, pencil.stiffness.dtype) for end in interval)
     if is_traced((pencil, low, high)):
         if k is None:
             raise ValueError(
-                "k: not given, and values are traced; expected the number of eigenvalues in the interval, which must "
-                "be known beforehand: `count_eigenvalues` at both ends, outside jax.jit"
+                "k: got None, and values are traced; expected the number of eigenvalues in the interval. "
+                "Call `count_eigenvalues` at both ends, outside jax.jit"
             )
         require_count("k", k)
         below, above = (certain_count(pencil, end)[0] for end in (low, high))
@@ -145,13 +145,13 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
     held = above - below
     count = int(held)
     if k is not None and k != count:
-        raise ValueError(f"k: got {k}; there are {count} eigenvalues in the interval. Leave k out")
+        raise ValueError(f"k: got {k}; expected {count}, the number of eigenvalues in the interval. Leave k out")
     needed = 4 * count * pencil.size * low.dtype.itemsize
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > available:
         raise ValueError(
-            f"interval: it holds {count} eigenpairs, which need about {needed / 1e9:.3g} GB, and the machine has "
-            f"{available / 1e9:.3g} GB; divide the interval"
+            f"interval: got one with {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine has "
+            f"{available / 1e9:.3g} GB. Divide the interval"
         )
     return Interval(low, high, below, held, count)
 
@@ -164,15 +164,15 @@ def _pairs(
     solver: Eigensolver,
     lowest: bool = True,
 ) -> Eigenpairs:
-    """Return eigenpairs, found as those of a pencil whose eigenvalues count from the origin."""
+    """Return the `Eigenpairs` of a pencil, given the pairs of the pencil translated to an origin."""
     values, vectors, frame, following, bound = found
     held = jax.lax.stop_gradient((tabulated(solved_pencil), values, vectors))
     known = solved_pencil is pencil and pencil.null_space is not None
     residuals, converged, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
-    # Of a constant JAX makes a number where it differentiates.
+    # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jnp.asarray(following), jnp.asarray(bound)
     if not known:
-        # Eigenvalues that are zero within rounding become exactly zero; their derivatives stay.
+        # Eigenvalues that are zero within rounding become exactly zero, and keep their derivatives.
         values = values + origin + jax.lax.stop_gradient(jnp.where(zero, -values - origin, 0))
         following, bound = following + origin, bound + origin
     return Eigenpairs(
@@ -196,7 +196,7 @@ def _pairs(
 def _quality(
     pencil: SymmetricPencil, values: Values, vectors: Vectors, origin: Scalar, tolerance: float, known: bool
 ) -> tuple[Array, ...]:
-    """Return residuals, what converged, which eigenvalues are zero within rounding, and the multiplet tolerance."""
+    """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance."""
     k = values.size
     if k == 0:
         return jnp.zeros(0, values.dtype), *[jnp.zeros(0, bool)] * 2, jnp.asarray(1e-6, values.dtype)
@@ -221,10 +221,10 @@ def _judged_by_jax(
 def _judged(
     xp: Any, measured: tuple[Any, Any, Any], values: Any, origin: Any, n_null: int, tolerance: float, known: bool
 ) -> tuple[Any, ...]:
-    """Return what `_quality` does, of pairs as they were measured.
+    """Return the result of `_quality`, given the measurements of the pairs.
 
-    Residuals are relative to eigenvalues as they count from the origin. Small eigenvalues are measured by the first
-    positive one where the null space is known, and else by their mean distance; where all are zero, by the size of K.
+    Residuals are relative to the distance of the eigenvalue from the origin. This distance is bounded below by the
+    first positive eigenvalue if the null space is known, otherwise by the mean gap; if all are zero, by the size of K.
     """
     (residuals, twice, size), k = measured, values.size
     rounding = 4 * xp.finfo(values.dtype).eps * size

@@ -1,4 +1,4 @@
-"""How well eigenpairs are known: their residuals, and what rounding alone makes of eigenvalues."""
+"""The accuracy of eigenpairs: their residuals, and the effect of rounding on eigenvalues."""
 
 from typing import Any
 
@@ -13,20 +13,20 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import products_with_columns, row_blocks
 
 _EXCUSED = 0.01
-"""The relative residual that rounding excuses at most."""
+"""The largest relative residual that is accepted as rounding."""
 _ALIKE = 0.1
-"""The inner product of normalised vectors from which on they count as one."""
+"""The inner product above which two normalised vectors count as the same eigenvector."""
 _ROWS = 8
-"""How many vectors to look at together: what is computed from them stays in the cache."""
+"""The number of vectors measured together: their images fit into the cache."""
 
 
 def measure_pairs(
     pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
-    """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether a vector is in large part among the few before it: one found twice.
+    """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether a vector is nearly parallel to one of the few before it (found twice).
 
-    If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared; nor are
-    they in double precision, in which all solvers keep them apart.
+    If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared. In double
+    precision, vectors are never compared, because all solvers keep vectors orthogonal.
     """
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     m, size, width = len(vectors), min(_ROWS, len(vectors)), min(2 * _ROWS, len(vectors))
@@ -54,7 +54,7 @@ def measure_pairs(
 def measured_on_host(
     pencil: SymmetricPencil, vectors: Float[np.ndarray, "m n_dof"], values: Float[np.ndarray, " m"]
 ) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Return ‖Kφ − λMφ‖ / ‖Mφ‖, whether a vector is in large part among those before it, and `largest`, by SciPy."""
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖, whether a vector nearly repeats an earlier vector, and `largest`; by SciPy."""
     stiffness, mass = (matrix.to_scipy().tocsr() for matrix in (pencil.stiffness, pencil.mass))
     columns = np.ascontiguousarray(vectors.T)
     image = mass @ columns
@@ -66,21 +66,21 @@ def measured_on_host(
 
 
 def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp) -> Any:
-    """Return the residuals ‖Kφ − λMφ‖ / ‖Mφ‖ up to which pairs count as converged.
+    """Return the largest residuals ‖Kφ − λMφ‖ / ‖Mφ‖ at which pairs count as converged.
 
-    The tolerance is relative to ``scale``: the size of λ, or of a typical eigenvalue if that is larger. The residuals
-    that rounding alone may make excuse a relative one of a per cent at most, beyond which the pair is not known.
+    The tolerance is relative to ``scale``: |λ|, or a typical eigenvalue if that is larger. Residuals up to the level of
+    rounding are accepted too, but at most one per cent of ``scale``, because a less accurate pair is useless.
     """
     return xp.maximum(tolerance * scale, xp.minimum(rounding, _EXCUSED * scale))
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
-    """Return the distance below which rounding in K alone makes two eigenvalues one: 4 ε λ_max."""
+    """Return 4 ε λ_max: two eigenvalues at a smaller distance are equal within the rounding of K."""
     return 4 * jnp.finfo(dtype).eps * largest(pencil)
 
 
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
-    """Return about the largest eigenvalue: 4·max|Kᵢᵢ/Mᵢᵢ| is λ_max on a uniform grid in 2D and 3D."""
+    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D."""
     matrices = pencil.stiffness, pencil.mass
     if not known_and_few(matrices):
         return _largest_by_jax(*matrices)

@@ -15,38 +15,38 @@ from hks_jax.linear.pencil import P
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 Report = Callable[[str], Any]
-"""Told in short texts how far a computation is; some of them are a `Status`."""
+"""A function that receives short texts on the progress of a computation. Some of these are a `Status`."""
 
 
 class Status(str):
-    """A text that says how far a computation is, with how long the rest takes.
+    """A text on the progress of a computation, with an estimate of the remaining time.
 
     Attributes:
-        seconds_left: an estimate; None where there is none.
+        seconds_left: the estimate; None if there is none.
     """
 
     seconds_left: float | None
 
     def __new__(cls, text: str, seconds_left: float | None = None) -> "Status":
-        """Return the text with the estimate."""
+        """Make the text with the estimate."""
         status = super().__new__(cls, text)
         status.seconds_left = seconds_left
         return status
 
 
 def silent(text: str) -> None:
-    """Say nothing."""
+    """Ignore the text."""
 
 
 class Eigensolver(eqx.Module, Generic[P]):
     """A method for the lowest eigenpairs of a symmetric pencil, with its settings (all static).
 
     Attributes:
-        name: what reports call the method.
-        indefinite: whether it takes pencils of whose null space nothing is known.
-        adjoint: what derivatives solve linear systems with; by default for any pencil that can be factorised.
-        tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, unless
-            rounding in the matrices' dtype forbids it.
+        name: the name of the method in reports.
+        indefinite: whether it supports an indefinite stiffness, or one with an unknown null space.
+        adjoint: the linear solver for derivatives. The default supports every pencil that can be factorised.
+        tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged. If the
+            level of rounding is larger, it replaces the tolerance.
     """
 
     name: ClassVar[str]
@@ -61,15 +61,14 @@ class Eigensolver(eqx.Module, Generic[P]):
     def lowest(self, pencil: P, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenvalues, ascending, M-orthonormal eigenvectors as rows, and a bound.
 
-        Every eigenvalue below the bound is certainly among the k, or beyond them. What was not found is NaN, and so is
-        the bound where nothing is certain. Traceable: works under `jit` and `vmap`. Called plainly, it may report
-        progress.
+        No eigenvalue below the bound was missed, except those after the k-th. Missing pairs are NaN, and the bound is
+        NaN if there is no certificate. Works under `jit` and `vmap`. Outside `jit`, it may report progress.
         """
 
     def guards(self, k: int, n_dof: int) -> int:
-        """Return how many pairs beyond k to compute where derivatives are wanted."""
+        """Return the number of pairs beyond k to compute for derivatives."""
         return 8 + k // 50
 
     def max_pairs(self, n_dof: int) -> int:
-        """Return the largest k that the method can deliver for n_dof degrees of freedom."""
+        """Return the largest k that the method supports for n_dof degrees of freedom."""
         return n_dof

@@ -1,4 +1,4 @@
-"""Weyl's law: how many eigenvalues there are, from the volume of a domain and of its rim."""
+"""Weyl's law: estimates of eigenvalue counts from the volume of a domain and the measure of its boundary."""
 
 import math
 from typing import Any, TypeVar
@@ -20,13 +20,13 @@ Volume = TypeVar("Volume", float, Float[Array, ""])
 
 
 def weyl(count: float, volume: Volume, dimension: int) -> Volume:
-    """Return about where the eigenvalue of that number lies, by the first term of `weyl_number`."""
+    """Estimate the eigenvalue with the index ``count``, by the first term of `weyl_number`."""
     constant = 4 * math.pi if dimension == 2 else (6 * math.pi**2) ** (2 / 3)
     return constant * (count / volume) ** (2 / dimension)
 
 
 def weyl_number(values: Real, volume: float, dimension: int, rim: float = 0.0) -> Real:
-    """Return about how many eigenvalues lie below λ ≥ 0; of the rim, natural parts count less Dirichlet ones."""
+    """Estimate the number of eigenvalues below λ ≥ 0. ``rim``: natural minus Dirichlet measure of the rim."""
     if dimension == 2:
         return (volume * values + rim * values**0.5) / (4 * math.pi)
     return volume * values**1.5 / (6 * math.pi**2) + rim * values / (16 * math.pi)
@@ -35,49 +35,50 @@ def weyl_number(values: Real, volume: float, dimension: int, rim: float = 0.0) -
 def weyl_count(
     problem: Eigenpairs | AnyPencil, values: Any, domain: TensorField | SimplicialMesh | None = None
 ) -> Float[np.ndarray, " n"]:
-    """Return how many eigenvalues lie below each of some numbers, by Weyl's law.
+    """Estimate the number of eigenvalues below each of several values, by Weyl's law.
 
-    In 2D N(λ) ≈ (A λ ± L √λ)/4π with the area A, in 3D N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π; plus with the length L or area S
-    of the natural part of the rim, minus with that of the Dirichlet part (Ivrii 1980). Where a mask is the domain, its
-    rim is the staircase that the elements make: eigenfunctions feel all of it only where √λ times the spacing nears 1.
+    In 2D N(λ) ≈ (A λ ± L √λ)/4π, where A is the area and L the length of the rim. In 3D N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π,
+    where V is the volume and S the area of the rim. The sign is plus for the natural part of the rim, and minus for the
+    Dirichlet part (Ivrii 1980). The rim of a mask is the staircase of element faces; its full length matters only if √λ
+    times the spacing is close to 1.
 
     Args:
-        problem: from `eigenpairs` or `assemble`: volume, dimension and boundary conditions.
+        problem: the result of `eigenpairs` or `assemble`, which has volume, dimension and boundary conditions.
         values: (n,) λ ≥ 0, in 1/(metric length)².
-        domain: the field or the mesh that the problem is of, for the second term; None: the first alone.
+        domain: the field or mesh of the problem, for the second term. None leaves the second term out.
 
     Returns:
-        (n,), on the host.
+        (n,) estimates, as a NumPy array.
 
     Raises:
-        ValueError: a negative λ; a problem with a potential; a domain that the problem is not of.
+        ValueError: λ is negative; the problem has a potential, or no volume; the domain is not that of the problem.
     """
     pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
     d = pencil.space.dimension
     volume = pencil.volume if pencil.measured else None
     if volume is None:
-        raise ValueError("problem: Weyl's law needs dimension and volume; give them to `sparse_pencil`")
+        raise ValueError("problem: got one without dimension or volume; give them to `sparse_pencil` for Weyl's law")
     if any(part.metric is not None and part.null_space is None for part in pencil.parts):
-        raise ValueError("problem: got one with a potential, which Weyl's law leaves out; `count_eigenvalues` counts")
+        raise ValueError("problem: got one with a potential, which Weyl's law omits; use `count_eigenvalues`")
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():
-        raise ValueError(f"values: got {numbers.min()}; expected eigenvalues, finite and not negative")
+        raise ValueError(f"values: got {numbers.min()}; expected finite, nonnegative numbers")
     if domain is None:
         return weyl_number(numbers, float(volume), d)
     shape = domain.grid.shape if isinstance(domain, TensorField) else (len(domain.vertices),)
     nodes = pencil.space.node_shape
-    if isinstance(pencil.space, MeshSpace):  # of degree 2 there are more nodes than vertices
+    if isinstance(pencil.space, MeshSpace):  # elements of degree 2 have more nodes than vertices
         nodes = (pencil.space.triangulation.n_vertices,)
     if shape != nodes:
-        raise ValueError(f"domain: got one of shape {shape}; expected that of the problem, {nodes}")
-    # The problems that make up a doubled domain have opposite conditions where it was doubled.
+        raise ValueError(f"domain: got shape {shape}; expected the problem's shape {nodes}")
+    # The parts of a doubled domain have opposite conditions on the rim where it was doubled.
     rim = sum(rim_measure(domain, part.space) for part in pencil.parts)
     return weyl_number(numbers, float(volume), d, rim)
 
 
 def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
-    """Return the length (in 3D the area) in the metric of the rim's natural part minus that of its Dirichlet part."""
+    """Return the metric length (area in 3D) of the natural part of the rim minus that of the Dirichlet part."""
     if isinstance(domain, SimplicialMesh):
         return _mesh_rim(domain, space)
     assert isinstance(space, GridSpace)
@@ -85,12 +86,12 @@ def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> f
 
 
 def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
-    """Add up the faces across one axis that belong to one element only."""
+    """Return the signed measure of the faces normal to one axis that belong to exactly one element."""
     d, spacing = space.dimension, field.grid.spacing
     others = [a for a in range(d) if a != axis]
     tensors = np.asarray(field.domain_tensors, np.float64)[..., others, :][..., others]
     density = wrap_nodes(np.sqrt(np.linalg.det(tensors)), space.periodic)
-    # At each face the trapezoidal rule over its nodes; indices along the axis are those of nodes.
+    # Integrate over each face by the trapezoidal rule; along the axis itself, indices remain those of nodes.
     for a in others:
         n = density.shape[a]
         density = (density.take(range(n - 1), a) + density.take(range(1, n), a)) / 2
@@ -110,7 +111,7 @@ def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
 
 
 def _mesh_rim(mesh: SimplicialMesh, space: FunctionSpace) -> float:
-    """Add up the facets that belong to one cell only."""
+    """Return the signed measure of the facets that belong to exactly one cell."""
     d, triangulation = space.dimension, mesh.triangulation
     cell, corner = np.divmod(triangulation.boundary_facets, d + 1)
     corners = np.concatenate([np.zeros((1, d)), np.eye(d)])[FACETS[d][corner]]  # in the basis of the cell's edges

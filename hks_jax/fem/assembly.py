@@ -58,7 +58,7 @@ def assemble(
             ``"mean"`` (two copies of the domain are glued along the whole rim). On grids give one name for all axes, or
             one entry per axis, which may be a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"``. The
             rim of a mask is natural, except under ``"mean"`` and ``"dirichlet-rim"``, which act on the rim and on all
-            sides. It has its own condition in a further entry after those of the axes: ``("periodic", "periodic",
+            sides. A further entry after those of the axes sets the condition on the rim: ``("periodic", "periodic",
             "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
         mass: ``"consistent"``, ``"lumped"`` (the diagonal matrix of row sums), or your own form.
         potential: a field V of either sign; the operator becomes −Δ + V.
@@ -67,7 +67,7 @@ def assemble(
             and in v and returns one number. The shape functions u and v have ``.value`` and ``.grad``. The point w has
             the metric ``.metric`` (d, d), its inverse ``.inverse``, the position ``.x`` and the fields ``w["name"]``.
             The number is integrated with the volume element √|T| dx. On meshes, gradients and metric are in the axes
-            of space, and tangential to a surface. Define a form once: each new function is compiled anew
+            of space; on a surface they are tangential. Define a form once: each new function is compiled anew
             (docs/operators.md).
         fields: the fields that your forms read, by name; they may have further axes after those of nodes or elements.
         components: the number c of components of a function. For c > 1, as in elasticity, ``u.value`` is (c,),
@@ -136,7 +136,7 @@ def assemble(
     if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
         raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch with jax.vmap")
     if degree != 1 or midpoints is not None:
-        raise ValueError(f"degree, midpoints: got degree {degree!r} for a grid; leave both out, as elements are Q1")
+        raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; leave both out")
     sides = normalise_boundary(boundary, domain.grid.dimension)
     if components > 1 and any("mirror" in pair for pair in sides):
         raise ValueError('boundary: got "mirror" with components; it is for scalar functions only. Use another')

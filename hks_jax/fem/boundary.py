@@ -38,8 +38,8 @@ def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, .
         entries: tuple[str | Sides, ...] = (everywhere or boundary,) * dimension + (everywhere or "neumann",)
     elif not isinstance(boundary, tuple | list) or len(boundary) not in (dimension, dimension + 1):
         raise ValueError(
-            f"boundary: got {boundary!r}; expected one name, a tuple of {dimension} entries, one per axis, "
-            f"or {dimension + 1} entries, of which the last is for the rim of a mask"
+            f"boundary: got {boundary!r}; expected one name, or a tuple of {dimension} entries, one per axis, "
+            f"or of {dimension + 1} entries, of which the last is for the rim of a mask"
         )
     else:
         entries = tuple(boundary)
@@ -77,7 +77,7 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     command line uses it by default; the functions of the library use ``"neumann"``.
 
     Args:
-        inside: (*shape) the nodes of the domain, as `Grid.inside`.
+        inside: (*shape) the nodes of the domain, such as `Grid.inside`.
     """
     if inside.all():
         return "neumann", "the domain has no mask"
@@ -95,7 +95,7 @@ def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) 
     own = 'is natural (Neumann); "dirichlet-rim" and "mean" act on it' if rim == "neumann" else f'has "{rim}"'
     return [
         f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
-        f"the mask's own rim {own}"
+        f"the rim of the mask {own}"
         for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False))
         for side, index, condition in zip(("low", "high"), (0, -1), conditions, strict=True)
         if condition not in ("neumann", rim) and not np.take(inside, index, axis).any()

@@ -119,7 +119,7 @@ def simplex_element(dimension: int, degree: int = 1) -> Element:
     The nodes of P2 are the corners, followed by the midpoints of the edges in the order of `Triangulation.cell_edges`.
     """
     points, weights = (_linear_rule if degree == 1 else _quadratic_rule)(dimension)
-    slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])  # of the barycentric coordinates
+    slopes = np.concatenate([-np.ones((1, dimension)), np.eye(dimension)])  # gradients of barycentric coordinates
     if degree == 1:
         return Element(points, np.stack([slopes] * len(points)), weights)
     a, b = np.array(list(combinations(range(dimension + 1), 2))).T
@@ -139,8 +139,8 @@ _LEAST, _GREATEST = 0.01, 1.0
 
 # Let the tensor T be constant, A = T⁻¹, hₐ the spacings, k the wave vector of a plane wave, and θₐ = kₐhₐ. With points
 # ±ξ and μ = (1 − ξ²)/4, the mass along one axis has the symbol 1 − μθ² + O(θ⁴). In the stiffness, ∂h∂h' has the symbol
-# k²(1 − θ²/12), and ∂h h' has (sin θ)/h for every ξ. Let the mass have μ, and the stiffness ν along the axes where it
-# does not differentiate. Then the eigenvalue λ = Σ Aₐᵦkₐkᵦ becomes, to leading order,
+# k²(1 − θ²/12), and ∂h h' has (sin θ)/h for every ξ. Let the mass have μ, and the stiffness ν along axes
+# without a derivative. Then the eigenvalue λ = Σ Aₐᵦkₐkᵦ becomes, to leading order,
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
@@ -174,9 +174,9 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
 # Only the shape functions are evaluated at these points. The tensors are evaluated at Gauss points, which integrate
 # them accurately: with tensors at the new points, errors on brains were twice as large.
 #
-# On a cell, a function is a sum of products of m coordinates, one for each set of m axes. Its derivative along an axis
-# has products of m − 1 coordinates, which grow with ξ. So the stiffness for points ±ξ is the one for Gauss points ±ξ₀
-# with each product multiplied by (ξ/ξ₀)^(m−1). The products are an orthogonal basis: at the corners they are 1 or −1.
+# On a cell, a function is a linear combination of products of coordinates, one for each set of axes. The derivative of
+# a product of m coordinates has m − 1 of them, which grow with ξ. So the stiffness for points ±ξ is the one for Gauss
+# points ±ξ₀ with each such product multiplied by (ξ/ξ₀)^(m−1). Their values at the corners, ±1, make them orthogonal.
 def moved(
     stiffness: Float[Array, "n n"], metric: Float[Array, "q d d"], spacing: Float[np.ndarray | Array, " d"]
 ) -> Float[Array, "n n"]:

@@ -31,8 +31,8 @@ def factorise(
 
     The matrix A may be indefinite. All results are differentiable with respect to K, M, σ and right-hand sides, in
     forward and reverse mode to any order, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ along a nested
-    dissection, without pivoting across fronts, and is tested on random right-hand sides. If small pivots make it
-    inaccurate, it is repeated with these pivots replaced, and solutions are refined iteratively.
+    dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots spoil
+    it, the elimination is repeated with these pivots replaced, and solutions are refined iteratively.
 
     Args:
         domain: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the identity), or (K, M), as

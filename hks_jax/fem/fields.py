@@ -134,5 +134,5 @@ def _check(
     remedy = "Raise" if positive and what == "not positive" else "Replace"
     raise ValueError(
         f"{name}: {int(wrong.sum())} of {int(counted.sum())} values are {what} (the first is {number}at {where}). "
-        f"{remedy} these values, or exclude the places by a mask"
+        f"{remedy} them, or exclude these places by a mask"
     )

@@ -62,7 +62,7 @@ def laplace_beltrami(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
 
 
 def l2(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
-    """Return the mass ρ u·v, which is the inner product of L²."""
+    """Return the mass ρ u·v, whose integral is the inner product of L²."""
     return _weighted(jnp.sum(u.value * v.value), w)
 
 

@@ -119,7 +119,7 @@ def to_rows(columns: Float[Array, "*shape b"]) -> Float[Array, "b nodes"]:
 
 _FILLED = {2: 0.45, 3: 0.6}
 """The least fraction of free nodes, by dimension. If half are free, later calls in 2D are 1.4 to 1.9 times slower, and
-about ten of them lose the time that the first call saves. In 3D the costs of factors grow faster."""
+about ten of them lose the time that the first call saves. In 3D the cost of a factorisation grows faster."""
 
 
 def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:

@@ -202,7 +202,7 @@ def _least(potential: Field, space: FunctionSpace, operator: WeakForm) -> Float[
 
 
 def _constants(space: FunctionSpace, values: Array) -> NullSpace:
-    """Return what every stiffness of a Laplace–Beltrami operator annihilates: constants on natural components."""
+    """Return the null space of a Laplace–Beltrami operator: the constants on components without Dirichlet nodes."""
     n_null, labels, numbers = space.n_null, space.null_labels, jnp if is_staged() else np
     if n_null == 0 or (n_null == 1 and (labels == 0).all()):
         vectors = numbers.ones((n_null, space.n_dof), values.dtype)

@@ -153,7 +153,7 @@ def _spread_by_jax(
 
 @jax.tree_util.register_static
 class GridSpace(FunctionSpace):
-    """The Q1 space on a grid with given boundary conditions, as `normalise_boundary` writes them.
+    """The Q1 space on a grid with given boundary conditions, as returned by `normalise_boundary`.
 
     Spacing and origin of the grid are not part of the space, so that they can change without recompilation.
 
@@ -222,7 +222,7 @@ class MeshSpace(FunctionSpace):
         self.node_shape, self.elements = rim.shape, np.ones(len(self.cells), bool)
         self.free = self.domain & ~rim if condition == "dirichlet" else self.domain
         if not self.free.any():
-            raise ValueError("boundary: every vertex is on the mesh's boundary, so that Dirichlet leaves none free")
+            raise ValueError("boundary: every vertex is on the mesh's boundary, and so none is free. Refine the mesh")
         self._labels, self._key = labels, (triangulation, condition, degree)
 
 
@@ -287,7 +287,7 @@ def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
 
 
 def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray | Array, "*shape"]:
-    """Return a mask for a computation with some values."""
+    """Return the mask as an array of NumPy or, for a compiled computation with ``values``, of JAX."""
     axes = _box(mask) if is_traced(values) and is_staged() else None
     return mask if axes is None else _outer([axis[None] for axis in axes])[0]
 
@@ -295,7 +295,7 @@ def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray |
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
     """Mark the offsets and nodes of couplings with two free ends, for a computation with ``values``.
 
-    None where these are traced and all nodes of the domain are free, so that nothing is to be eliminated.
+    The result is None if the values are traced and all nodes of the domain are free.
     """
     if not (is_traced(values) and is_staged()):
         return free_couplings(space)

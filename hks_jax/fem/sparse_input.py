@@ -173,7 +173,7 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
     if diagonal is None:
         mass = _entries("M", M)
         if mass.size != n:
-            raise ValueError(f"M: got shape {(mass.size, mass.size)}; expected that of K, {(n, n)}")
+            raise ValueError(f"M: got shape {(mass.size, mass.size)}; expected {(n, n)}, the shape of K")
         if (mass.rows == mass.cols).all():
             diagonal = jnp.zeros(n, mass.values.dtype).at[jnp.asarray(mass.rows)].add(mass.values)
         else:

@@ -51,7 +51,7 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
     lacking = {"mark", *(field.name for field in dataclasses.fields(Checkpoint))} - set(data)
     if lacking:
         names = ", ".join(sorted(lacking))
-        raise ValueError(f"checkpoint: {path} is no file of a fit, it lacks {names}. Use another name, or remove it")
+        raise ValueError(f"checkpoint: {path} is not that of a fit, it lacks {names}. Use another name, or remove it")
     if str(data["mark"]) != mark:
         raise ValueError(
             f"checkpoint: {path} belongs to another fit (another target, initial field or setting). Use another name, "

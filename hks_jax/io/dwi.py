@@ -127,7 +127,7 @@ def fit_dwi(
         covariance, modes = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
     clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
     notes = [
-        f"tensors fitted by weighted least squares to {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g})",
+        f"weighted least-squares fit to {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
         *remarks,
         *found,
         *nifti.placement_notes(image),

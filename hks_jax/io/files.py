@@ -130,7 +130,7 @@ def save(
 
     ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
 
-    ``.vti``: one array of point data per time, named by the time, the array ``mask``, and `extra` as field data.
+    ``.vti``: point data with one array per time, whose name contains the time, and ``mask``; field data with `extra`.
 
     ``.npz``: the values as the array `name`, and the arrays in `extra`. A grid adds ``spacing``, ``origin``, and if
     they exist ``mask``, ``affine`` and ``slice_axis``. A mesh adds ``vertices`` and ``faces`` (triangles) or ``cells``

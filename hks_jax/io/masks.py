@@ -41,7 +41,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
 
 
 def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndarray, "*shape"]:
-    """Remove the boundary voxels of a mask, which contain several tissues and have the least reliable tensors.
+    """Remove the boundary voxels of a mask, because they contain several tissues and their tensors are unreliable.
 
     Each iteration removes the voxels with a face neighbour outside the mask. Voxels beyond the image count as inside,
     so a volume that ends inside the head keeps its last slices.

@@ -222,7 +222,7 @@ def load_obj(file: Path) -> Loaded:
                 corners = [int(word.partition("/")[0]) for word in words[1:]]
                 if 0 in corners or len(corners) < 3:
                     raise ValueError(f"line {number}: got the face {' '.join(words[1:])}; expected 3 vertices or more")
-                # Vertices are numbered from 1. A negative number counts backwards from the last vertex above the line.
+                # Vertices are numbered from 1. A negative number counts backwards from the last vertex read so far.
                 polygons.append([corner - 1 if corner > 0 else len(vertices) + corner for corner in corners])
     return _triangulated(file, vertices, polygons)
 
@@ -270,7 +270,7 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
         if (cut < 0).any():
             bad = which[np.argmax((cut < 0).any(axis=(1, 2)))]
             raise ValueError(
-                f"{file}: face {bad} with {size} corners is not star-shaped from a corner. Cut it into triangles"
+                f"{file}: face {bad} with {size} corners is not star-shaped about a corner. Cut it into triangles"
             )
         order.append(np.repeat(which, size - 2))
         triangles.append(cut.reshape(-1, 3))

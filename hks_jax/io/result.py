@@ -27,7 +27,7 @@ class Result:
     """A signature or another scalar field on a mesh, or on a volume or slice whose mask is the domain.
 
     Attributes:
-        place: the volume, slice or mesh. If a file has no tensors, they are the identity.
+        place: the volume, slice or mesh. If a file has no tensors, those of the volume are the identity.
         values: (n_times, *shape).
         times: (n_times,), or (0,) for a result without times.
         eigenvalues: (k,), or (0,) if they are unknown.

@@ -62,7 +62,7 @@ class TensorVolume:
         covariance: (*shape, m, m), the covariance of the components xx xy yy (xz yz zz) along the voxel axes, in the
             squared unit of the tensors, if known (`fit_dwi`); otherwise None.
         modes: (*shape, n, m), the contribution of each of the n images to the noise of these components, if the noise
-            was estimated from residuals (`fit_dwi`, in float32); otherwise None. They hold the noise that voxels share.
+            was estimated from residuals (`fit_dwi`, in float32); otherwise None. Modes include noise that voxels share.
 
     Raises:
         ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
@@ -195,7 +195,7 @@ class TensorVolume:
             ValueError: the fit did not estimate the noise.
         """
         if self.modes is not None:
-            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # of a fit, a signal without weighting included
+            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # the tensor and the unweighted signal
         if self.covariance is None:
             raise ValueError(
                 "noise: got a volume without an estimate of its noise; fit the tensors by `fit_dwi` with noise=, or "

@@ -1,1 +1,1 @@
-"""Linear algebra of symmetric matrices that knows no domain."""
+"""Linear algebra of symmetric matrices, independent of domains and meshes."""

@@ -1,8 +1,7 @@
-"""What is arranged otherwise where computations run on an accelerator.
+"""Decisions that depend on whether computations run on an accelerator.
 
-There each launch of a kernel takes some 4 µs, however little it does, and where the host has to look at a number it
-waits for everything launched before. Programs there have few kernels, and lengths known beforehand, at the price of
-some arithmetic.
+On an accelerator, each kernel launch takes at least about 4 µs. A host that reads a number waits for all earlier
+kernels. So programs for accelerators have few kernels and static loop lengths, at the cost of additional arithmetic.
 """
 
 import warnings
@@ -16,7 +15,7 @@ from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Float
 
 _CAPABILITY = 8.0
-"""The compute capability (Ampere) from which on XLA compiles Triton's kernels."""
+"""The least compute capability (Ampere) for which XLA compiles Triton kernels."""
 
 
 def at_hand() -> bool:
@@ -25,7 +24,7 @@ def at_hand() -> bool:
 
 
 def kernels_compile() -> bool:
-    """Return whether Pallas' kernels compile for the GPU here; False without one, as tracing them takes time."""
+    """Return whether Pallas kernels compile for this machine's GPU; False without a GPU, because tracing takes time."""
     if jax.default_backend() != "gpu":
         return False
     try:
@@ -37,18 +36,18 @@ def kernels_compile() -> bool:
 
 
 INTERPRETED = False
-"""Whether Pallas' kernels run on any device by XLA's operations instead: for tests."""
+"""Whether Pallas interprets its kernels by XLA operations on any device, for tests."""
 
 _PROVED: dict[tuple[str, str], bool] = {}
 
 
 def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[Any, Any]]]) -> bool:
-    """Return whether Pallas' kernels compile for the GPU here, and compute what they should, as the first use finds.
+    """Return whether Pallas kernels compile for this machine's GPU and are correct; tested at the first use.
 
-    ``compare`` runs each of them on a small problem, and returns its results beside those that are expected.
+    ``compare`` runs each kernel on a small problem, and returns pairs of computed and expected results.
 
     Warns:
-        RuntimeWarning: they do not; XLA's operations take their place for the rest of the process.
+        RuntimeWarning: the kernels fail the test; XLA operations replace them for the rest of the process.
     """
     if not kernels_compile():
         return False
@@ -56,22 +55,22 @@ def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[An
     if key not in _PROVED:
         failure = ""
         try:
-            with ThreadPoolExecutor(1) as pool:  # a thread of its own computes, also while this one traces a program
+            with ThreadPoolExecutor(1) as pool:  # a separate thread computes, even while this one traces
                 results = pool.submit(lambda: [tuple(map(np.asarray, pair)) for pair in compare()]).result()
             for found, expected in results:
                 error = np.max(np.abs(found - expected))
                 if not error <= float(np.finfo(dtype).eps) ** 0.6 * np.max(np.abs(expected)):
-                    failure = f"differ from what they should compute by {error:.1e}"
-        except DeprecationWarning:  # JAX gives Triton up: where that is an error, no kernels are wanted
+                    failure = f"have an error of {error:.1e}"
+        except DeprecationWarning:  # JAX deprecates Triton; if warnings are errors, use no kernels
             _PROVED[key] = False
             return False
-        except Exception as error:  # whatever the compiler of kernels raises
+        except Exception as error:  # the kernel compiler may raise any error
             failure = f"do not compile ({str(error).strip().splitlines()[0]})" if str(error) else "do not compile"
         if failure:
             device = jax.local_devices()[0]
             warnings.warn(
-                f"on {device.device_kind} the kernels of {name} in {key[1]} {failure}; XLA's operations take their "
-                "place, which are slower",
+                f"on {device.device_kind} the kernels of {name} in {key[1]} {failure}; slower XLA operations replace "
+                "them",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -80,13 +79,13 @@ def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[An
 
 
 def padded_size(n: int, least: int) -> int:
-    """Return a power of two, as Triton's arrays need it, that is not below n, nor below the least, a power of two."""
+    """Return the smallest power of two ≥ n and ≥ ``least``, itself a power of two; Triton arrays need such sizes."""
     return max(least, 1 << (n - 1).bit_length())
 
 
 def row_by_row(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return an array; on accelerators one that lies in memory in the order of its axes.
+    """Return the array; on accelerators, force row-major memory layout.
 
-    Where a part of a large array is needed transposed, XLA would there rather transpose all of it.
+    Otherwise, XLA transposes a whole large array there if a part is needed transposed.
     """
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim)))) if at_hand() else x

@@ -1,8 +1,7 @@
-"""Recursive bisection of any graph, for nested dissection: where to cut, and which vertices separate the halves.
+"""Recursive bisection of a general graph by vertex separators, for nested dissection.
 
-Distances in the graph from a few landmarks far apart serve as coordinates; every part is cut across its principal axis
-at the median, and separated by a minimum vertex cover of the edges that are cut (Kőnig's theorem). All parts of a level
-are cut at once.
+Graph distances from a few remote landmarks serve as coordinates. Every part is cut at the median along its principal
+axis. The separator is a minimum vertex cover of the cut edges (Kőnig's theorem). All parts of a level are cut at once.
 
 I. S. Duff and others, Direct Methods for Sparse Matrices (2nd edition, Oxford 2017), chapters 8 and 9.
 """
@@ -21,24 +20,24 @@ from scipy.sparse.csgraph import (
 )
 
 _CELL = 50
-"""The number of vertices from which on a cell is divided further: solves take less time than with half as many."""
+"""The largest number of vertices in a cell; larger cells are divided. With cells of 25, solves take longer."""
 _LANDMARKS = 8
 _SMOOTHING = 6
-"""How often distances are averaged with those of neighbours: they are integers, of which many are equal. Measured on
-random closed surfaces, the factors are then as large as where the vertices' positions serve as coordinates, and 3 to
-8 % larger than with the cuts of METIS, whose own nested dissection takes about as long; a factorisation takes 12 to
-28 % more operations."""
+"""The number of times that distances are averaged with those of neighbours, because many integer distances are equal.
+Measured on random closed surfaces, the factors are then as large as with the vertices' positions as coordinates. They
+are 3 to 8 % larger than with METIS, whose nested dissection takes about as long; a factorisation takes 12 to 28 % more
+operations."""
 
 
 Ints = Int[np.ndarray, " _"]
 
 
 class Parts(NamedTuple):
-    """A recursive bisection of a graph: part q of a level is separated into parts 2q and 2q + 1 of the next."""
+    """A recursive bisection of a graph: part q of a level is divided into parts 2q and 2q + 1 of the next level."""
 
-    # at which level each vertex belongs to a separator; what is separated no further, the cells, is the last level
+    # the level of the separator that contains each vertex; vertices of the undivided cells have the last level
     level: Int[np.ndarray, " n"]
-    part: Int[np.ndarray, " n"]  # the part of that level which it separates
+    part: Int[np.ndarray, " n"]  # the index, within that level, of the part whose separator (or cell) it is in
     depth: int  # the number of levels
 
 
@@ -50,7 +49,7 @@ def bisect_graph(n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"
     once = tails < heads
     tails, heads = tails[once], heads[once]
     level, part, side = np.full(n, -1), np.zeros(n, int), np.empty(n, np.int32)
-    # The vertices that are left, those of a part together, along the axis across which it was cut out.
+    # The remaining vertices, grouped by part; each part is sorted along the principal axis of its parent.
     left, x, counts, depth = np.arange(n), _coordinates(graph), np.array([n]), 0
     while True:
         q = np.repeat(np.arange(counts.size), counts)
@@ -76,7 +75,7 @@ def bisect_graph(n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"
 
 
 def _banded(n: int, rows: Ints, cols: Ints) -> tuple[Ints, csr_matrix]:
-    """Return an order of the vertices in which neighbours are near each other, in memory too, and the graph in it."""
+    """Return an order of the vertices with small bandwidth, for memory locality, and the reordered graph."""
     start = np.append(0, np.cumsum(np.bincount(rows, minlength=n)))
     graph = csr_matrix((np.ones(cols.size, np.int8), cols, start), shape=(n, n))
     order = reverse_cuthill_mckee(graph, symmetric_mode=True)
@@ -85,18 +84,18 @@ def _banded(n: int, rows: Ints, cols: Ints) -> tuple[Ints, csr_matrix]:
     return order, graph
 
 
-# The gaps between components are as long as these are: with longer ones, one vertex of its own would turn the principal
-# axis of all others towards it.
+# The gaps between components are as long as the components. With longer gaps, a single isolated vertex would determine
+# the principal axis.
 def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
-    """Return distances from landmarks, one in each component; components follow each other on an axis of their own."""
+    """Return distances from landmarks in each component; an additional coordinate places components in sequence."""
     n = graph.shape[0]
     count, label = connected_components(graph, directed=False)
-    # The first in the order is far from the last; no distance is as large.
+    # The first landmark is the first vertex in the order, which is far from the last; all distances are below n.
     nearest, roots = np.arange(2 * n, n, -1), np.empty(count, int)
     distances: list[Int[np.ndarray, " n"]] = []
     for _ in range(_LANDMARKS):
         ends = np.flatnonzero(nearest == _largest(nearest, label, count)[label])
-        roots[label[ends]] = ends  # one in each component, as far as can be from the landmarks so far
+        roots[label[ends]] = ends  # in each component, a vertex farthest from the landmarks so far
         distances.append(_distances(graph, roots))
         nearest = np.minimum(nearest, distances[-1])
     x = np.stack(distances, axis=1).astype(np.float32)
@@ -110,14 +109,14 @@ def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
 
 
 def _largest(values: Int[np.ndarray, " n"], label: Int[np.ndarray, " n"], count: int) -> Int[np.ndarray, " count"]:
-    """Return the largest of each component's values, which are not negative."""
+    """Return the maximum of the nonnegative values in each component."""
     largest = np.zeros(count, int)
     np.maximum.at(largest, label, values)
     return largest
 
 
 def _distances(graph: csr_matrix, roots: Int[np.ndarray, " r"]) -> Int[np.ndarray, " n"]:
-    """Return the number of edges to the nearest root, by one search from a further vertex that leads to all of them."""
+    """Return graph distances to the nearest root, by one search from an additional vertex joined to all roots."""
     n = graph.shape[0]
     indices = np.append(graph.indices, roots)
     start = np.append(graph.indptr, indices.size)
@@ -125,7 +124,7 @@ def _distances(graph: csr_matrix, roots: Int[np.ndarray, " r"]) -> Int[np.ndarra
     order, predecessor = breadth_first_order(joined, n)
     place = np.empty(n + 1, int)
     place[order] = np.arange(order.size)
-    parents = place[predecessor[order[1:]]]  # ascending, as in any queue
+    parents = place[predecessor[order[1:]]]  # ascending, because the search uses a queue
     ends = [1]
     while ends[-1] < order.size:
         ends.append(1 + int(np.searchsorted(parents, ends[-1])))
@@ -135,7 +134,7 @@ def _distances(graph: csr_matrix, roots: Int[np.ndarray, " r"]) -> Int[np.ndarra
 
 
 def _along_axes(x: Float[np.ndarray, "n c"], q: Ints, counts: Ints) -> Ints:
-    """Return an order in which the vertices of each part, which lie together, follow its principal axis."""
+    """Return the order that sorts the vertices of each part along its principal axis; parts are contiguous."""
     c, parts = x.shape[1], counts.size
     mean = np.stack([np.bincount(q, column, parts) for column in x.T], axis=1) / np.maximum(counts, 1)[:, None]
     centred = np.ascontiguousarray((x - np.repeat(mean.astype(x.dtype), counts, axis=0)).T)
@@ -149,15 +148,15 @@ def _along_axes(x: Float[np.ndarray, "n c"], q: Ints, counts: Ints) -> Ints:
 
 
 def within_groups(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " n"]:
-    """Return 0, 1, … within each of consecutive groups."""
+    """Return 0, 1, … within each of consecutive groups of the given sizes."""
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-# Kőnig: let Z be what alternating paths (an edge that is not matched, an edge that is, …) reach from the unmatched
-# vertices of the one side, for a maximum matching. The vertices of that side outside Z and those of the other in Z
-# cover all edges, and are as many as the matching has edges: no cover has fewer.
+# Kőnig's theorem: for a maximum matching, let Z be the set of vertices that alternating paths (an unmatched edge, a
+# matched edge, …) reach from the unmatched vertices on the left. The left vertices outside Z and the right vertices in
+# Z cover all edges. The cover has as many vertices as the matching has edges, so that no cover is smaller.
 def minimum_cover(left: Int[np.ndarray, " m"], right: Int[np.ndarray, " m"]) -> Int[np.ndarray, " s"]:
-    """Return a minimum vertex cover of a bipartite graph, given by the two ends of its edges."""
+    """Return a minimum vertex cover of a bipartite graph, given the left and right ends of its edges."""
     lefts, row = np.unique(left, return_inverse=True)
     rights, col = np.unique(right, return_inverse=True)
     graph = csr_matrix((np.ones(row.size, np.int8), (row, col)), shape=(lefts.size, rights.size))

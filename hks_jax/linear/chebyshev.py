@@ -1,4 +1,4 @@
-"""Chebyshev polynomials of a matrix by its products alone, the expansion of exp(−tλ) in them, and bounds of spectra."""
+"""Matrix-free Chebyshev polynomials of a matrix, the Chebyshev expansion of exp(−tλ), and bounds of spectra."""
 
 import math
 from collections.abc import Callable
@@ -16,20 +16,20 @@ from hks_jax.linear.products import aligned, matmul
 
 _FAILURE = 1e-6
 _START = 30
-"""How far from uniform the start of a Lanczos bound may be: the root of the condition of PD and more."""
+"""The assumed deviation of the start of `lanczos_bound` from a uniform one: above the root of the condition of PD."""
 
 Scalar = Float[Array, ""]
 Columns = Float[Array, "*shape b"]
 
 
 def chebyshev_recurrence(
-    product: Callable[[Any], Any],  # y ↦ Ay, the spectrum of A within [−1, 1]
+    product: Callable[[Any], Any],  # y ↦ Ay, where the spectrum of A lies in [−1, 1]
     x: Any,  # an array, or a tree of arrays
     degree: int,  # at least 1; static
-    total: Any = (),  # what is to be gathered on the way
+    total: Any = (),  # the initial value of the accumulated sum
     add: Callable[[Any, Any, Any], Any] = lambda n, y, total: total,  # (n, yₙ, total) ↦ the total with the term of yₙ
 ) -> tuple[Any, Any, Any]:
-    """Go through yₙ = Tₙ(A)x, n = 0, …, degree: y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁; return the last two and the total."""
+    """Compute yₙ = Tₙ(A)x by y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁ up to n = degree; return the last two yₙ and the total."""
 
     def step(n: Array, state: tuple) -> tuple:
         y, before, total = state
@@ -42,30 +42,30 @@ def chebyshev_recurrence(
     return y, before, add(degree, y, total)
 
 
-# The three-term recurrence of p in s(z) = (z − c)/e, c and e the interval's centre and half width, for z_j = q_j(A) w,
-# everything divided by p_j(ζ), whose ratios are σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}):
+# Let s(z) = (z − c)/e, where c and e are the interval's centre and half width. Divide the three-term recurrence of p by
+# p_j(ζ), and let σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}). Then z_j = q_j(A) w satisfies
 #
 #     z_{j+1} = (2σ_j/e) ((A − c) z_j + w) − σ_j σ_{j−1} z_{j−1},    z_0 = 0,   z_1 = (σ_0/e) w,   σ_0 = 1/s(ζ).
 #
-# `chebyshev_recurrence` would overflow where ζ is far from the interval, and has p(A), not q(A).
+# `chebyshev_recurrence` computes p(A), not q(A), and would overflow if ζ is far from the interval.
 def chebyshev_iteration(
     product: Callable[[Columns], Columns],
     w: Columns,
     low: Scalar,
     high: Scalar,
-    value: Float[Array, "*b"] | float,  # ζ, outside the interval; a number for each column, or one for all
-    degree: Int[Array, ""] | int,  # of p
+    value: Float[Array, "*b"] | float,  # ζ outside the interval, one for each column or one for all
+    degree: Int[Array, ""] | int,  # the degree of p
 ) -> Columns:
     """Return q(A)w, where q(z) = (p(z)/p(ζ) − 1)/(z − ζ) and p is the Chebyshev polynomial of [low, high].
 
-    −q(A)w is what Chebyshev iteration makes of (A − ζ)x = w for a matrix A with its spectrum in the interval, given its
-    product: the residual is p(A)w/p(ζ).
+    If the spectrum of A lies in the interval, −q(A)w is the result of Chebyshev iteration for (A − ζ)x = w, with
+    residual p(A)w/p(ζ). ``product`` is x ↦ Ax.
     """
     centre, half = (high + low) / 2, (high - low) / 2
     s = (value - centre) / half
 
-    # On accelerators two steps a turn, so that each new vector takes the place of the one before the last: with one,
-    # both would be copied. Where they do not add up, the first is the step from z₀ = 0 to z₁.
+    # On accelerators, each loop iteration takes two steps, so that new vectors overwrite old ones; with one step, XLA
+    # would copy both. If the number of steps is odd, an additional first step leads from z₀ = 0 to z₁.
     together = 2 if accelerators.at_hand() else 1
     missing = jnp.asarray((degree - 1) % together)
 
@@ -87,13 +87,13 @@ def chebyshev_iteration(
     return jax.lax.fori_loop(0, (degree - 1 + missing) // together, turn, first)[1]
 
 
-# exp(−tλ) on 0 ≤ λ ≤ top has the coefficients e^(−z) Iₙ(z), z = t·top/2, twice that for n > 0, with alternating signs.
+# The coefficients of exp(−tλ) on 0 ≤ λ ≤ top are (−1)ⁿ 2 e^(−z) Iₙ(z), where z = t·top/2; for n = 0, half of that.
 @partial(jax.jit, static_argnames="degree")
 def chebyshev_heat_coefficients(
     times: Float[Array, " m"], top: Scalar | float, degree: int
 ) -> Float[Array, "m {degree}+1"]:
-    """Return the coefficients by the cosine transform of samples, whose derivatives JAX knows."""
-    samples = degree + 32 + 4 * math.isqrt(degree)  # aliasing brings in coefficients from 2·samples − degree on
+    """Return the coefficients of exp(−tλ), by the cosine transform of samples, which JAX can differentiate."""
+    samples = degree + 32 + 4 * math.isqrt(degree)  # aliases have indices ≥ 2·samples − degree
     angles = (np.arange(samples) + 0.5) * (np.pi / samples)
     weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
     weights[:, 0] /= 2
@@ -102,39 +102,40 @@ def chebyshev_heat_coefficients(
 
 
 def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:
-    """Return the moduli of the coefficients down to 1e-25."""
+    """Return the absolute values of the coefficients of exp(−tλ), down to 1e-25."""
     n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
     return np.where(n == 0, 1, 2) * ive(n, z)
 
 
 def coefficient_tails(z: float) -> Float[np.ndarray, " n_and_1"]:
-    """Return the sums of their moduli from each n on, and 0 at the end."""
+    """Return the sums of the `coefficient_sizes` from each n on, and a final 0."""
     return np.append(np.cumsum(coefficient_sizes(z)[::-1])[::-1], 0)
 
 
 def least_degree(z: float, error: float) -> int:
-    """Return the least degree, at least 1, beyond which the coefficients add up to no more than the error."""
+    """Return the least degree ≥ 1 at which the truncated coefficients sum to at most the error."""
     return max(int(np.argmax(coefficient_tails(z) <= error)) - 1, 1)
 
 
 @jax.jit
 def gershgorin(entries: Float[Array, "offsets *shape"], inverse: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Return the bound of Gershgorin's discs, which never fails, on D⁻¹K: K's entries row by row, and D⁻¹."""
+    """Return the Gershgorin bound of the spectrum of D⁻¹K, given the entries of K row by row, and D⁻¹."""
     return jnp.max(jnp.sum(jnp.abs(entries), axis=0) * inverse)
 
 
 def lanczos_bound(
     apply: Callable[[Array], Array],  # x ↦ Kx
     solve: Callable[[Array], Array],  # r ↦ Pr
-    sums: Float[Array, "..."],  # D ≈ P⁻¹, a diagonal, of the shape of x; 0 where there is no degree of freedom
-    n: int,  # how many degrees of freedom there are
+    sums: Float[Array, "..."],  # a diagonal D ≈ P⁻¹ with the shape of x; 0 outside the degrees of freedom
+    n: int,  # the number of degrees of freedom
     steps: int,
 ) -> Scalar:
-    """Return an upper bound on the eigenvalues of PK by Lanczos iteration.
+    """Return an upper bound of the eigenvalues of PK by Lanczos iteration.
 
-    From a random start the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ but for a probability of
-    1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2): θ/(1 − ε) is returned for the ε that
-    makes this 10⁻⁶. The start is normal in the coordinates of D, not quite those of P, which is allowed for.
+    From a random start, the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ with probability at least
+    1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is θ/(1 − ε) for the ε at
+    which the probability of failure is 10⁻⁶. The start is normally distributed with respect to D instead of P⁻¹; a
+    safety factor accounts for the difference.
     """
     r = jnp.sqrt(sums) * jax.random.normal(jax.random.key(0), sums.shape, sums.dtype)
 
@@ -142,7 +143,7 @@ def lanczos_bound(
         v, r, size = state
         z = solve(r)
         following = jnp.sqrt(jnp.maximum(jnp.vdot(r, z), 0))
-        # The Krylov space may be exhausted: zeros from there on add zeros to the Ritz values.
+        # If the Krylov space is exhausted, all further coefficients are zero, which adds only zero Ritz values.
         alive = following > 1e-5 * size
         scale = jnp.where(alive, 1 / jnp.where(alive, following, 1), 0)
         w, z = scale * r, scale * z
@@ -156,6 +157,6 @@ def lanczos_bound(
     _, (alpha, beta) = jax.lax.scan(step, start, length=steps)
     matrix = jnp.diag(alpha) + jnp.diag(beta[1:], 1) + jnp.diag(beta[1:], -1)
     epsilon = (math.log(1.648 * _START * math.sqrt(n) / _FAILURE) / (2 * steps - 1)) ** 2
-    if steps >= n:  # the whole space was seen
+    if steps >= n:  # the Krylov space is the whole space
         epsilon = 1e-3
     return lapack.eigh(matrix)[0][-1] / (1 - epsilon)

@@ -1,8 +1,8 @@
-"""What block Lanczos does with blocks of a few long columns, in one launch of a kernel each, for CUDA devices.
+"""Kernels for CUDA devices that fuse the operations of block Lanczos on blocks of a few long columns.
 
-Written with XLA's operations, inner products and what is made of them take four launches: parts of the sums, their sum,
-a small matrix computed from it, and combinations of columns. Instead the parts go to the kernel that needs them: each
-of its programs adds them up, computes the small matrix for itself, and combines its own rows.
+By XLA operations, inner products and the combinations that use them take four launches: for partial sums, their sum, a
+small matrix computed from the sum, and combinations of columns. In this module, the partial sums are the input of a
+second kernel. Each of its programs adds the partial sums, computes the small matrix, and combines its own rows.
 """
 
 from collections.abc import Callable
@@ -16,21 +16,21 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.linear import accelerators
 
 LARGEST = 32
-"""Columns of the widest blocks."""
+"""The largest number of columns of a block."""
 _SMALLEST = 8
 _NUMBERS = 1 << 13
-"""Numbers of which a program keeps sums at once."""
+"""The number of sums that a program accumulates simultaneously."""
 _PARTS, _ROWS = 256, 512
-"""Parts of a sum at most, and rows of each at least."""
+"""The maximal number of partial sums, and the least number of rows per partial sum."""
 
 Block = Float[Array, "n b"]
 Small = Float[Array, "b b"]
 Parts = Float[Array, "parts b b"]
-"""Parts of a small matrix, to be added up."""
+"""Partial sums of a small matrix."""
 
 
 def parts_of_products(x: Block, y: Block) -> Parts:
-    """Return xᵀy."""
+    """Return partial sums of xᵀy."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -67,9 +67,9 @@ def parts_of_products(x: Block, y: Block) -> Parts:
 
 
 def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] | None = None) -> tuple[Block, Small]:
-    """Return x less the block times D, and D, which comes in parts.
+    """Return x − block·D, and D, given partial sums of D.
 
-    With another block and its coefficients ``before``, x loses their product too, and D is made symmetric.
+    With ``before`` = (previous block, coefficients), subtract their product too, and use the symmetric part of D.
     """
     columns, matrices = ((x, block), ()) if before is None else ((x, block, before[0]), before[1:])
 
@@ -82,12 +82,10 @@ def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] 
 
 
 def orthonormal(parts: Parts, columns: tuple[Block, ...], before: Small) -> tuple[tuple[Block, ...], Small]:
-    """Return columns times F⁻ᵀ, and a matrix times F, where FFᵀ = G, which comes in parts and has at most 32 rows.
+    """Return columns times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G (at most 32 rows).
 
-    With G = xᵀMx the columns xF⁻ᵀ are M-orthonormal.
-
-    For F the columns are scaled to length one, and taken in the order of what the ones before leave of them; of those
-    that depend on the ones before, to rounding, the least length that rounding tells from zero is kept.
+    If G = xᵀMx, the columns of xF⁻ᵀ are M-orthonormal. F is a pivoted Cholesky factor after scaling to unit diagonal.
+    Pivots below the level of rounding, which belong to linearly dependent columns, are raised to that level.
     """
     b = len(before)
     floor = b * float(jnp.finfo(before.dtype).eps)
@@ -106,7 +104,7 @@ def orthonormal(parts: Parts, columns: tuple[Block, ...], before: Small) -> tupl
 
 
 def agree(dtype: Any) -> bool:
-    """Return whether these kernels compute on this GPU what they should; see `accelerators.kernels_agree`."""
+    """Return whether these kernels are correct on this GPU; see `accelerators.kernels_agree`."""
 
     def compare() -> list[tuple[Any, Any]]:
         rng, n, b = np.random.default_rng(0), 3 * _ROWS + 5, 7
@@ -119,7 +117,7 @@ def agree(dtype: Any) -> bool:
         found.append((rest, x - y @ products - z @ mix))
         squares = parts_of_products(jnp.asarray(x), jnp.asarray(x))
         (unit,), factor = orthonormal(squares, (jnp.asarray(x),), jnp.asarray(np.eye(b, dtype=dtype)))
-        # By NumPy: on GPUs JAX multiplies matrices in single precision with three digits.
+        # NumPy computes these products, because JAX's default precision on GPUs has only three digits.
         q, r = np.asarray(unit), np.asarray(factor).T
         return [*found, (q.T @ q, np.eye(b, dtype=dtype)), (q @ r, x)]
 
@@ -127,7 +125,7 @@ def agree(dtype: Any) -> bool:
 
 
 _Terms = list[list[tuple[int, Array | None]]]
-"""For each block of columns that is wanted the sum of which blocks times which matrices it is, None the identity."""
+"""Each output block is a sum of terms (index of an input block, matrix factor); None is the identity."""
 
 
 def _combined(
@@ -138,7 +136,7 @@ def _combined(
     wanted: int,
     name: str,
 ) -> tuple[tuple[Block, ...], Small]:
-    """Return combinations of blocks of columns, and a small matrix, as computed from a sum in parts and matrices."""
+    """Return linear combinations of blocks, and a small matrix; ``small`` computes both coefficients and matrix."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -197,7 +195,7 @@ def _combined(
 
 
 def _divided(n: int, tile: int) -> tuple[int, int]:
-    """Return among how many programs to divide n rows, and how many rows, in whole tiles, each takes."""
+    """Return the number of programs for n rows, and the number of rows of each, a multiple of ``tile``."""
     rows = max(-(-n // _PARTS), min(_ROWS, n))
     rows = -(-rows // tile) * tile
     return -(-n // rows), rows
@@ -209,7 +207,7 @@ def _identity(size: int) -> Bool[Array, "size size"]:
 
 
 def _square(size: int, b: int) -> Bool[Array, "size size"]:
-    """Return which entries of a padded matrix belong to the matrix itself."""
+    """Return the mask of the entries of a padded matrix that belong to the matrix itself."""
     index = jax.lax.broadcasted_iota(jnp.int32, (size,), 0)
     return (index < b)[:, None] & (index < b)[None, :]
 
@@ -219,10 +217,10 @@ def _product(x: Float[Array, "m s"], y: Float[Array, "s s"]) -> Float[Array, "m 
 
 
 def _pivoted_cholesky(a: Small, floor: float, rank: int) -> tuple[Small, Small]:
-    """Return F with FFᵀ = A but for pivots that are raised to the floor, and F⁻ᵀ; the first ``rank`` columns of both.
+    """Return F with FFᵀ = A, except for pivots raised to ``floor``, and F⁻ᵀ; the first ``rank`` columns of both.
 
-    The k-th column of C = F⁻ᵀ follows from CFᵀ = I, whose column for the k-th row p chosen has no terms beyond: F[p, k]
-    times it is e_p less those of the columns before.
+    Let p be the k-th pivot row. Since F[p, j] = 0 for j > k, column p of CFᵀ = I gives the k-th column of C = F⁻ᵀ:
+    F[p, k] C[:, k] = e_p − Σ_{j<k} F[p, j] C[:, j].
     """
     index = jax.lax.broadcasted_iota(jnp.int32, (a.shape[0],), 0)
 
@@ -240,7 +238,7 @@ def _pivoted_cholesky(a: Small, floor: float, rank: int) -> tuple[Small, Small]:
         inverse = jnp.where(is_pivot, its_inverse[:, None], inverse)
         return a - column[:, None] * column[None, :], jnp.where(chosen, 0, left), factor, inverse
 
-    # What is beyond the matrix is never chosen.
+    # Padding rows are never pivots.
     left = (index < rank).astype(a.dtype)
     zeros = jnp.zeros_like(a)
     _, _, factor, inverse = jax.lax.fori_loop(0, rank, eliminate, (a, left, zeros, zeros))

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients, a block of columns at once, each with a matrix of its own; in JAX or NumPy."""
+"""Preconditioned conjugate gradients in JAX or NumPy, for a block of columns, each with its own matrix."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,36 +10,36 @@ from hks_jax.linear.loops import when, while_loop
 from hks_jax.linear.products import matmul, products_with_columns
 
 Array = Any
-"""NumPy's or JAX's, the same for all arguments and the result."""
+"""An array of NumPy or JAX; all arguments and the result are of the same library."""
 
 _MOST_STEPS = 200
 _RESTARTS = 3
 _KEPT, _MEMORY = 400, 4e8
-"""Residuals that are kept orthogonal at most, and bytes that they may take."""
+"""The maximal number of residuals for reorthogonalisation, and their maximal memory in bytes."""
 
 
 class Solution(NamedTuple):
-    """The state of conjugate gradients for one block of columns; r and p are zero for those that are done."""
+    """The state of conjugate gradients for one block of columns. For finished columns, r and p are zero."""
 
-    x: Float[Array, "n b"]  # the solutions so far; at the end NaN where a product is
+    x: Float[Array, "n b"]  # the solutions so far; finally NaN if a product was NaN
     rhs: Float[Array, "n b"]  # the right-hand sides
-    r: Float[Array, "n b"]  # their residuals
-    z: Float[Array, "n b"]  # these, preconditioned
-    p: Float[Array, "n b"]  # the next directions
-    first: Float[Array, " b"]  # rᵀz at the beginning,
-    energy: Float[Array, " b"]  # and now
-    change: Float[Array, " b"]  # the energy relative to that before
-    errors: Float[Array, " b"]  # estimates, relative, in units of those wanted; above 1 an iteration did not converge
-    going: Bool[Array, " b"]  # which columns go on
+    r: Float[Array, "n b"]  # the residuals
+    z: Float[Array, "n b"]  # the preconditioned residuals
+    p: Float[Array, "n b"]  # the next search directions
+    first: Float[Array, " b"]  # the initial rᵀz
+    energy: Float[Array, " b"]  # the current rᵀz
+    change: Float[Array, " b"]  # the ratio of rᵀz to that of the previous step
+    errors: Float[Array, " b"]  # estimated relative errors in units of the wanted ones; converged if at most 1
+    going: Bool[Array, " b"]  # whether each column continues
     fresh: Bool[Array, ""]  # whether the next step is the first, or the first after a restart
-    starts: Int[Array, ""]  # how many restarts there were
-    steps: Int[Array, ""]  # how many steps; −1 before the right-hand side is known
-    # the residuals of all steps, divided by √(rᵀz), and z likewise; None where none are kept
+    starts: Int[Array, ""]  # the number of restarts
+    steps: Int[Array, ""]  # the number of steps; −1 before the right-hand side is computed
+    # the residuals r and z of all steps, divided by √(rᵀz); None without reorthogonalisation
     kept: tuple[Float[Array, "m n"], Float[Array, "m n"]] | None
 
     @property
     def converged(self) -> Float[Array, "n b"]:
-        """The solutions; NaN where the error asked for is not reached."""
+        """The solutions; NaN for columns that did not converge."""
         xp = self.x.__array_namespace__()
         return xp.where(self.errors <= 1, self.x, xp.nan)
 
@@ -52,22 +52,22 @@ def conjugate_gradients(
     product: Callable[..., tuple[Array, Array]],  # x ↦ Aᵢxᵢ, and the energies below which Aᵢ counts as singular
     precondition: Callable[[Array], Array],  # r ↦ an approximation of Aᵢ⁻¹rᵢ
     rhs: Float[Array, "n b"],
-    wanted: Float[Array, " b"],  # the error in the energy norm, relative; columns of which it is infinite stay zero
+    wanted: Float[Array, " b"],  # the wanted relative error in the energy norm; if infinite, the column stays zero
     inner: Callable[[Array, Array], Array] = _dot,
     clean: Callable[[Array], Array] | None = None,
-    most: Int[Array, ""] | int = _MOST_STEPS,  # steps after which to stop all the same
+    most: Int[Array, ""] | int = _MOST_STEPS,  # the maximal number of steps
     orthogonal: bool = False,
 ) -> Solution:
     """Solve Aᵢxᵢ = rhsᵢ for a block of columns.
 
     Args:
-        inner: the inner products (b,) of two blocks of columns, with respect to which all Aᵢ and the preconditioner are
-            symmetric and positive definite; energies are measured with it.
-        clean: x ↦ its part in the subspace in which all this is so. Where rounding has led out of it, which an energy
-            that is not positive tells, the iteration starts again from there.
-        orthogonal: for one ill-conditioned matrix whose products are dear; b = 1, in JAX. Residuals stay orthogonal in
-            spite of rounding. ``product(x, first)`` then returns the right-hand side where ``first``, so that what it
-            has in common with Ax is compiled once, and of ``rhs`` the shape counts.
+        inner: the function that returns the inner products (b,) of two blocks of columns. All Aᵢ and the preconditioner
+            must be symmetric and positive definite with respect to ``inner``.
+        clean: the projection x ↦ Px on the subspace in which the Aᵢ are positive definite. If rounding has led x out of
+            the subspace, an energy is not positive; then the iteration restarts from Px.
+        orthogonal: whether to reorthogonalise residuals, for one ill-conditioned matrix with expensive products (b = 1,
+            JAX only). Then ``product(x, first)`` returns the right-hand side if ``first`` is true, so that their common
+            parts are compiled once; only the shape of ``rhs`` matters.
     """
     xp, n = rhs.__array_namespace__(), len(rhs)
 
@@ -98,11 +98,11 @@ def conjugate_gradients(
         x, r, again = state.x + wide * p, state.r - wide * image, begin
         kept = state.kept
         if kept is not None:
-            # In exact arithmetic rᵢᵀPrⱼ = 0. Rounding loses that as soon as an eigenvector at the end of the spectrum
-            # is known, and conjugate gradients then look for it again and again: where eigenvalues fall off over eight
-            # decades, that doubles the number of steps. Where products are dear and n is small it is cheaper to
-            # restore it (Paige 1971; Simon 1984). When all places are taken the last one is used again: what is lost
-            # first was known first.
+            # In exact arithmetic rᵢᵀPrⱼ = 0, where P is the preconditioner. Rounding destroys this orthogonality once
+            # an extreme Ritz pair has converged, and the method then finds that eigenvector repeatedly. If eigenvalues
+            # decay over eight decades, this doubles the number of steps. If products are expensive and n is small,
+            # reorthogonalisation is cheaper (Paige 1971; Simon 1984). If the memory is full, the last place is
+            # overwritten, because the pairs that converged first need the early residuals.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
             r = r - matmul(kept[0].T, products_with_columns(kept[1], r))
@@ -121,13 +121,13 @@ def conjugate_gradients(
         else:
             before = direct(before)
             state, regular = advance(before)
-            # The residual, preconditioned, tells the error before a step. That the step reduces it as the one before
-            # did saves the preconditioner, which costs the most, once more than it takes steps.
+            # The preconditioned residual gives the error before this step. The step is assumed to reduce the error by
+            # the same factor as the previous step; this saves one expensive application of the preconditioner.
             reduction = xp.where(before.fresh, 1, xp.sqrt(xp.minimum(xp.abs(before.change), 1)))
             error = relative(before.energy, before.first) * reduction
         errors = xp.where(before.going, xp.where(regular, error, xp.inf), before.errors)
         going = before.going & (regular | state.fresh) & (errors > 1)
-        # The host takes no products of columns that are zero.
+        # On the host, the preconditioner skips zero columns.
         return state._replace(r=xp.where(going, state.r, 0), p=xp.where(going, state.p, 0), errors=errors, going=going)
 
     asked, one, zero = xp.isfinite(wanted), xp.ones_like(wanted), xp.zeros_like(rhs)

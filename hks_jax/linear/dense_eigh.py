@@ -1,6 +1,6 @@
-"""Dense symmetric pencils: all eigenpairs, with derivatives that are finite where eigenvalues are equal.
+"""All eigenpairs of dense symmetric pencils, with derivatives that are finite at multiple eigenvalues.
 
-A pencil becomes a matrix by Cholesky's factorisation.
+A Cholesky factorisation of B reduces a pencil to a standard eigenvalue problem.
 """
 
 from functools import partial
@@ -24,41 +24,42 @@ class DenseEigenpairs(NamedTuple):
     """Eigenpairs of a dense symmetric matrix or pencil: ``values, vectors = hj.eigh(A)``."""
 
     eigenvalues: Float[Array, " n"]
-    """Ascending."""
+    """The eigenvalues in ascending order."""
     eigenvectors: Float[Array, "n n"]
-    """One in each column, orthonormal, or with vᵢᵀBvⱼ = δᵢⱼ."""
+    """The eigenvectors as columns, orthonormal, or with vᵢᵀBvⱼ = δᵢⱼ."""
 
 
 def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> DenseEigenpairs:
     """Compute all eigenpairs of Av = λv, or of Av = λBv, of dense symmetric matrices, differentiably.
 
-    Derivatives, forward and reverse, are never NaN. They are exact, also at multiple eigenvalues, for functions of
-    whole multiplets: sums of f(λ) over all copies, such as tr f(A), and the projectors on eigenspaces. Where an
-    eigenvalue is simple, they are those of its own eigenvalue and eigenvector.
+    First derivatives, forward and reverse, are never NaN. At multiple eigenvalues, derivatives of sums of f(λ) over all
+    equal eigenvalues, such as tr f(A), and of projectors on eigenspaces are exact. At a simple eigenvalue, derivatives
+    of the eigenvalue and the eigenvector are exact.
 
-    The derivative of one eigenvector of a multiple eigenvalue does not exist: here it is that which has no rotation
-    within the eigenspace; and that of one of its eigenvalues is one diagonal entry of VᵀȦV. **From these the derivative
-    of V f(Λ) Vᵀ does not come out at a multiple eigenvalue: use `matrix_function`**, which is exact everywhere. No rule
-    could do it: at A = I the derivative along Ȧ is f'(1) Ȧ, but what Λ̇ and a rotation of V give is diagonal in V.
+    A single eigenvector of a multiple eigenvalue has no derivative. The rule returns an eigenvector derivative without
+    rotation within the eigenspace, and a diagonal entry of VᵀȦV for each of the equal eigenvalues. **At a multiple
+    eigenvalue, the derivative of V f(Λ) Vᵀ through V and Λ is therefore wrong: use `matrix_function`**, which is exact
+    everywhere. No rule for V and Λ could be exact: at A = I the derivative along Ȧ is f'(1) Ȧ, but Λ̇ and a rotation of
+    V give only the diagonal of VᵀȦV.
 
-    Nearly equal eigenvalues have eigenvectors that are accurate to about ε|λ|/gap, and so are their derivatives here.
-    What is computed from a whole cluster loses these digits too, unless `multiplet_tolerance` declares it a multiplet.
+    Eigenvectors of nearly equal eigenvalues, and their derivatives, have errors of about ε|λ|/gap. Derivatives of
+    functions of a whole cluster have the same errors, unless the gaps are below `multiplet_tolerance`.
 
-    Second derivatives are exact where all eigenvalues are simple, and NaN elsewhere.
+    Second derivatives are exact if all eigenvalues are simple, and NaN otherwise.
 
     Args:
-        A: (n, n), symmetric, float32 or float64. Derivatives are those of its symmetric part.
+        A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
         B: (n, n), symmetric positive definite; None: the identity.
-        multiplet_tolerance: eigenvalues nearer to each other than this, relative to the largest magnitude, count as
-            equal in derivatives. None: 4nε, about as much as rounding moves them apart.
+        multiplet_tolerance: eigenvalues count as equal in derivatives if they differ by less than this, relative to the
+            largest |λ|. None is 4nε, about the effect of rounding.
 
     Returns:
         (n,) eigenvalues, ascending, and (n, n) eigenvectors in columns.
 
     Raises:
-        ValueError: entries that are NaN or infinite, complex or of another precision; shapes that are not square or
-            differ; a matrix that is unsymmetric by more than √ε of its largest entry (by how much, and where); B not
-            positive definite. What is traced cannot be looked at: there NaN comes out, and the symmetric part is taken.
+        ValueError: entries are not finite, complex, or of another precision; a matrix is not square, or the shapes
+            differ; a matrix is unsymmetric by more than √ε of its largest entry; B is not positive definite. Traced
+            values are not checked: the result may be NaN, and the symmetric part is used.
     """
     if multiplet_tolerance is not None:
         require_number("multiplet_tolerance", multiplet_tolerance, 1, inclusive=True)
@@ -72,7 +73,7 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
 def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Matrix]:
     """Return the eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors in columns.
 
-    With a tolerance, derivatives are those of `eigh`. Without one they are NaN where eigenvalues are equal.
+    With a tolerance, derivatives are those of `eigh`. Without a tolerance, derivatives are NaN at equal eigenvalues.
     """
     return lapack.eigh(a)
 
@@ -81,10 +82,10 @@ def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Mat
 #
 #     λ̇ᵢ = Gᵢᵢ,    V̇ = VΩ,    Ωᵢⱼ = Gᵢⱼ/(λⱼ − λᵢ) for i ≠ j.
 #
-# Ω is antisymmetric, and what it does between vectors of one eigenspace cancels in the derivative of VₑVₑᵀ, the
-# projector on it: there it may be set to zero. So may it in that of tr f(A) = Σ f(λᵢ), where no vector enters. The
-# derivative of 1/gap, which second derivatives take, is NaN there: a sum like Σᵢ f'(λᵢ) Gᵢᵢ changes with what this rule
-# leaves out.
+# Ω is antisymmetric. In the derivative of VₑVₑᵀ, the projector on an eigenspace, the entries of Ω within the eigenspace
+# cancel, so that the rule may set them to zero. The derivative of tr f(A) = Σ f(λᵢ) does not contain Ω. Second
+# derivatives contain the derivative of 1/gap, which is NaN at equal eigenvalues, because a sum such as Σᵢ f'(λᵢ) Gᵢᵢ
+# depends on the omitted entries.
 @differentiable_eigh.defjvp
 def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
     values, vectors = differentiable_eigh(tolerance, primals[0])
@@ -95,7 +96,7 @@ def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Ar
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse_gaps(tolerance: float | None, values: Values) -> Matrix:
-    """Return 1/(λⱼ − λᵢ), and 0, or without a tolerance NaN, where λᵢ and λⱼ count as equal."""
+    """Return 1/(λⱼ − λᵢ). If λᵢ and λⱼ count as equal, return 0, or NaN without a tolerance (0 on the diagonal)."""
     gap, apart = _gaps(tolerance, values)
     equal = 0 if tolerance is not None else jnp.where(jnp.eye(len(values), dtype=bool), 0, jnp.nan)
     return jnp.where(apart, 1 / jnp.where(apart, gap, 1), equal)
@@ -111,23 +112,24 @@ def _inverse_gaps_jvp(tolerance: float | None, primals: tuple[Array], tangents: 
 
 
 def _gaps(tolerance: float | None, values: Values) -> tuple[Matrix, Bool[Array, "n n"]]:
-    """Return λⱼ − λᵢ in row i and column j, and where it is not zero but for the tolerance."""
+    """Return λⱼ − λᵢ in row i and column j, and whether its magnitude exceeds the tolerance."""
     gap = values[None] - values[:, None]
     return gap, jnp.abs(gap) > (tolerance or 0) * jnp.max(jnp.abs(values))
 
 
 @jax.custom_jvp
 def standard_form(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
-    """Return L⁻¹AL⁻ᵀ and the lower triangular L of B = LLᵀ; NaN where B is not positive definite.
+    """Return L⁻¹AL⁻ᵀ and the lower triangular L with B = LLᵀ; NaN if B is not positive definite.
 
-    Where w is an eigenvector of the first, L⁻ᵀw is one of Av = λBv.
+    If w is an eigenvector of L⁻¹AL⁻ᵀ, then L⁻ᵀw is an eigenvector of Av = λBv.
     """
     factor = lapack.cholesky(b)
     half = lapack.triangular_solve(factor, a)
     return lapack.triangular_solve(factor, half.T), factor
 
 
-# With P lower triangular and L̇ = LP, Ḃ = L̇Lᵀ + LL̇ᵀ says P + Pᵀ = L⁻¹ḂL⁻ᵀ; and Ċ = L⁻¹ȦL⁻ᵀ − PC − CPᵀ of C = L⁻¹AL⁻ᵀ.
+# Let L̇ = LP with P lower triangular. Then Ḃ = L̇Lᵀ + LL̇ᵀ gives P + Pᵀ = L⁻¹ḂL⁻ᵀ. For C = L⁻¹AL⁻ᵀ it follows that
+# Ċ = L⁻¹ȦL⁻ᵀ − PC − CPᵀ.
 @standard_form.defjvp
 def _standard_form_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[tuple, tuple]:
     reduced, factor = standard_form(*primals)
@@ -171,28 +173,28 @@ def pencil_eigh(a: Matrix, b: Matrix, k: int | None = None) -> tuple[Float[Array
 
 
 def checked_standard_form(A: Any, B: Any) -> tuple[Matrix, Matrix | None]:
-    """Return the standard form of the symmetric parts, checked as `hks_jax.eigh` says; without B, A and None."""
+    """Check A and B as `hks_jax.eigh` documents, and return their `standard_form`; without B, return A and None."""
     a = _symmetric("A", A)
     if B is None:
         return a, None
     b = _symmetric("B", B)
     if b.shape != a.shape or b.dtype != a.dtype:
-        raise ValueError(f"B: got {b.dtype}{list(b.shape)}; expected what A is, {a.dtype}{list(a.shape)}")
+        raise ValueError(f"B: got {b.dtype}{list(b.shape)}; expected {a.dtype}{list(a.shape)}, as for A")
     reduced, factor = standard_form(a, b)
     if not is_traced(factor) and not np.isfinite(factor).all():
         least = np.linalg.eigvalsh(np.asarray(b))[0]
         raise ValueError(
-            f"B: its Cholesky factorisation broke down, its least eigenvalue is {least:.3g}; expected a positive "
-            "definite matrix. If it is A that is, exchange them: the eigenvalues become their reciprocals"
+            f"B: got a matrix whose least eigenvalue is {least:.3g}; expected a positive definite matrix. If A is "
+            "positive definite, exchange A and B: the eigenvalues become their reciprocals"
         )
     return (reduced + reduced.T) / 2, factor
 
 
 def _symmetric(name: str, matrix: Any) -> Matrix:
-    """Return the symmetric part of one matrix of a user."""
+    """Check a user's matrix and return its symmetric part."""
     array = real_array(name, matrix)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or array.size == 0:
-        raise ValueError(f"{name}: got shape {array.shape}; expected (n, n), one square matrix: jax.vmap takes several")
+        raise ValueError(f"{name}: got shape {array.shape}; expected (n, n). Use jax.vmap for several matrices")
     if array.dtype not in (jnp.float32, jnp.float64):
         raise ValueError(f"{name}: got dtype {array.dtype}; expected float32 or float64")
     if not is_traced(array):
@@ -201,7 +203,7 @@ def _symmetric(name: str, matrix: Any) -> Matrix:
 
 
 def _require_symmetric(name: str, array: np.ndarray) -> None:
-    """Raise ValueError unless the entries are finite, and symmetric but for noise."""
+    """Raise ValueError unless the matrix is finite, and symmetric up to noise."""
     finite = np.isfinite(array)
     if not finite.all():
         i, j = np.argwhere(~finite)[0]
@@ -212,7 +214,7 @@ def _require_symmetric(name: str, array: np.ndarray) -> None:
     limit = np.sqrt(np.finfo(array.dtype).eps)
     if skew[i, j] > limit * largest:
         raise ValueError(
-            f"{name}: unsymmetric, most of all in row {i}, column {j}: {array[i, j]:.6g} there, and "
-            f"{array[j, i] - array[i, j]:.2g} more in row {j}, column {i}; expected a symmetric matrix, but for "
-            f"{limit:.2g} of its largest entry, {largest:.6g}. Pass ({name} + {name}.T) / 2 if the difference is noise"
+            f"{name}: got {array[i, j]:.6g} in row {i}, column {j}, and {array[j, i] - array[i, j]:.2g} more in row "
+            f"{j}, column {i}; expected a matrix that is symmetric up to {limit:.2g} of its largest entry, "
+            f"{largest:.6g}. Pass ({name} + {name}.T) / 2 if the difference is noise"
         )

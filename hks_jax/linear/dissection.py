@@ -1,8 +1,8 @@
-"""Nested dissection: in which order to eliminate a sparse matrix' rows, and what each elimination touches.
+"""Nested dissection: an elimination order of a sparse matrix's rows, and the structure of its fronts.
 
-A separator leaves two halves of the graph that the matrix does not couple; separators separate the halves, and so on
-down to small cells. Eliminated from the cells up to the first separator, all fronts of a level are independent and
-nearly of one size: padded to the largest, a level is one batch of dense blocks.
+A separator divides the graph into two halves that the matrix does not couple. Further separators divide the halves
+recursively, down to small cells. Elimination goes from the cells up to the first separator. All fronts of a level are
+independent and of nearly equal size; padded to the largest size, they form one batch of dense blocks.
 
 A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10 (1973).
 """
@@ -26,22 +26,22 @@ class Dissection(NamedTuple):
 
     # from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1
     levels: tuple[Level, ...]
-    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' own nodes, concatenated
-    # the matrix entries, as indices into the array of entries; None: all of them, in order
+    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' concatenated own nodes
+    # the indices of the needed matrix entries in the array of entries; None means all entries in order
     entries: Int[np.ndarray, " m"] | None
-    # their places among all levels' blocks (fronts, s + r, s), concatenated: those of an entry's column, unless its row
-    # is eliminated before. Out of range, where all are listed, for those that are not needed: of two that are equal by
-    # symmetry one is enough
+    # the places of these entries in the concatenated blocks (fronts, s + r, s) of all levels. Of two entries equal by
+    # symmetry only one is needed, whose row is not eliminated before its column. If all entries are listed, unneeded
+    # ones have places out of range
     places: Int[np.ndarray, " m"]
-    padding: Int[np.ndarray, " p"]  # the places of the diagonal entries that belong to no node
-    merged: Merged | None  # what solves go along on accelerators; None where it is the tree itself
+    padding: Int[np.ndarray, " p"]  # the places of the diagonal entries of padding nodes
+    merged: Merged | None  # the merged tree for solves on accelerators; None if solves use the tree itself
 
 
 def dissect(pattern: Pattern) -> Dissection:
     """Return the elimination tree of a matrix with this pattern.
 
     Raises:
-        ValueError: more entries in the factors than an index can count.
+        ValueError: the factors have 2³¹ or more entries.
     """
     return _dissect(pattern, accelerators.at_hand())
 
@@ -52,14 +52,14 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     n = pattern.size
     level, front, depth = pattern.bisect()
     own, slot = _own_nodes(level, front, depth)
-    # For each entry, whether its row is eliminated before its column, with it, or after.
+    # Positive if an entry's row is eliminated before its column, zero if with it, negative if after it.
     order_of_ends = level[rows] - level[cols]
     above = np.flatnonzero(order_of_ends > 0)
     boundaries = _boundaries(level, front, depth, rows[above], cols[above])
     ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
-    # One at least, of nothing but padding where no front is coupled to another: the first level has no parent.
+    # The width is at least 1 (only padding if no front is coupled), except on the first level, which has no parent.
     width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
-    # For each boundary node of a level, its front and its place in the parent: among its own nodes, or its boundary.
+    # List each boundary node's front, and the node's place among the own and boundary nodes of the parent.
     placed = [(keys // n, slot[keys % n]) for keys in boundaries]
     for below, (at, place) in enumerate(placed[1:]):
         nodes = boundaries[below + 1] % n
@@ -110,18 +110,18 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
 
 
 def _listed(entries: Ints, places: Ints, number: int, end: int) -> tuple[Ints | None, Ints]:
-    """Return entries and their places, or the places of all: whichever takes less memory; ``end`` is out of range."""
+    """Return needed entries and their places, or the places of all entries if this takes less memory."""
     others = number - entries.size
     if others > entries.size or end + others > np.iinfo(np.int32).max:
         return entries.astype(np.int32), places.astype(np.int32)
     of_all, without = np.empty(number, np.int32), np.ones(number, bool)
     of_all[entries], without[entries] = places, False
-    of_all[without] = np.arange(end, end + others)  # no two are equal, as scattering was told
+    of_all[without] = np.arange(end, end + others)  # distinct places, because the scatter declares its indices unique
     return None, of_all
 
 
 def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], Ints]:
-    """Return for each level the nodes of its fronts, (fronts, s), and the place of every node in its front."""
+    """Return the own nodes (fronts, s) of each level's fronts, and the place of every node in its front."""
     n, own, slot = level.size, [], np.zeros(level.size, np.int32)
     for number in range(depth):
         nodes = np.flatnonzero(level == number)
@@ -134,10 +134,10 @@ def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], 
 
 
 def _boundaries(level: Ints, front: Ints, depth: int, rows: Ints, cols: Ints) -> list[Ints]:
-    """Return for each level the boundary nodes of its fronts as sorted keys front·n + node.
+    """Return each level's boundary nodes as sorted keys front·n + node.
 
-    They are what the front's own nodes are coupled to above it, as rows and columns say, and what it inherits from its
-    children's boundaries.
+    A front's boundary nodes are eliminated later. Such a node is coupled to the front's own nodes by an entry (row,
+    column), or inherited from the boundary of a child.
     """
     n, keys, boundaries = level.size, np.empty(0, int), []
     eliminated, keys_of = level[rows], front[rows] * n + cols

@@ -1,11 +1,11 @@
-"""The levels of an elimination tree, and how to merge them, so that solves on accelerators take fewer steps.
+"""The levels of an elimination tree, and their merging for solves on accelerators.
 
-Fronts of neighbouring levels that belong together become one, with an explicit inverse. That reads more from memory,
-and launches less: of all ways to divide the levels into groups the one is taken that costs least. Only what solves
-multiply with is merged; the factorisation, and with it the inertia, goes level by level.
+A front and its descendants on the following levels merge into one front with an explicit inverse. Merging increases
+memory traffic but reduces kernel launches; the groups of levels are chosen for the least total cost. Merging affects
+only the matrices of solves. The factorisation, and hence the inertia, proceeds level by level.
 
-Few explicit inverses in place of many substitutions: F. L. Alvarado, A. Pothen and R. Schreiber, Highly parallel sparse
-triangular solution, in Graph Theory and Sparse Matrix Computation (Springer 1993).
+The method replaces many substitutions by few explicit inverses: F. L. Alvarado, A. Pothen and R. Schreiber, Highly
+parallel sparse triangular solution, in Graph Theory and Sparse Matrix Computation (Springer 1993).
 """
 
 from typing import NamedTuple
@@ -16,45 +16,45 @@ from jaxtyping import Int
 from hks_jax.linear.bisection import within_groups
 
 _TRAFFIC = 20e6
-"""Bytes that memory moves in the time of a launch: 4 µs at 4.8 TB/s."""
+"""The memory traffic in bytes during one launch: 4 µs at 4.8 TB/s."""
 _LAUNCHES = 4
-"""Launches of a level in a solve: a gather and a product, upwards and downwards."""
+"""The number of launches per level in a solve: a gather and a product, both upwards and downwards."""
 _BYTES = 8
-"""Of a number."""
+"""The size of a number."""
 _ALIGNED = 64
-"""Of how many nodes large fronts have a multiple: of others XLA would copy the matrices, with zeros around them."""
+"""Large fronts have a multiple of this number of nodes; otherwise XLA would copy their matrices to pad them."""
 
 
 class Level(NamedTuple):
     """The fronts of one level: each eliminates its own s nodes, and is coupled to r boundary nodes eliminated later.
 
-    Where a front has fewer, indices are padded with the first number that is out of range.
+    In smaller fronts, indices are padded with the first number that is out of range.
     """
 
-    own: Int[np.ndarray, "fronts s"]  # the degrees of freedom eliminated
+    own: Int[np.ndarray, "fronts s"]  # the eliminated degrees of freedom
     # the places of the boundary nodes among the (fronts, s + r) nodes of the level above
     boundary: Int[np.ndarray, "fronts r"]
-    # the places of the front's nodes among the (fronts, r) boundary nodes of the level below, as often as nodes have
-    # such places: in an elimination tree those of the first child, and those of the second. Empty for cells
+    # the places of the front's nodes among the (fronts, r) boundary nodes of the level below. A node has up to c such
+    # places; in an elimination tree, one for each child. Empty for cells
     children: Int[np.ndarray, "c fronts s_plus_r"]
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(fronts, s + r, s): that of the blocks which hold the columns of the own nodes."""
+        """The shape (fronts, s + r, s) of the blocks with the columns of the own nodes."""
         fronts, s = self.own.shape
         return fronts, s + self.boundary.shape[1], s
 
 
 class Merged(NamedTuple):
-    """What solves go along in place of the elimination tree."""
+    """The merged tree, which solves use instead of the elimination tree."""
 
     levels: tuple[Level, ...]  # the merged levels
-    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' own nodes, concatenated
-    # for each merged level, and each level of the tree merged in it, where its own nodes (fronts, s) are among those of
-    # the merged level; out of range for padding
+    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' concatenated own nodes
+    # for each merged level and each tree level merged in it: the places of the tree level's own nodes (fronts, s)
+    # among those of the merged level; out of range for padding
     rows: tuple[tuple[Int[np.ndarray, "_fronts _s"], ...], ...]
-    # for each merged level, where its own nodes (fronts, s) are among those of its levels of the tree, concatenated;
-    # out of range for padding
+    # for each merged level: the places of its own nodes (fronts, s) among the concatenated own nodes of its tree
+    # levels; out of range for padding
     places: tuple[Int[np.ndarray, "_fronts _s"], ...]
 
 
@@ -86,7 +86,7 @@ def merged(levels: tuple[Level, ...], n: int) -> Merged:
 
 
 def divided(levels: tuple[Level, ...], n: int) -> list[tuple[int, int]]:
-    """Return the first and the end of each group of levels, such that solves cost least."""
+    """Return the first level and the end of each group of levels, for the least cost of solves."""
     depth = len(levels)
     counts = [np.sum(level.own < n, axis=1) for level in levels]
     best: list[tuple[float, int]] = [(0.0, depth)] * (depth + 1)
@@ -107,7 +107,7 @@ def divided(levels: tuple[Level, ...], n: int) -> list[tuple[int, int]]:
 
 
 def _own_nodes(levels: tuple[Level, ...], n: int) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
-    """Return the own nodes of the merged fronts, and what `Merged` has of a level as ``rows`` and ``places``."""
+    """Return the own nodes of the merged fronts, and the ``rows`` and ``places`` of `Merged` for one level."""
     fronts = len(levels[0].own)
     sizes = np.array([level.own.size for level in levels])
     start = np.cumsum(sizes) - sizes
@@ -129,7 +129,7 @@ def _own_nodes(levels: tuple[Level, ...], n: int) -> tuple[np.ndarray, tuple[np.
 
 
 def _boundary_nodes(levels: tuple[Level, ...], n: int) -> list[np.ndarray]:
-    """Return the degrees of freedom at the boundary of each level's fronts, n for padding."""
+    """Return the degrees of freedom at the boundary of each level's fronts, padded with n."""
     nodes, result = np.empty(0, int), []
     for level in levels:
         boundary = np.append(nodes, n)[np.minimum(level.boundary, nodes.size)]
@@ -139,7 +139,7 @@ def _boundary_nodes(levels: tuple[Level, ...], n: int) -> list[np.ndarray]:
 
 
 def _find(nodes: np.ndarray, front: np.ndarray, node: np.ndarray, n: int) -> np.ndarray:
-    """Return where among the nodes (fronts, m) each of several is, given its front."""
+    """Return the flat places of given nodes of given fronts in an array of nodes (fronts, m)."""
     keys = (np.arange(len(nodes))[:, None] * (n + 1) + nodes).ravel()
     ascending = np.argsort(keys, kind="stable")
     return ascending[np.searchsorted(keys, front * (n + 1) + node, sorter=ascending)]

@@ -1,4 +1,4 @@
-"""A factorised symmetric matrix, whose solves, determinant and inverse are differentiable by its entries."""
+"""A factorised symmetric matrix. Solves, determinant and inverse are differentiable with respect to its entries."""
 
 import math
 from collections.abc import Callable
@@ -22,25 +22,25 @@ from hks_jax.linear.symmetric_inverse import symmetric_inverses
 from hks_jax.traced import is_traced
 
 _PROBES = 4
-"""Random right-hand sides to try a factorisation out."""
+"""The number of random right-hand sides that test a factorisation."""
 _LEAST_PIVOT = 0.375
-"""The least pivot with which a factorisation is tried again, as a power of ε."""
+"""The exponent of ε in the least pivot of a second factorisation."""
 _DOUBTFUL = 0.01
-"""The error of determinants and inverses from which on a warning says so."""
+"""The least error of determinants and inverses that causes a warning."""
 _BACKWARD = 4
-"""The backward error from which on solutions are not refined, in units of rounding."""
+"""The backward error, in units of ε, at which refinement of solutions stops."""
 _NULL = 1000
-"""The eigenvalues that count as zero in an error, in units of rounding of the matrix' norm."""
+"""The largest singular value that an error message counts as zero, in units of ε‖A‖."""
 _SEARCHED, _TURNS = 16, 4
-"""How many null vectors are looked for, and in how many steps."""
+"""The number of null vectors that an error message searches for, and the number of iterations."""
 
 
 Fields = tuple[tuple[Array, ...], tuple[Array, ...], Array]
-"""Those of a factorisation without its dissection: what a compiled function hands through is copied."""
+"""The arrays of a factorisation without its dissection, because XLA would copy arguments that are returned."""
 
 
 class Inertia(NamedTuple):
-    """How many eigenvalues are negative, and positive; −1 where that is uncertain."""
+    """The numbers of negative and of positive eigenvalues; −1 if they are uncertain."""
 
     negative: Int[Array, "..."]
     positive: Int[Array, "..."]
@@ -50,13 +50,13 @@ class FactorisedMatrix(eqx.Module):
     """A symmetric matrix A = LDLᵀ, factorised once; a pytree. See `hks_jax.factorise`.
 
     Attributes:
-        matrix: A, by whose entries results are differentiable, any number of times, forward and reverse.
-        factor: LDLᵀ; constant to derivatives.
-        sound: whether the factorisation was found, on random right-hand sides, to be that of A: its inertia is then
-            that of A, and iterative refinement converges. Results are NaN where it is not.
-        error: an estimate of ‖I − AF⁻¹‖ in Frobenius' norm, F being what LDLᵀ is by rounding: the error of log|det A|,
-            and the relative one of A⁻¹. Infinite where pivots were replaced; these two are then NaN. Solutions are
-            refined, and do not have it.
+        matrix: A. Derivatives of any order with respect to its entries exist, forward and reverse.
+        factor: LDLᵀ. Derivatives treat the factorisation as a constant.
+        sound: whether a test with random right-hand sides shows that the factorisation is accurate enough. Then its
+            inertia is that of A, and iterative refinement converges. Otherwise results are NaN.
+        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. This is about the error of
+            log|det A| and the relative error of A⁻¹. The estimate is infinite if pivots were replaced; then log|det A|
+            and A⁻¹ are NaN. Solutions are refined, and more accurate.
     """
 
     matrix: PatternedOperator
@@ -74,21 +74,21 @@ class FactorisedMatrix(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """How many eigenvalues of A are negative, and positive: of K − σM, those of the pencil below and above σ."""
+        """The numbers of negative and positive eigenvalues of A; for A = K − σM, of the pencil's below and above σ."""
         negative = self.factor.negative
         counts = negative, jnp.asarray(self.size, negative.dtype) - negative
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
 
     @property
     def sign(self) -> Float[Array, ""]:
-        """The sign of the determinant, ±1; NaN where it is uncertain."""
+        """The sign of the determinant, ±1; NaN if it is uncertain."""
         return _nan_unless(self.sound, (1 - 2 * (self.factor.negative % 2)).astype(self.matrix.dtype))
 
     def solve(self, b: Float[Array | np.ndarray, "n *m"]) -> Float[Array, "n *m"]:
-        """Solve A x = b for a vector (n,), or the columns of a block (n, m), to a backward error of rounding.
+        """Solve A x = b for a vector (n,) or the columns of a block (n, m), with a backward error at rounding level.
 
         Raises:
-            ValueError: b of another shape, or complex.
+            ValueError: b has another shape, or is complex.
         """
         b = real_array("b", b).astype(self.matrix.dtype)
         if b.ndim not in (1, 2) or b.shape[0] != self.size:
@@ -100,21 +100,21 @@ class FactorisedMatrix(eqx.Module):
         """Return log|det A|; `sign` has the sign.
 
         Raises:
-            ValueError: concrete values of which pivots were replaced.
+            ValueError: pivots were replaced, and values are concrete.
 
         Warns:
-            AccuracyWarning: an `error` above 0.01.
+            AccuracyWarning: `error` exceeds 0.01.
         """
         return self._unless_replaced(_log_determinant)
 
     def inverse_diagonal(self) -> Float[Array, " n"]:
-        """Return the diagonal of A⁻¹, by selected inversion: in about the time of the factorisation.
+        """Return the diagonal of A⁻¹ by selected inversion, which takes about as long as the factorisation.
 
         Raises:
-            ValueError: concrete values of which pivots were replaced.
+            ValueError: pivots were replaced, and values are concrete.
 
         Warns:
-            AccuracyWarning: an `error` above 0.01.
+            AccuracyWarning: `error` exceeds 0.01.
         """
         return self._unless_replaced(_inverse_diagonal)
 
@@ -122,27 +122,27 @@ class FactorisedMatrix(eqx.Module):
         if not is_traced(self.error) and self.sound:
             if jnp.isinf(self.error):
                 raise ValueError(
-                    "matrix: A is regular, but a block of it, from which the elimination begins, is singular or nearly "
-                    "so; that leaves solutions accurate, but not the determinant and the inverse. Shift A a little"
+                    "matrix: got a regular A, but the elimination begins at a block of A that is singular or nearly "
+                    "so. Solutions are accurate, but the determinant and the inverse are not. Shift A slightly"
                 )
             if self.error > _DOUBTFUL:
                 warn_of_accuracy(
-                    f"matrix: rounding in {self.matrix.dtype} leaves an error of about {float(self.error):.1g} in "
-                    "log|det A|, and relative in the inverse. Use float64, or shift A a little"
+                    f"matrix: rounding in {self.matrix.dtype} causes an error of about {float(self.error):.1g} in "
+                    "log|det A|, and as large a relative error in the inverse. Use float64, or shift A slightly"
                 )
         return _nan_unless(jnp.isfinite(self.error), function(self.matrix.flat(), jax.lax.stop_gradient(self.factor)))
 
 
 def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return x, or NaN, of which derivatives are NaN, too: those of a choice would be zero."""
+    """Return x, or NaN. The product also makes derivatives NaN, where `jnp.where` would make them zero."""
     return x * jnp.where(known, 1.0, jnp.nan).astype(x.dtype)
 
 
 def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMatrix:
-    """Factorise a symmetric matrix A, of which only the lower or upper of two entries equal by symmetry is read.
+    """Factorise a symmetric matrix A. Only one of each pair of entries equal by symmetry is read.
 
     Raises:
-        ValueError: A, concrete, is not finite or singular, with its null vectors; by the name given.
+        ValueError: A is concrete, and not finite or singular. The message begins with the given name.
     """
     ones = jnp.ones(matrix.size, matrix.dtype)
     pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))
@@ -151,7 +151,7 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
     factor, trial, tries = certain_factorisation(dissection, known, jnp.zeros((), matrix.dtype))
     if not is_traced(trial) and not trial.sound:
         raise ValueError(_failure(name, known, factor))
-    # A random vector is as long in the image of a matrix as the matrix in Frobenius' norm, over √n.
+    # For a random unit vector v, ‖Ev‖ is about the Frobenius norm of E divided by √n.
     error = jnp.where(trial.sound & (tries == 1), trial.rate * math.sqrt(matrix.size), jnp.inf)
     return FactorisedMatrix(pencil.stiffness, factor, trial.sound, error)
 
@@ -159,7 +159,7 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
 def certain_factorisation(
     dissection: Dissection, pencil: SymmetricPencil, shift: Float[Array, ""]
 ) -> tuple[Factorisation, Trial, Int[Array, ""]]:
-    """Factorise K − σM, if need be once more with small pivots replaced; return what it is good for, and the tries."""
+    """Factorise K − σM, if necessary again with small pivots replaced; also return the `Trial`, and the tries."""
     probes = jax.random.normal(jax.random.key(0), (pencil.size, _PROBES), shift.dtype)
     bounded, matrix = float(jnp.finfo(shift.dtype).eps) ** _LEAST_PIVOT, pencil.shifted(shift)
 
@@ -170,7 +170,7 @@ def certain_factorisation(
 
     none = jnp.zeros((), int)
     if is_traced((pencil, shift, none)):
-        # A loop, so that the factorisation is compiled once.
+        # A loop compiles the factorisation only once.
         start = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(attempt, none))
         tries, (fields, trial) = jax.lax.while_loop(
             lambda s: (s[0] < 2) & ~s[1][1].sound, lambda s: (s[0] + 1, attempt(s[0])), (none, start)
@@ -183,12 +183,12 @@ def certain_factorisation(
 
 
 def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
-    """Say why a matrix could not be factorised, given the factorisation with small pivots replaced."""
+    """Return the reason why a matrix could not be factorised, given the factorisation with small pivots replaced."""
     entries = np.asarray(pencil.stiffness.triplets()[0])
     wrong = int((~np.isfinite(entries)).sum())
     if wrong:
-        return f"{name}: {wrong} of {entries.size} entries are NaN or infinite"
-    # x − F⁻¹Ax keeps null vectors, and takes all else away but for what F differs from A.
+        return f"{name}: {wrong} of {entries.size} entries are NaN or infinite; expected finite numbers"
+    # x ↦ x − F⁻¹Ax preserves null vectors of A, and reduces other vectors to the relative error of F.
     product, norm = pencil.stiffness.of_columns(), max(float(_norm(pencil.stiffness)), np.finfo(entries.dtype).tiny)
     size = min(_SEARCHED, pencil.size)
     x = np.random.default_rng(0).standard_normal((pencil.size, size)).astype(entries.dtype)
@@ -198,25 +198,25 @@ def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
     null = sizes <= _NULL * np.finfo(entries.dtype).eps
     if not null.any():
         return (
-            f"{name}: singular within rounding of {entries.dtype}, ‖Av‖ ≤ {sizes.min():.1e} ‖A‖ ‖v‖ for some v, or of "
-            "a form that an elimination without pivoting cannot take. Shift it, scale rows and columns, or use float64"
+            f"{name}: got a matrix that is singular within rounding of {entries.dtype} (‖Av‖ ≤ {sizes.min():.1e} "
+            "‖A‖ ‖v‖ for some v), or needs pivoting. Shift it, scale rows and columns, or use float64"
         )
     many = f"{'at least ' if null.all() and size < pencil.size else ''}{null.sum()}"
     return (
-        f"{name}: singular: {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. "
-        "Shift it, fix as many unknowns, or add a term that is definite on them"
+        f"{name}: got a singular matrix with {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. "
+        "Shift it, fix as many unknowns, or add a term that is definite on the null space"
     )
 
 
 @jax.jit
 def _norm(matrix: PatternedOperator) -> Float[Array, ""]:
-    """Return the largest sum of a row's moduli."""
+    """Return the maximum norm, the largest row sum of absolute values."""
     ones = jnp.ones((matrix.size, 1), matrix.dtype)
     return jnp.max(matrix.with_flat(jnp.abs(matrix.flat())).of_columns()(ones))
 
 
-# A dx = db − dA x. JAX has the derivatives of a linear solve, any number of times and in both modes, from the product
-# with A alone; how it is solved is a constant to them.
+# A dx = db − dA x. JAX derives all derivatives of a linear solve from the product with A. The solution method does not
+# enter these derivatives.
 @jax.jit
 def _solve(matrix: PatternedOperator, factor: Factorisation, b: Float[Array, "n m"]) -> Float[Array, "n m"]:
     product, norm = matrix.of_columns(), jax.lax.stop_gradient(_norm(matrix))
@@ -226,7 +226,7 @@ def _solve(matrix: PatternedOperator, factor: Factorisation, b: Float[Array, "n 
 def _refined(
     factor: Factorisation, norm: Float[Array, ""], product: OfColumns, b: Float[Array, "n m"]
 ) -> Float[Array, "n m"]:
-    """Solve, and solve again for what is left of b, as long as that at least halves the largest backward error."""
+    """Solve with iterative refinement, as long as a step at least halves the largest backward error."""
     finfo = jnp.finfo(b.dtype)
 
     def largest(x: Array) -> Float[Array, " m"]:
@@ -249,7 +249,7 @@ def _refined(
 
 
 def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated:
-    """Return (A⁻¹, BA⁻¹) of the elimination tree; where solves go along another one it is eliminated once more."""
+    """Return (A⁻¹, BA⁻¹) of the elimination tree; if solves use a merged tree, eliminate the matrix again."""
     tree = factor.dissection
     if tree.merged is not None:
         return eliminate(tree, matrix, lambda blocks, _: symmetric_inverses(blocks)[0])
@@ -257,8 +257,8 @@ def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated
     return [(both[:, :s], both[:, s:]) for s, both in zip(sizes, factor.downward, strict=True)]
 
 
-# d(A⁻¹) = −A⁻¹ dA A⁻¹, at some places: the derivative of the elimination itself and of the recurrence from the first
-# separator to the cells. Transposed, it takes a few times as many operations as these. The factors have the values.
+# d(A⁻¹) = −A⁻¹ dA A⁻¹ is needed at some places. The rule differentiates the elimination and the recurrence from the
+# first separator to the cells. The transpose takes a few times as many operations. Values use the factors.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
     return selected(factor.dissection, _eliminated(matrix, factor), diagonal)
@@ -279,8 +279,8 @@ def _log_of_pivots(matrix: Float[Array, " m"], factor: Factorisation) -> Float[A
     return jnp.sum(jnp.log(jnp.abs(factor.pivots)))
 
 
-# d log|det A| = tr(A⁻¹ dA) = Σ (A⁻¹)ᵢⱼ dAᵢⱼ: the inverse is needed where A has entries. Those of a front's own block
-# are all listed; of its coupling to the boundary and the transpose one of two, which counts twice.
+# d log|det A| = tr(A⁻¹ dA) = Σ (A⁻¹)ᵢⱼ dAᵢⱼ needs the inverse where A has entries. All entries of a front's own block
+# are listed. Of the coupling to its boundary and the transpose only one is listed, which counts twice.
 @_log_of_pivots.defjvp
 def _log_of_pivots_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (matrix, factor), (change, _) = primals, tangents

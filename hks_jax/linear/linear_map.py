@@ -1,6 +1,6 @@
-"""What rules of derivatives are made of: linear maps with rules of their own, for second derivatives in any order.
+"""Building blocks of derivative rules: linear maps with custom rules, which allow second derivatives in any order.
 
-And guards where differentiating a rule once more would give wrong numbers.
+Guards raise an error where differentiating a rule again would give wrong numbers.
 """
 
 from collections.abc import Callable
@@ -11,28 +11,27 @@ import jax
 import jax.numpy as jnp
 
 LinearMap = Callable[[Any, Any, Any], Any]
-"""f(at, constants, x), linear in x; all are pytrees of arrays."""
+"""f(at, constants, x), linear in x; all arguments are pytrees of arrays."""
 Derivative = Callable[[Any, Any, Any, Any], Any]
 """f(at, change of at, constants, x), bilinear in the change and in x."""
 Tree = TypeVar("Tree")
 
 
-# In reverse mode JAX replaces a function that has a custom rule by its body, as soon as the function is linear in an
-# unknown tangent; an outer derivative then differentiates that body. A linear solve is left as it is. With F x = y
-# and its transpose, the system
+# In reverse mode, JAX replaces a function with a custom rule by its body if the function is linear in an unknown
+# tangent. An outer derivative then differentiates that body. However, JAX does not replace a linear solve. The system
 #
 #     ⎡ 0   I ⎤ ⎡u⎤   ⎡b⎤             ⎡ 0   F ⎤
 #     ⎣ I  −S ⎦ ⎣v⎦ = ⎣c⎦,        S = ⎣ Fᵀ  0 ⎦,
 #
-# is symmetric, and its solution is v = b, u = c + S b: F x stands in u for b = (0, x) and c = 0. JAX differentiates
-# the system, which is S, and that has a rule. As S is symmetric, reverse mode solves the same system.
+# is symmetric, and its solution is v = b, u = c + S b. For b = (0, x) and c = 0, u contains F x. JAX differentiates the
+# system, that is, S, which has a custom rule. Since S is symmetric, reverse mode solves the same system.
 def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: Any, x: Any) -> Any:
     """Return ``function(at, constants, x)``, whose derivative with respect to ``at`` is ``derivative``, in any mode.
 
-    Derivatives with respect to the constants are taken to be zero.
+    Derivatives with respect to the constants are zero.
     """
 
-    x = jax.tree.map(jnp.asarray, x)  # tangents of users may be numbers
+    x = jax.tree.map(jnp.asarray, x)  # a user's tangents may be Python numbers
     like = jax.tree.map(jnp.zeros_like, x)
     forward = partial(_forward, function, derivative, at, constants)
     return with_transpose(forward, partial(_backward, function, derivative, at, constants, like), x, at)
@@ -41,11 +40,11 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
 def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any], x: Any, at: Any = ()) -> Any:
     """Return y = ``forward(x)``, linear in x, whose transpose is ``backward``; JAX itself transposes neither.
 
-    Both x and y are pytrees of floating point arrays. By other arguments of the two, ``at``, they are differentiated in
-    rules of their own.
+    Both x and y are pytrees of floating point arrays. ``at`` contains further variables of the two functions, whose
+    derivatives have custom rules.
     """
 
-    # JAX transposes a solve all of whose right-hand side depends on what is linearised: x, or `at`.
+    # JAX transposes a solve only if its whole right-hand side depends on the linearised variables, x or `at`.
     def zeros(like: Any, tree: Any) -> Any:
         empty = [jnp.ravel(leaf)[:0].astype(float) for leaf in jax.tree.leaves(tree)]
         nothing = jnp.sum(jnp.concatenate([jnp.zeros(0), *empty]))
@@ -65,7 +64,7 @@ def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any]
     y = zeros(jax.eval_shape(forward, x), x)
     right = (y, jax.tree.map(jnp.add, x, zeros(x, x))), (y, zeros(x, x))
     (result, rest), others = jax.lax.custom_linear_solve(system, right, solve, symmetric=True)
-    # JAX differentiates a transposed solve all of whose right-hand side, the cotangents, depends on something.
+    # JAX differentiates a transposed solve only if its whole right-hand side, the cotangents, depends on variables.
     return jax.tree.map(jnp.add, result, zeros(result, (rest, others)))
 
 
@@ -83,7 +82,7 @@ def _forward_jvp(function: LinearMap, derivative: Derivative, primals: tuple, ta
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _backward(function: LinearMap, derivative: Derivative, at: Any, constants: Any, like: Any, y: Any) -> Any:
-    """Return the transpose applied to y; ``like`` is of the form of x."""
+    """Return the transpose applied to y; ``like`` has the structure of x."""
     return jax.linear_transpose(partial(function, at, constants), like)(y)[0]
 
 
@@ -109,17 +108,17 @@ def _refuse(message: str, primals: tuple, tangents: tuple) -> NoReturn:
 
 _MESSAGE = (
     "second derivatives of eigenpairs and of their signatures with respect to the tensors, the vertices or the "
-    "pencil are not implemented. First derivatives are, and their derivatives with respect to times and other "
-    "parameters of the filter (in the other order, with jax.jvp for the inner one). For a Hessian use Gauss-Newton "
-    "products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
+    "pencil are not implemented. First derivatives are implemented, and so are their derivatives with respect to "
+    "times and other filter parameters (in the other order, use jax.jvp for the inner derivative). For a Hessian use "
+    "Gauss-Newton products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
 )
 
 
 def first_order_only(tree: Tree) -> Tree:
     """Return ``tree`` unchanged; differentiating it raises NotImplementedError.
 
-    The rules for eigenpairs and spectral functions hold at eigenpairs. Along a path their ingredients would have to
-    rotate within multiple eigenvalues in a way that first derivatives do not know, so that differentiating the rules
-    gives wrong numbers there. An error is better.
+    The rules for eigenpairs and spectral functions are valid only at eigenpairs. First derivatives do not determine how
+    eigenvectors of a multiple eigenvalue rotate along a path. So differentiating the rules would give wrong numbers,
+    and an error is raised instead.
     """
     return not_differentiable(_MESSAGE, tree)

@@ -1,6 +1,6 @@
-"""Loops that are written once: Python's where values are concrete, and can then be interrupted; XLA's where traced.
+"""Loops that run in Python for concrete values, where they can be interrupted, and in XLA for traced values.
 
-Batches of problems are loops, too: one after another where a device gains nothing from taking them together.
+On CPUs, a batch of problems is also a loop, because solving them together is not faster.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ State = TypeVar("State")
 
 
 def while_loop(going_on: Callable[[State], Any], step: Callable[[State], State], state: State) -> State:
-    """Return what the steps make of a state; `jax.lax.while_loop` where any of it is traced."""
+    """Apply steps to a state while a condition holds; by `jax.lax.while_loop` if the state is traced."""
     if is_traced(state):
         return jax.lax.while_loop(going_on, step, state)
     while going_on(state):
@@ -26,7 +26,7 @@ def while_loop(going_on: Callable[[State], Any], step: Callable[[State], State],
 
 
 def for_each(count: int, step: Callable[[Any, State], State], state: State) -> State:
-    """Return what steps, given their numbers, make of a state; `jax.lax.fori_loop` where any of it is traced."""
+    """Apply ``step(i, state)`` for i = 0, …, count − 1; by `jax.lax.fori_loop` if the state is traced."""
     if is_traced(state):
         return jax.lax.fori_loop(0, count, step, state)
     for number in range(count):
@@ -35,26 +35,26 @@ def for_each(count: int, step: Callable[[Any, State], State], state: State) -> S
 
 
 def when(condition: Any, function: Callable[[State], State], state: State) -> State:
-    """Return ``function(state)`` if the condition holds, and else the state; `jax.lax.cond` where it is traced."""
+    """Return ``function(state)`` if the condition holds, otherwise the state; by `jax.lax.cond` if it is traced."""
     if is_traced(condition):
         return jax.lax.cond(condition, function, lambda state: state, state)
     return function(state) if condition else state
 
 
-# Of a batch taken together, every loop runs until its last problem is done, both branches of a condition are computed,
-# and the factorisations no longer fit into a CPU's cache: that took three times as long as one after another. One
-# problem alone leaves most of an accelerator idle, though.
+# In a vectorised batch, every loop runs until its last problem has finished, both branches of conditions are computed,
+# and the factorisations exceed a CPU's cache. This took three times as long as solving the problems in sequence. On an
+# accelerator, however, a single problem leaves most of the device idle.
 def one_by_one(function: Callable[..., Any], settings: tuple[Hashable, ...], *args: Any) -> Any:
-    """Return function(*settings, *args), mapped over the problems of a batch one by one where `vmap` runs on a CPU.
+    """Return function(*settings, *args). Under `vmap` on a CPU, the problems of a batch run in sequence.
 
-    Not differentiable; derivative rules may call it. The function is traceable and the same object in every call, so
-    that it is compiled once; settings are static.
+    The result is not differentiable, but derivative rules may call this. The function must be traceable, and the same
+    object in every call, so that it is compiled once. Settings are static.
     """
     if not is_traced(args):
-        # Of a derivative taken plainly, JAX would compile the known part anew.
+        # Otherwise, JAX would compile the primal part of a derivative again outside `jit`.
         with contextlib.nullcontext() if is_staged() else jax.core.eval_context():
             return function(*settings, *args)
-    # `custom_vmap` takes no static arguments, and so each call has a rule of its own; what it runs is compiled once.
+    # `custom_vmap` supports no static arguments, so that each call defines a rule; its body is compiled only once.
     problem = jax.custom_batching.custom_vmap(partial(function, *settings))
 
     @problem.def_vmap
@@ -74,14 +74,14 @@ def _batch(
     batched: tuple[bool, ...],
     *leaves: jax.Array,
 ) -> Any:
-    """Return the results for a batch, of whose leaves some are the same for all problems."""
+    """Return the results of a batch. Leaves that are not ``batched`` are common to all problems."""
 
     def problem(call: Callable[..., Any], own: list[jax.Array]) -> Any:
         remaining = iter(own)
         whole = [next(remaining) if of_batch else leaf for of_batch, leaf in zip(batched, leaves, strict=True)]
         return call(*jax.tree.unflatten(structure, whole))
 
-    # A batch of batches comes one by one, too.
+    # Nested batches also run in sequence.
     alone = partial(problem, partial(one_by_one, function, settings))
     together = jax.vmap(partial(problem, partial(function, *settings)))
     own = [leaf for of_batch, leaf in zip(batched, leaves, strict=True) if of_batch]

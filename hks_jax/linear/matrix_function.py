@@ -17,35 +17,35 @@ from hks_jax.signatures.filters import divided_difference, second_divided_differ
 
 Matrix = Float[Array, "n n"]
 Function = Callable[[Any, Any, Array], Array]
-"""f(parameters, others, x): parameters is a pytree of real arrays, others one of others; elementwise in x."""
+"""f(parameters, others, x), elementwise in x. ``parameters`` is a pytree of real arrays, ``others`` of other arrays."""
 
 
 def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:
     """Compute f(A) = V f(Λ) Vᵀ of a dense symmetric matrix A = VΛVᵀ, differentiably.
 
-    With B it is V f(Λ) Vᵀ = f(B⁻¹A) B⁻¹ of the pencil: AV = BVΛ and VᵀBV = I. So f(λ) = 1 gives B⁻¹, f(λ) = 1/λ gives
-    A⁻¹, f(λ) = e^(−tλ) the heat kernel.
+    With B, the result is V f(Λ) Vᵀ = f(B⁻¹A) B⁻¹, where AV = BVΛ and VᵀBV = I. For example, f(λ) = 1 gives B⁻¹,
+    f(λ) = 1/λ gives A⁻¹, and f(λ) = e^(−tλ) gives the heat kernel.
 
-    First and second derivatives with respect to A, B and what f closes over, forward and reverse in any order, are
-    exact where eigenvalues are equal, and accurate where they are close: nothing is divided by a small difference.
-    `jax.vmap` over parameters of f computes eigenpairs once. Third derivatives raise an error.
+    First and second derivatives exist with respect to A, B and the arrays in the closure of f, forward and reverse in
+    any order. These derivatives are exact at equal eigenvalues, and accurate at nearly equal ones, because no division
+    by a small gap occurs. `jax.vmap` over parameters of f computes eigenpairs once. Third derivatives raise an error.
 
-    Time is O(n³), most of it that of the eigenpairs, and memory O(n²); a gradient takes about as much again. Second
-    derivatives are for small matrices: they evaluate f'' 89 times for each of n³ triples of eigenvalues.
+    The function takes O(n³) time, mainly for the eigenpairs, and O(n²) memory; a gradient takes about as much again.
+    Second derivatives evaluate f'' 89 times for each of n³ triples of eigenvalues, and so are for small matrices.
 
     Args:
-        A: (n, n), symmetric, float32 or float64. Derivatives are those with respect to its symmetric part.
-        f: maps one eigenvalue, a scalar, to a real scalar, in JAX's operations. It is evaluated between the eigenvalues
-            too. First derivatives take f', second ones f''; f need not be smooth where there is no eigenvalue, so that
-            ``lambda x: x < c`` gives the projector on the eigenvectors below c.
+        A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
+        f: a function of JAX operations that maps one eigenvalue, a scalar, to a real scalar. It is also evaluated
+            between eigenvalues. First derivatives use f', second derivatives f''. Between eigenvalues, f need not be
+            smooth; so ``lambda x: x < c`` gives the projector on the eigenvectors with λ < c.
         B: (n, n), symmetric positive definite; None: the identity.
 
     Returns:
-        (n, n), symmetric. NaN where f is, such as the logarithm of a negative eigenvalue.
+        The symmetric matrix f(A), (n, n). The matrix is NaN if f is NaN, as for the logarithm of a negative eigenvalue.
 
     Raises:
-        ValueError: f does not return a real scalar; what `eigh` raises.
-        NotImplementedError: third derivatives.
+        ValueError: f does not return a real scalar; `eigh` refuses A or B.
+        NotImplementedError: a third derivative is requested.
     """
     a, factor = checked_standard_form(A, B)
     elementwise, parameters, others = _with_parameters(f, a)
@@ -57,14 +57,14 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
 
 
 def _with_parameters(f: Callable[[Array], Any], like: Matrix) -> tuple[Function, Any, Any]:
-    """Return f as a function of the real numbers that it closes over, of other arrays, and of x, elementwise in x."""
-    one = jax.eval_shape(lambda a: a[0, 0], like)  # and not its shape alone: a shard_map marks what is its own
+    """Return f as a `Function` of the real arrays in its closure, of other arrays, and of x."""
+    one = jax.eval_shape(lambda a: a[0, 0], like)  # keeps the sharding type inside `shard_map`
     out = jax.eval_shape(f, one)
     if not hasattr(out, "shape") or out.shape != () or jnp.issubdtype(out.dtype, jnp.complexfloating):
         got = f"{out.dtype}{list(out.shape)}" if hasattr(out, "shape") else f"{out}"
         raise ValueError(
-            f"f: returned {got} for one eigenvalue; expected a real scalar. For several functions at once use jax.vmap "
-            "over their parameters"
+            f"f: returned {got} for one eigenvalue; expected a real scalar. For several functions use jax.vmap over "
+            "their parameters"
         )
     closed = jax.make_jaxpr(lambda x: jnp.asarray(f(x)).astype(like.dtype))(one)
     parameters, others = eqx.partition([jnp.asarray(const) for const in closed.consts], eqx.is_inexact_array)
@@ -88,16 +88,16 @@ def _function(f: Function, parameters: Any, others: Any, a: Matrix) -> tuple[Mat
     return _compose(vectors, jnp.diag(f(parameters, others, values))), values, vectors
 
 
-# Of A = VΛVᵀ, Ȧ and Ä being two directions, G = VᵀȦV and H = VᵀÄV, the derivatives are (Daleckii and Krein 1965)
+# Let A = VΛVᵀ, and let G = VᵀȦV and H = VᵀÄV for two directions Ȧ and Ä. The derivatives are (Daleckii and Krein 1965)
 #
 #     ḟ(A) = V ([f]∘G) Vᵀ,    [f]ᵢⱼ = f[λᵢ, λⱼ],
 #     f̈(A) = V S Vᵀ,    Sᵢₖ = Σⱼ f[λᵢ, λⱼ, λₖ] (Gᵢⱼ Hⱼₖ + Hᵢⱼ Gⱼₖ),
 #
-# with divided differences of f, which are smooth where eigenvalues meet. Nothing in them depends on which eigenvectors
-# stand for a multiple eigenvalue; yet differentiating the first one, term by term, would not give the second, as Λ and
-# V have no derivatives there. So each has a rule of its own, and the eigenpairs count as constants in both.
+# with divided differences of f, which are smooth at equal eigenvalues. Both formulas are independent of the chosen
+# basis of an eigenspace. But differentiating the first formula term by term would not give the second at a multiple
+# eigenvalue, because Λ and V have no derivatives there. So each formula has its own rule, with eigenpairs as constants.
 #
-# When parameters of f change too, with ∂f and ∂'f for their two changes, the derivatives are
+# If parameters of f also change, let ∂f and ∂'f be the derivatives of f along their two changes. The derivatives are
 #
 #     V ([f]∘G + ∂f(Λ)) Vᵀ    and    V (S + [∂f]∘H + [∂'f]∘G + ∂∂'f(Λ)) Vᵀ.
 @_function.defjvp
@@ -110,7 +110,7 @@ def _function_jvp(f: Function, primals: tuple, tangents: tuple) -> tuple[tuple, 
     return (value, values, vectors), (tangent, jnp.zeros_like(values), jnp.zeros_like(vectors))
 
 
-_THIRD = "third derivatives of matrix functions are not implemented: first and second ones are"
+_THIRD = "third derivatives of matrix functions are not implemented; only first and second derivatives are"
 
 
 def _first(f: Function, at: Any, constants: Any, change: Any) -> Matrix:
@@ -133,12 +133,12 @@ def _second(f: Function, at: Any, one: Any, constants: Any, two: Any) -> Matrix:
 
 
 def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
-    """Return [f], the divided differences of all pairs."""
+    """Return the matrix [f] of divided differences of all pairs of eigenvalues."""
     return divided_difference(f, jnp.minimum(values[:, None], values), jnp.maximum(values[:, None], values))
 
 
 def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:
-    """Return [∂f], linear in the change: whether a mean or a quotient is taken depends on f alone."""
+    """Return [∂f], linear in the change, because the choice between a mean and a quotient depends only on f."""
     return jax.jvp(lambda p: _table(partial(f, p, others), values), (parameters,), (change,))[1]
 
 

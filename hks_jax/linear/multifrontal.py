@@ -1,7 +1,8 @@
-"""The multifrontal LDLᵀ factorisation of K − σM: solves, and by its inertia a count of eigenvalues.
+"""The multifrontal LDLᵀ factorisation of K − σM, for linear solves, and for eigenvalue counts by its inertia.
 
-All of it is batched dense algebra, one batch for each level of the nested dissection: O(N^1.5) operations to factorise
-in 2D, O(N log N) to solve, O(log N) steps one after another; the same code on every device, under `jit` and `vmap`.
+The computation is batched dense algebra, with one batch for each level of the nested dissection. In 2D, a factorisation
+takes O(N^1.5) operations and a solve O(N log N), in O(log N) sequential steps. The same code runs on every device,
+under `jit` and `vmap`.
 """
 
 import math
@@ -24,7 +25,7 @@ from hks_jax.linear.products import batched_with_columns, gram, matmul, transpos
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
-"""The greatest spectral radius of a factorisation's relative error at which its inertia is trusted."""
+"""The largest spectral radius of a factorisation's relative error at which its inertia is accepted."""
 
 Blocks = tuple[Array, ...]
 """A batch of dense blocks for each level."""
@@ -33,21 +34,20 @@ Blocks = tuple[Array, ...]
 class Factorisation(eqx.Module):
     """K − σM = LDLᵀ.
 
-    A front with its own block A and the coupling B to its boundary leaves there the Schur complement C − BA⁻¹Bᵀ. A
-    stack of them, for several σ, has one more axis in front.
+    Eliminating a front with own block A and coupling B to its boundary leaves the Schur complement C − BA⁻¹Bᵀ on the
+    boundary. A stack of factorisations, for several σ, has an additional leading axis.
     """
 
     dissection: Dissection  # the elimination tree
-    # A⁻¹ above BA⁻¹ for each level, of the tree or merged, (fronts, s + r, s)
+    # A⁻¹ stacked on BA⁻¹, (fronts, s + r, s), for each level of the (merged) tree
     downward: tuple[Float[Array, "... _fronts _s_plus_r _s"], ...]
     upward: tuple[Float[Array, "... _fronts _s _r"], ...]  # (BA⁻¹)ᵀ, (fronts, s, r)
-    # numbers whose product is the determinant, as many of them negative as eigenvalues; others than those of degrees of
-    # freedom are 1
+    # pivots: their product is the determinant, and as many are negative as eigenvalues of K − σM; padding has pivots 1
     pivots: Float[Array, "... pivots"]
 
     @property
     def negative(self) -> Int[Array, "..."]:
-        """How many eigenvalues are negative: by Sylvester's law of inertia, those of the pencil that are below σ."""
+        """The number of negative eigenvalues; by Sylvester's law of inertia, the number of the pencil's below σ."""
         return jnp.sum(self.pivots < 0, axis=-1)
 
     @jax.jit
@@ -59,45 +59,44 @@ class Factorisation(eqx.Module):
 
 
 class Trial(NamedTuple):
-    """What a factorisation is good for."""
+    """The measured accuracy of a factorisation."""
 
-    sound: Bool[Array, ""]  # whether its inertia is that of K − σM
-    # ‖b − (K − σM)x‖/‖b‖ of its solutions x for random b: by how much a step of iterative refinement reduces the error,
-    # about
+    sound: Bool[Array, ""]  # whether its inertia equals that of K − σM
+    # ‖b − (K − σM)x‖/‖b‖ of solutions x for random b, which estimates the convergence rate of iterative refinement
     rate: Float[Array, ""]
-    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x: what the residuals of eigenpairs near σ computed
-    # with it cannot go below. Measured, these are 1 to 15 times as large, rarely up to 40
+    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x. Residuals of eigenpairs near σ cannot be smaller;
+    # measured residuals are 1 to 15 times as large, rarely up to 40 times
     error: Float[Array, ""]
 
 
-# Where a part of the domain has the shift for an eigenvalue, a pivot vanishes. One of size δ leaves Schur complements
-# of size 1/δ, and with the explicit inverses of the next front errors of ε/δ². To replace it by the least pivot allowed
-# perturbs the matrix by at most twice that: the two are balanced near ε^(1/3), which bounds the error of every
-# factorisation (static pivoting, Li and Demmel 1998). Measured, ε^(3/8) is best for counts. Solves need more accuracy,
-# and small pivots may be harmless: on a thin domain, or where a component is hardly coupled to others.
+# If the shift is an eigenvalue of a part of the domain, a pivot vanishes. A pivot δ causes Schur complements of size
+# 1/δ and, with the explicit inverses of the next front, errors of ε/δ². Replacing it by the least allowed pivot
+# perturbs the matrix by at most twice that pivot. Both errors balance near ε^(1/3), which bounds the error of every
+# factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need more
+# accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
 def factorise(
     dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | float = 0.0
 ) -> Factorisation:
-    """Factorise a symmetric matrix, without pivoting from one front to the next; what it is good for, `try_out` tells.
+    """Factorise a symmetric matrix, without pivoting between fronts; `try_out` measures the accuracy.
 
-    The matrix is given by its entries at the places of the pattern: `SymmetricPencil.shifted`. Pivots below the least
-    allowed, relative to the entries, are replaced by it.
+    The matrix is given by its entries at the places of the pattern, as from `SymmetricPencil.shifted`. Pivots smaller
+    than ``least``, relative to the entries of the front, are replaced by it.
     """
-    # Where no pivot is replaced, the sizes of the fronts' entries are not needed.
+    # Without replacement of pivots, the sizes of the fronts' entries are not needed.
     least_or_none = None if isinstance(least, float) and least == 0 else jnp.asarray(least, matrix.dtype)
-    # Compiled without its result's dissection: what a compiled function hands through is copied.
+    # The compiled function does not return the dissection, because XLA would copy it.
     return Factorisation(dissection, *_eliminate(dissection, matrix, least_or_none))
 
 
-# What is factorised is F = A + E with A = K − σM. If the spectral radius of EF⁻¹ is below one, F − tE = (1 − tEF⁻¹)F is
-# singular for no t in [0, 1], so that no eigenvalue crosses zero on the way: F and A have the same inertia. With
-# x = F⁻¹b the residual b − Ax is EF⁻¹b, so that solving again with it is a step of the power method. Already the first
-# decides if it is tiny: b is random, and the share of any direction in it hardly less than 1/√n.
+# Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, the matrix
+# F − tE = (1 − tEF⁻¹)F is regular for all t in [0, 1]. So no eigenvalue crosses zero, and F and A have equal inertia.
+# For x = F⁻¹b, the residual b − Ax equals EF⁻¹b, so that repeated solves with residuals are a power iteration. If the
+# first residual is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
 @jit_quickly()
 def try_out(
     factor: Factorisation, pencil: SymmetricPencil, shift: Float[Array, ""], b: Float[Array, "n_dof b"]
 ) -> Trial:
-    """Find out, with random right-hand sides b, how far a factorisation can be trusted."""
+    """Measure the accuracy of a factorisation with random right-hand sides b."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     tiny = CONTRACTION / math.sqrt(len(b))
 
@@ -113,18 +112,18 @@ def try_out(
         rates = rates.at[turn].set(jnp.linalg.norm(residual) / jnp.linalg.norm(b))
         return turn + 1, rates, jnp.where(turn == 0, _error(x, image, residual), error), residual
 
-    # A loop, so that the solve is compiled once.
+    # A loop compiles the solve only once.
     none = jnp.full(2, jnp.inf, b.dtype)
     _, (first, further), error, _ = jax.lax.while_loop(in_doubt, solve, (jnp.zeros((), int), none, none[0], b))
     return Trial((first < tiny) | ((first < CONTRACTION) & (further < CONTRACTION)), first, error)
 
 
 def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[Array, "n b"]) -> Float[Array, ""]:
-    """Return `Trial.error`, given solutions x, Mx, and what is left of the right-hand sides."""
-    # Solutions have most of the eigenvector nearest to the shift, on which the error may be smaller than on others.
+    """Return `Trial.error`, given solutions x, Mx, and residuals."""
+    # Solutions are dominated by the eigenvector nearest to the shift, so the error is measured on orthonormal vectors.
     products = gram(x, image)
     norms = jnp.sqrt(jnp.diagonal(products))
-    # Of a matrix this small the inverse is as good, and a long triangular solve is slow.
+    # For such a small matrix, the inverse is accurate enough and faster than a long triangular solve.
     inverse = lapack.inverse_cholesky(products / norms[None] / norms[:, None]) / norms[None]
     residuals, images = (jnp.linalg.norm(matmul(y, inverse.T), axis=0) for y in (residual, image))
     return jnp.max(residuals / images)
@@ -151,7 +150,7 @@ def _eliminate(
 
 
 def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward: Blocks) -> tuple[Blocks, Blocks]:
-    """Return the matrices of merged levels: what substitution along the levels in them makes of the identity."""
+    """Return the matrices of merged levels, by substitution with the identity along the levels in each of them."""
     inverses, couplings, first = [], [], 0
     for rows, places in zip(merged.rows, merged.places, strict=True):
         (fronts, s), group = places.shape, slice(first, first + len(rows))
@@ -174,9 +173,9 @@ def eliminate(
 ) -> list[tuple[Inexact[Array, "fronts s s"], Inexact[Array, "fronts r s"]]]:
     """Eliminate a symmetric matrix, real or complex, from the cells up to the first separator.
 
-    Given how to invert symmetric blocks (fronts, s, s), with the greatest modulus of each front's entries, it returns
-    (A⁻¹, BA⁻¹) of each level's fronts, in the order of the levels: A is what the Schur complements of the fronts below
-    have made of a front's own block, and B its coupling to its boundary.
+    ``invert`` maps symmetric blocks (fronts, s, s), and the largest absolute value of each front's entries, to
+    inverses. The result is (A⁻¹, BA⁻¹) for the fronts of each level. Here A is a front's own block and B its coupling
+    to its boundary, both with the Schur complements of the fronts below added.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
     entries = jnp.zeros(start[-1], matrix.dtype)
@@ -204,7 +203,7 @@ def eliminate(
 def _substituted(
     levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along levels, zero at the boundary of the first: return x at their own nodes, and what is left to that."""
+    """Solve along levels with x = 0 at the first one's boundary; return x at own nodes, and the boundary residual."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None
@@ -212,7 +211,7 @@ def _substituted(
         s = level.own.shape[1]
         force, onward = taken(rhs, level.own), jnp.zeros((), rhs.dtype)
         if passed is not None:
-            # What a child does not have is found in the row of zeros.
+            # Nodes that a child does not have refer to the additional row of zeros.
             padded = jnp.pad(passed.reshape(-1, width), ((0, 1), (0, 0)))
             total = sum((taken(padded, places) for places in level.children), jnp.zeros((), rhs.dtype))
             force, onward = force + total[:, :s], total[:, s:]
@@ -229,7 +228,7 @@ def _substituted(
 
 
 def taken(x: Inexact[Array, "n *b"], index: Int[ArrayLike, "*m"]) -> Inexact[Array, "*m_and_b"]:
-    """Return rows of x; whatever is there where the index is out of range, for products in which it meets zeros."""
+    """Return rows of x. For indices out of range the rows are arbitrary; callers multiply these by zero."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
@@ -243,7 +242,7 @@ def gather_symmetric(
     """Return the entries of symmetric blocks at pairs of places (block · r + i, block · r + j); zero for padding."""
     n, r = blocks.shape[:2]
     valid = index < n * r
-    # Whole rows first, and of these the columns: faster than entry by entry.
+    # Gathering complete rows, and then columns of these, is faster than gathering single entries.
     rows = jnp.where(valid[..., None], taken(blocks.reshape(-1, r), index), 0)
     columns = jnp.take_along_axis(rows, (index % r)[:, :, None, :], axis=3, mode="clip")
     return jnp.where(valid[:, :, None, :], columns, 0)

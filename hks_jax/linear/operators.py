@@ -1,4 +1,4 @@
-"""Symmetric linear operators: a matrix by its entries at the places of a pattern, or by its diagonal."""
+"""Symmetric linear operators: sparse matrices with a static pattern, and diagonal matrices."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -20,13 +20,13 @@ Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 
 _PLACES = 1 << 12
-"""Places whose products are computed together: what is gathered for them stays in the cache."""
+"""The number of entries of an outer product that are computed together: their operands fit into the cache."""
 ROUNDING = 1000
-"""By how many units of rounding of the largest entry a matrix may differ from its transpose."""
+"""The largest accepted asymmetry of a matrix, in units of ε times its largest entry."""
 
 
 class Operator(eqx.Module):
-    """A symmetric matrix, applied without being formed."""
+    """A symmetric matrix, applied without forming the full matrix."""
 
     @property
     @abstractmethod
@@ -39,7 +39,7 @@ class Operator(eqx.Module):
 
     @abstractmethod
     def of_columns(self) -> OfColumns:
-        """Return the product with a block of columns; for products in a loop, call this outside."""
+        """Return the product with a block of columns, as a function; call this outside a loop of products."""
 
     @abstractmethod
     def triplets(self) -> tuple[Float[Array, " nnz"], Places]:
@@ -47,11 +47,11 @@ class Operator(eqx.Module):
 
     @abstractmethod
     def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "Operator":
-        """Return pxᵀ where the matrix has entries, by NumPy: the derivative of Σ p·Ax by A."""
+        """Return pxᵀ on the sparsity pattern, by NumPy: the derivative of Σ p·Ax with respect to A."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(n_dof, n_dof)."""
+        """The shape (n_dof, n_dof)."""
         return (self.size, self.size)
 
     @property
@@ -88,23 +88,23 @@ def _scattered(data: Float[Array, " nnz"], rows: Any, cols: Any, shape: tuple[in
 
 
 class PatternedOperator(Operator):
-    """A matrix with entries at the places of a pattern, which can be factorised."""
+    """A matrix with a static sparsity pattern, which can be factorised."""
 
     @property
     @abstractmethod
     def pattern(self) -> Pattern:
-        """Where the entries are; static."""
+        """The sparsity pattern; static."""
 
     @abstractmethod
     def flat(self) -> Float[Array, " m"]:
-        """Return the array of entries into which the pattern's places point."""
+        """Return the array of entries that the pattern's places index."""
 
     @abstractmethod
     def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
         """Return the matrix with other entries at the same places."""
 
     def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "PatternedOperator":
-        """Return pxᵀ where the matrix has entries, by NumPy."""
+        """Return pxᵀ on the sparsity pattern, by NumPy."""
         where, rows, cols = self.pattern.places()
         entries = np.zeros(self.pattern.n_entries, x.dtype)
         for start in range(0, where.size, _PLACES):
@@ -113,9 +113,9 @@ class PatternedOperator(Operator):
         return self.with_flat(jax.device_put(entries))
 
     def plus(self, diagonal: Float[Array | np.ndarray, " n"]) -> "PatternedOperator":
-        """Return the sum with a diagonal matrix, (n_dof,)."""
+        """Return the sum with a diagonal matrix, given as an array (n_dof,)."""
         if np.shape(diagonal) != (self.size,):
-            raise ValueError(f"diagonal: got shape {np.shape(diagonal)}; expected {(self.size,)}, one number a row")
+            raise ValueError(f"diagonal: got shape {np.shape(diagonal)}; expected {(self.size,)}, one number per row")
         minus = DiagonalOperator(-jnp.asarray(diagonal, self.dtype))
         return self.with_flat(shifted(self, minus, jnp.ones((), self.dtype)))
 
@@ -126,13 +126,13 @@ class PatternedOperator(Operator):
 
 
 class SparseOperator(PatternedOperator):
-    """A matrix with any pattern.
+    """A sparse matrix with an arbitrary symmetric pattern.
 
     Attributes:
-        entries: (m,) in the order of the pattern.
+        entries: the entries (m,) in the order of the pattern.
         structure: the pattern; static.
-        table: the pattern's table as arrays, which compiled computations take for arguments; None makes constants of
-            it, which the compiler reads. Of a million rows that takes seconds for each computation.
+        table: the pattern's table as arrays, which are arguments of compiled functions. With None, the table is a
+            constant, which for a million rows adds seconds to each compilation.
     """
 
     entries: Float[Array, " m"]
@@ -141,7 +141,7 @@ class SparseOperator(PatternedOperator):
 
     @property
     def pattern(self) -> SparsePattern:
-        """Where the entries are; static."""
+        """The sparsity pattern; static."""
         return self.structure
 
     def flat(self) -> Float[Array, " m"]:
@@ -154,7 +154,7 @@ class SparseOperator(PatternedOperator):
 
     @jax.jit
     def symmetric_part(self) -> "SparseOperator":
-        """Return (A + Aᵀ)/2: an entry and the one across the diagonal become one parameter, in derivatives too."""
+        """Return (A + Aᵀ)/2, so that also in derivatives, entries (i, j) and (j, i) are one parameter."""
         return self.with_flat((self.entries + self.entries[self.pattern.across]) / 2)
 
     @property
@@ -170,7 +170,7 @@ class SparseOperator(PatternedOperator):
         return of_each_row(self.of_columns(), x.reshape(-1, self.size)).reshape(x.shape)
 
     def of_columns(self) -> OfColumns:
-        """Return the product with a block of columns, or with one vector."""
+        """Return the product with a block of columns or with a vector, as a function."""
         table = self._places
         ordered = list(self.entries.at[table.entries].get(mode="fill", fill_value=0, wrap_negative_indices=False))
 
@@ -220,7 +220,7 @@ class DiagonalOperator(Operator):
 
 @jit_quickly()
 def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, ""]) -> Inexact[Array, " m"]:
-    """Return the entries of K − σM at the places of K's pattern, which has those of M; σ may be complex."""
+    """Return the entries of K − σM at the places of K's pattern, which contains M's; σ may be complex."""
     dtype = np.result_type(stiffness.dtype, shift.dtype)
     entries = stiffness.flat().astype(dtype)
     if isinstance(mass, PatternedOperator):
@@ -231,11 +231,11 @@ def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, 
 
 
 def require_symmetric(name: str, values: Any, places: Places, size: int, remedy: str) -> None:
-    """Raise ValueError unless entries, of which those at one place add up, are finite and symmetric up to rounding."""
+    """Raise ValueError unless a matrix is finite and symmetric up to rounding. Repeated places add up."""
     data, (rows, cols) = np.asarray(values), places
     wrong = int((~np.isfinite(data)).sum())
     if wrong:
-        raise ValueError(f"{name}: {wrong} of {data.size} entries are NaN or infinite")
+        raise ValueError(f"{name}: {wrong} of {data.size} entries are NaN or infinite; expected finite numbers")
     held = coo_matrix((data, (rows, cols)), shape=(size, size)).tocsr()
     difference = abs(held - held.T).tocoo()
     largest = float(np.max(np.abs(data), initial=0))

@@ -1,4 +1,4 @@
-"""Where a sparse symmetric matrix has entries: what a factorisation and products need to know before any number."""
+"""Sparsity patterns of symmetric matrices. A pattern determines the structure of factorisations and products."""
 
 from abc import abstractmethod
 from functools import cached_property
@@ -13,7 +13,7 @@ from hks_jax.linear.bisection import Parts, bisect_graph
 
 
 class Pattern:
-    """The places at which a symmetric matrix may have entries. Static and hashable."""
+    """The places where a symmetric matrix may have nonzero entries. Static and hashable."""
 
     size: int  # the number of rows
     n_entries: int  # the size of the array of entries
@@ -28,27 +28,27 @@ class Pattern:
 
     @abstractmethod
     def bisect(self) -> Parts:
-        """Return how to cut the matrix' graph for nested dissection."""
+        """Return a recursive bisection of the matrix's graph, for nested dissection."""
 
 
 class Ellpack(NamedTuple):
-    """The places of a matrix in a table of columns that are as long as it has rows, and those beyond its width."""
+    """A pattern in ELLPACK format: a table with one row of slots per matrix row, and a list of overflowing entries."""
 
-    entries: Int[np.ndarray | Array, "width n"]  # indices into the entries; out of range where a row has fewer
-    cols: Int[np.ndarray | Array, "width n"]  # their columns
-    others: Int[np.ndarray | Array, " m"]  # the places of the entries that are left,
-    other_rows: Int[np.ndarray | Array, " m"]  # their rows,
-    other_cols: Int[np.ndarray | Array, " m"]  # and their columns
-    diagonal: Int[np.ndarray | Array, " n"]  # the places of the diagonal entries
+    entries: Int[np.ndarray | Array, "width n"]  # indices of the entries in the table; out of range for empty slots
+    cols: Int[np.ndarray | Array, "width n"]  # the columns of these entries
+    others: Int[np.ndarray | Array, " m"]  # indices of the entries outside the table
+    other_rows: Int[np.ndarray | Array, " m"]  # the rows of the entries outside the table
+    other_cols: Int[np.ndarray | Array, " m"]  # the columns of the entries outside the table
+    diagonal: Int[np.ndarray | Array, " n"]  # the indices of the diagonal entries
 
 
 _SCATTERED = 3
-"""What an entry outside the table costs in a product, in entries of the table."""
+"""The cost of an entry outside the table in a product, relative to an entry in the table."""
 
 
 @jax.tree_util.register_static
 class SparsePattern(Pattern):
-    """Any symmetric pattern with a full diagonal, its entries in the order of rows, and of columns within a row."""
+    """A symmetric pattern with a full diagonal. Entries are sorted by row, then by column."""
 
     def __init__(self, size: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> None:
         self.size, self.n_entries = size, len(rows)
@@ -73,21 +73,21 @@ class SparsePattern(Pattern):
         return np.flatnonzero(self.rows == self.cols)
 
     def bisect(self) -> Parts:
-        """Return how to cut the matrix' graph."""
+        """Return a recursive bisection of the matrix's graph."""
         return bisect_graph(self.size, self.rows, self.cols)
 
     @cached_property
     def across(self) -> Int[np.ndarray, " m"]:
-        """For each entry the place of the one across the diagonal."""
+        """The index of the transposed entry of each entry."""
         return np.lexsort((self.rows, self.cols)).astype(np.int32)
 
     @cached_property
     def table(self) -> Ellpack:
-        """The places as a table, as wide as makes products fastest: a few long rows do not widen it."""
+        """The pattern as a table. The width minimises the cost of products: a few long rows do not increase it."""
         counts = np.bincount(self.rows, minlength=self.size)
         start = np.cumsum(counts) - counts
-        longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # rows with more than 0, 1, … entries
-        left = np.cumsum(longer[::-1])[::-1]  # entries beyond a width of 0, 1, …
+        longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # the number of rows with more than 0, 1, … entries
+        left = np.cumsum(longer[::-1])[::-1]  # the number of entries beyond a width of 0, 1, …
         left = np.append(left, 0)
         width = int(np.argmin(np.arange(left.size) * self.size + _SCATTERED * left))
         slot = np.arange(width)[:, None]

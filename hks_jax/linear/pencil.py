@@ -1,4 +1,4 @@
-"""A pair of symmetric matrices, of which one is positive definite: what eigensolvers know of a problem."""
+"""Symmetric definite pencils (K, M), the input of eigensolvers."""
 
 from typing import TypeVar
 
@@ -11,12 +11,12 @@ from hks_jax.linear.pattern import Pattern, SparsePattern
 
 
 class NullSpace(eqx.Module):
-    """The null space of a stiffness K ⪰ 0, all of it.
+    """The complete null space of a stiffness K ⪰ 0.
 
     Attributes:
-        vectors: (m, n_dof) a basis; m may be 0.
-        fixed: whether every perturbation of K annihilates it too, as of stiffness matrices of elements. Derivatives
-            then leave out what only rounding could contribute.
+        vectors: a basis (m, n_dof); m may be 0.
+        fixed: whether every perturbation of K annihilates the null space too, as for stiffness matrices of finite
+            elements. Derivatives then omit the corresponding terms, which are only rounding errors.
     """
 
     vectors: Float[Array, "m n_dof"]
@@ -24,12 +24,12 @@ class NullSpace(eqx.Module):
 
 
 class SymmetricPencil(eqx.Module):
-    """The stiffness K and mass M of Kφ = λMφ, symmetric, M ≻ 0.
+    """The stiffness K and mass M of Kφ = λMφ. Both are symmetric, and M ≻ 0.
 
     Attributes:
-        stiffness: K; multiply with ``@``, or take ``.to_scipy()``, ``.to_dense()``.
-        mass: M, likewise. It has no entries where K has none.
-        null_space: that of K ⪰ 0; None where nothing is known, and K may be indefinite.
+        stiffness: K; use ``@`` for products, ``.to_scipy()`` and ``.to_dense()`` for conversion.
+        mass: M, an operator like K. Its pattern is contained in K's.
+        null_space: the null space of K ⪰ 0. None means unknown; then K may be indefinite.
     """
 
     stiffness: PatternedOperator
@@ -43,22 +43,22 @@ class SymmetricPencil(eqx.Module):
 
     @property
     def pattern(self) -> Pattern:
-        """Where K has entries."""
+        """The sparsity pattern of K."""
         return self.stiffness.pattern
 
     @property
     def n_null(self) -> int:
-        """How many null vectors of K are known beforehand."""
+        """The dimension of the known null space of K; 0 if it is unknown."""
         return 0 if self.null_space is None else len(self.null_space.vectors)
 
     @property
     def n_fixed(self) -> int:
-        """How many of them every perturbation of K annihilates, too."""
+        """The number of null vectors that every perturbation of K annihilates."""
         return self.n_null if self.null_space is not None and self.null_space.fixed else 0
 
     @property
     def parts(self) -> tuple["SymmetricPencil", ...]:
-        """The pencil itself: one problem."""
+        """A tuple of the pencil itself, for symmetry with pencils of several parts."""
         return (self,)
 
     def shifted(self, shift: Float[Array, ""]) -> Float[Array, " m"]:
@@ -67,11 +67,11 @@ class SymmetricPencil(eqx.Module):
 
 
 P = TypeVar("P", bound=SymmetricPencil)
-"""Any pencil, or those of a domain, or of a grid."""
+"""The type of pencil that a solver supports: any pencil, those of a domain, or those of a grid."""
 
 
 def tabulated(pencil: P) -> P:
-    """Return a pencil with what products need of a sparse pattern as arrays, to hand over to several computations."""
+    """Return the pencil with the pattern's tables as arrays, which several compiled functions can share."""
     pattern = pencil.pattern
     if not isinstance(pattern, SparsePattern):
         return pencil

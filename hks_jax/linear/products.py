@@ -1,4 +1,4 @@
-"""Products of blocks of vectors, as XLA computes them fastest, and quadratic forms in many of them."""
+"""Products of blocks of vectors, arranged for speed in XLA, and quadratic forms in many vectors."""
 
 from collections.abc import Callable
 from functools import partial, reduce
@@ -14,44 +14,44 @@ from hks_jax.linear import accelerators
 from hks_jax.linear.linear_map import with_transpose
 
 _MANY, _TERMS = 512, 40
-"""For how many matrices, of how many columns at most, products on a CPU are written out: others take longer to compile
-than they gain."""
+"""The least number of matrices, and their largest number of columns, for which a CPU sums batched products term by
+term. For others, compilation would take longer than the gain."""
 _ROWS, _LARGE = (4, 5, 3, 7, 2), 1 << 18
-"""How many rows of an array of so many numbers are multiplied at a time, which stay in the cache: the first of these by
-which their number can be divided, as what were left over would have to be copied."""
+"""The numbers of rows of a large array (at least ``_LARGE`` numbers) that are multiplied together in the cache. The
+first divisor of the number of rows is used, because a remainder would be copied."""
 
 
 def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
-    """Return the inner products.
+    """Return the inner products of rows and columns.
 
-    XLA's CPU kernels for a long contraction are many times faster with the large factor on the left: the barrier keeps
-    XLA from turning the product round.
+    XLA's CPU kernels for long contractions are many times faster with the large factor on the left. The barrier keeps
+    XLA from exchanging the factors.
     """
     return jax.lax.optimization_barrier(matmul(basis, columns))
 
 
 def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
-    """Return the inner products with rows, as what comes after takes them fastest: the small factor on the left."""
+    """Return the inner products of rows. The result is (b, m), the layout in which later products are fastest."""
     if len(basis) < len(block):
         return products_with_columns(block, basis.T)  # the larger factor on the left
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
 
 
 def matmul(*factors: Inexact[Array, "*batch _ _"]) -> Inexact[Array, "*batch _ _"]:
-    """Return the product of matrices, or of batches of them, in the precision of their entries on every device."""
+    """Return the product of (batches of) matrices, on every device in the full precision of their dtype."""
     return reduce(partial(jnp.matmul, precision="highest"), factors)
 
 
 def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
     """Return the products of a batch of matrices with a few columns each.
 
-    XLA's CPU kernels compute all products of small matrices in one thread: those of many are a loop over sums that are
-    written out term by term, which is dealt out to all threads.
+    XLA's CPU kernels compute all products of small matrices in one thread. So for many matrices, sums are written out
+    term by term, which XLA distributes over all threads.
     """
     if accelerators.at_hand() or len(matrices) < _MANY or matrices.shape[2] > _TERMS:
         return matmul(matrices, columns)
-    # Computed as part of the loop, the columns would be computed anew for each row. A condition XLA computes apart from
-    # what comes before it; both ways are right.
+    # XLA might fuse the computation of the columns into the loop, and repeat this computation for each row. A condition
+    # prevents fusion; both branches give the same result.
     return jax.lax.cond(jnp.isfinite(columns[0, 0, 0]), _written_out, matmul, matrices, columns)
 
 
@@ -64,13 +64,13 @@ def transposed(x: Inexact[Array, "m i j"]) -> Inexact[Array, "m j i"]:
     return jnp.swapaxes(x, 1, 2)
 
 
-# Written out row by row, the derivative by what the function depends on, which sums over the rows, is a fused sum and
-# not a reduction, which XLA does many times slower on CPUs. What the function makes of a row is made again in it: kept,
-# it would be several arrays of the size of all rows.
+# The derivative with respect to parameters of the function sums over the rows. Written out row by row, the sum is
+# fused; a reduction would be many times slower on CPUs. The derivative recomputes intermediate results, because storing
+# them would take several arrays of the size of all rows.
 def of_each_row(
     function: Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]], rows: Float[Array, "b *shape"]
 ) -> Float[Array, "b *shape"]:
-    """Return a linear function of each row."""
+    """Apply a linear function to each row."""
 
     @jax.checkpoint
     def of_some(some: Float[Array, "c *shape"]) -> Float[Array, "c *shape"]:
@@ -86,50 +86,50 @@ def of_each_row(
 
 
 def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
-    """Return the inner products of columns."""
+    """Return the inner products xᵀy of columns."""
     return matmul(x.T, y)
 
 
 def even_size(count: int, most: int) -> int:
-    """Return the size of as few blocks as can be, none larger than the most, if all are of one size."""
+    """Return the block size for dividing ``count`` items into the fewest blocks of equal size, at most ``most``."""
     return -(-count // -(-count // most))
 
 
 def row_blocks(
     count: int, size: int
 ) -> tuple[Int[np.ndarray, " blocks"], tuple[Int[np.ndarray, " count"], Int[np.ndarray, " count"]]]:
-    """Return the first rows of blocks, the last of which may overlap, and where each row is: (block, row within)."""
+    """Return the first row of each block (the last block may overlap), and each row's block and place in it."""
     starts = np.minimum(np.arange(0, count, size), count - size)
     block = np.arange(count) // size
     return starts, (block, np.arange(count) - starts[block])
 
 
 def aligned(x: Array, like: ArrayLike) -> Array:
-    """Return x with axes before its own, as many as ``like`` has: `jax_numpy_rank_promotion` may forbid to add them."""
+    """Return x with leading axes up to the rank of ``like``, because `jax_numpy_rank_promotion` may be an error."""
     return jnp.expand_dims(x, tuple(range(jnp.ndim(like) - x.ndim)))
 
 
 _OF_MATRIX, _BLOCKS = 64, 8
-"""At least how many rows of C are taken together, and at most how often: each time is compiled apart."""
+"""The least number of rows in a block of C, and the maximal number of blocks; each is compiled separately."""
 _POINTS = 2048
-"""Points at which the vectors, of a few hundred functions, stay in the cache."""
+"""The number of points per step, at which a few hundred vectors fit into the cache."""
 
 
-# Of C the upper triangle is enough, in blocks of rows from the diagonal on: what is beside their first square counts
-# twice. Where only the first few functions matter, blocks beyond the last of them are left out. A few points at a time,
-# the vectors are read from memory once for all matrices and blocks.
+# Only the upper triangle of C is used, in blocks of rows from the diagonal on. Entries right of a block's diagonal
+# square count twice. Blocks beyond the last function that matters are omitted. The loop over groups of points is the
+# outermost, so that vectors are read from memory only once.
 def quadratic_forms(
     matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
 ) -> Float[Array, "m n"]:
     """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each C; not differentiable with respect to φ.
 
-    Of C's entries between functions that do not matter for it some may be taken for zero.
+    Entries of C between functions that do not matter for this C may be treated as zero.
     """
     (m, k), n = matters.shape, vectors.shape[1]
     size, width = min(max(_OF_MATRIX, -(-k // _BLOCKS)), k), min(_POINTS, n)
     first, (starts, _) = np.arange(0, k, size), row_blocks(n, width)
     past_last = jnp.max(jnp.where(matters, np.arange(1, k + 1), 0), axis=1)
-    # Matrices in the order of how many of their blocks count, and how many have the first block, the second …
+    # The matrices sorted by descending number of needed blocks, and the number of matrices that need each block.
     order, counts = jnp.argsort(-past_last), jnp.sum(past_last[None] > first[:, None], axis=1)
 
     def at_points(number: Array) -> tuple[Array, Float[Array, "k width"]]:
@@ -155,7 +155,7 @@ def quadratic_forms(
         def add_points(number: Array, blocks: list[Array]) -> list[Array]:
             start, some = at_points(number)
             own = jax.lax.dynamic_slice_in_dim(weights, start, width, axis=1)
-            own = jnp.where(start + np.arange(width) >= number * width, own, 0)  # each point once
+            own = jnp.where(start + np.arange(width) >= number * width, own, 0)  # counts each point once
             results = []
             for i, count, block in zip(first, counts, blocks, strict=True):
 

@@ -1,14 +1,14 @@
-"""The inverse of a sparse symmetric matrix, where the matrix has entries: selected inversion.
+"""Selected inversion: the entries of the inverse of a sparse symmetric matrix on its sparsity pattern.
 
-Takahashi, Fagan and Chin (1973), here on the elimination tree. Once a front with own block A and coupling B to its
-boundary is eliminated, the inverse G of the whole matrix satisfies there, with C = BA⁻¹,
+The method is that of Takahashi, Fagan and Chin (1973), on the elimination tree. Let a front have the own block A at its
+elimination, the coupling B to its boundary, and C = BA⁻¹. Then the inverse G of the whole matrix satisfies
 
     G_own = A⁻¹ + Cᵀ G_b C,    G_b,own = −G_b C,
 
-G_b its block at the boundary. A front's boundary lies among the own and boundary nodes of the front above it, so that
-from the first separator down to the cells each level finds what it needs in the one above. That takes about as many
-operations as the factorisation, O(N^1.5) in 2D and O(N²) in 3D: L. Lin and others, SelInv, ACM Trans. Math. Softw. 37
-(2011).
+where G_b is its block at the boundary. A front's boundary nodes are own or boundary nodes of the front above. So the
+recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. The
+recursion takes about as many operations as the factorisation, O(N^1.5) in 2D and O(N²) in 3D: L. Lin and others,
+SelInv, ACM Trans. Math. Softw. 37 (2011).
 """
 
 from typing import NamedTuple
@@ -23,32 +23,33 @@ from hks_jax.linear.multifrontal import eliminate, gather_symmetric, taken
 from hks_jax.linear.products import matmul, transposed
 
 Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts _r _s"]]]
-"""(A⁻¹, BA⁻¹) of each level's fronts."""
+"""The matrices (A⁻¹, BA⁻¹) of the fronts of each level."""
 
 
 class Cost(NamedTuple):
-    """What selected inversion of one matrix takes."""
+    """The cost of the selected inversion of one matrix."""
 
-    operations: float  # floating-point operations in complex arithmetic
-    entries: float  # how many numbers are kept at once: the factors, and the inverse on two levels
+    operations: float  # the number of floating-point operations in complex arithmetic
+    entries: float  # the number of stored entries: the factors, and the inverse on two levels
 
 
 def diagonal_of_inverse(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Inexact[Array, " n_dof"]:
     """Return the diagonal of the inverse of a symmetric matrix, real or complex (not Hermitian).
 
-    There is no pivoting from one front to the next: for matrices whose real or imaginary part is definite, of which no
-    Schur complement is singular. Differentiable in both modes; for the transpose some copies of the factors are kept.
+    The elimination does not pivot between fronts. This is safe if the real or imaginary part of the matrix is definite,
+    because then all Schur complements are regular. The function is differentiable in both modes; reverse mode stores
+    several copies of the factors.
     """
     return selected(dissection, eliminated_differentiably(dissection, matrix), diagonal=True)
 
 
 def eliminated_differentiably(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Eliminated:
-    """Return what `eliminate` does, with blocks inverted by a rule that is differentiable any number of times."""
+    """Call `eliminate` with an inverse whose derivative rule can be differentiated any number of times."""
     return eliminate(dissection, matrix, lambda blocks, _: _inverses(blocks))
 
 
 def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> Inexact[Array, " m"]:
-    """Return the inverse's diagonal, (n_dof,), or its columns (fronts, s + r, s) as `Dissection.places` counts them."""
+    """Return the inverse's diagonal (n_dof,), or its blocks (fronts, s + r, s) as in `Dissection.places`."""
     parts = []
     known: Array | None = None
     for number, (level, (inverse, coupling)) in enumerate(zip(dissection.levels, eliminated, strict=True)):
@@ -57,7 +58,7 @@ def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> 
             boundary = gather_symmetric(known, jnp.asarray(level.boundary)[None])[0]
         beside = -matmul(boundary, coupling)
         last = number == len(dissection.levels) - 1
-        if diagonal and last:  # of the cells, nothing else is wanted
+        if diagonal and last:  # cells need only their diagonal
             own = jnp.diagonal(inverse, axis1=1, axis2=2) - jnp.sum(coupling * beside, axis=1)
         else:
             block = inverse - matmul(transposed(coupling), beside)
@@ -70,7 +71,7 @@ def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> 
 
 
 def inversion_cost(dissection: Dissection) -> Cost:
-    """Estimate what `diagonal_of_inverse` takes."""
+    """Estimate the cost of `diagonal_of_inverse`."""
     operations = entries = most = 0.0
     for level in dissection.levels:
         fronts, whole, s = level.shape
@@ -88,6 +89,6 @@ def _inverses(matrices: Inexact[Array, "m n n"]) -> Inexact[Array, "m n n"]:
 
 @_inverses.defjvp
 def _inverses_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    # d(A⁻¹) = −A⁻¹ dA A⁻¹: nothing but the inverse is kept for the transpose.
+    # d(A⁻¹) = −A⁻¹ dA A⁻¹, so that reverse mode stores only the inverse.
     inverse = _inverses(*primals)
     return inverse, -matmul(inverse, *tangents, inverse)

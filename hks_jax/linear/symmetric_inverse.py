@@ -1,4 +1,4 @@
-"""The inverses of a batch of symmetric indefinite matrices together with their inertia."""
+"""Inverses of a batch of symmetric indefinite matrices, together with their inertia."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,25 +16,25 @@ Pivots = Float[Array, " m"]
 Inverses = tuple[Matrices, Float[Array, "m n"]]
 
 _BLOCK, _BLOCKS, _LARGE = 48, 4, 2048
-"""On CPUs, matrices up to the first size are inverted by their eigenvalues, and of those up to the last about so many
-blocks swept."""
+"""On CPUs, matrices of up to ``_BLOCK`` rows are inverted by their eigenvalues. Those of up to ``_LARGE`` rows are
+swept in about ``_BLOCKS`` blocks."""
 _ROWS = 32
-"""The largest blocks that are swept row by row."""
+"""The largest size of blocks that are swept row by row."""
 _MANY = 128
-"""Fronts of a level from which on all of them are definite as a rule: the shift is below their eigenvalues."""
+"""The least number of fronts of a level at which usually all are definite, because the shift is below their spectra."""
 _LARGEST, _SMALLEST = 64, 16
-"""Rows of the largest matrix of a kernel: 4 warps, 32 numbers in each thread; and of the smallest, padded."""
+"""The largest number of rows of a kernel's matrix (4 warps with 32 numbers per thread), and the least after padding."""
 
 
 def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inverses:
-    """Return the inverses, and for each matrix its pivots: as many are negative as eigenvalues, their product is det A.
+    """Return the inverses and the pivots of each matrix: det A is their product, and their signs give the inertia.
 
-    Pivots smaller than ``least`` are replaced by it, with their sign; without it the inverse of a singular matrix is
-    not finite. On CPUs by LAPACK, of many definite matrices by their Cholesky factors and of others by their
-    eigenvalues; elsewhere by elimination, which takes far fewer of the operations that are slow there.
+    Pivots smaller than ``least`` are replaced by ±``least``. Without ``least``, the inverse of a singular matrix is not
+    finite. On CPUs, LAPACK computes Cholesky factors of large batches, which are usually definite, and eigenvalues of
+    others. Accelerators use elimination, because eigenvalues and Cholesky factors are slow there.
     """
     none = jnp.zeros(len(matrices), matrices.dtype) if least is None else least
-    if not accelerators.at_hand():  # to trace what is not used takes longer
+    if not accelerators.at_hand():  # avoids tracing unused branches
         return (by_cholesky_factors if len(matrices) >= _MANY else by_eigenvalues)(matrices, none)
     ways = {"cpu": by_eigenvalues} | ({"cuda": by_kernels} if _kernel_agrees(matrices.dtype) else {})
     return jax.lax.platform_dependent(matrices, none, **ways, default=by_elimination)
@@ -53,21 +53,21 @@ def _kernel_agrees(dtype: Any) -> bool:
 
 
 def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert the Cholesky factors, in a third of the time; by eigenvalues unless all are definite, no pivot small."""
+    """Invert by Cholesky factors, in a third of the time; by eigenvalues if a matrix is indefinite or a pivot small."""
     inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
-        jnp.all(pivots > least[:, None]),  # they are NaN where a matrix is not definite
+        jnp.all(pivots > least[:, None]),  # pivots are NaN if a matrix is not definite
         lambda: (matmul(transposed(inverses), inverses), pivots),
         lambda: by_eigenvalues(matrices, least),
     )
 
 
 def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert the eigenvalues: of small matrices their own, of others those of the blocks that are swept.
+    """Invert small matrices by their eigenvalues, and others by sweeping blocks that are inverted likewise.
 
-    Large matrices are swept in large blocks, these in turn in small ones, so that there are few passes over them. Of
-    the largest, halves take fewer operations.
+    Large blocks are in turn swept in small blocks, which needs few passes over the matrix. The largest matrices are
+    divided into halves, which takes fewer operations.
     """
     n = matrices.shape[1]
     if n <= _BLOCK:
@@ -89,13 +89,13 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
 
 
 def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
-    """Sweep the matrices block by block, these in one launch of a kernel each."""
+    """Sweep the matrices block by block, with one kernel launch for each block."""
     n, size = matrices.shape[1], _LARGEST
     if n <= size:
         return invert_in_registers(matrices, least)
     a, pivots = matrices, []
-    # Written out, as a turn of XLA's loops is three launches more; behind the barrier, so that XLA compiles one kernel
-    # for all blocks, and not one for each.
+    # The loop is unrolled, because an iteration of an XLA loop takes three more launches. Because of the barrier, XLA
+    # compiles one kernel for all blocks.
     for start in range(0, n, size):
         at, rows = jax.lax.optimization_barrier(jnp.int32(start)), min(size, n - start)
         inverses, of_block = invert_in_registers(a, least, at, rows)
@@ -105,7 +105,7 @@ def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
 
 
 def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
-    """Sweep the matrices block by block, and these row by row."""
+    """Sweep the matrices block by block, and each block row by row."""
 
     def by_rows(blocks: Matrices, least: Pivots) -> Inverses:
         return jax.vmap(_sweep)(blocks, least[:, None])
@@ -114,7 +114,7 @@ def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
 
 
 def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: Matrices, least: Pivots) -> Inverses:
-    """Sweep the matrices in blocks of one size, given how to invert these."""
+    """Sweep the matrices in blocks of one size. ``invert`` inverts the blocks."""
     m, n, _ = matrices.shape
     whole = -(-n // size) * size
     a = jnp.broadcast_to(jnp.eye(whole, dtype=matrices.dtype), (m, whole, whole)).at[:, :n, :n].set(matrices)
@@ -127,17 +127,17 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
         return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
-    # What is left out are positive numbers: those of the padding, which are 1, or eigenvalues that are no smaller.
+    # All but one of these pivots are positive: 1 from the padding, or eigenvalues that are not smaller.
     last = jnp.prod(pivots[:, n - 1 :], axis=1, keepdims=True)
     return -a[:, :n, :n], jnp.concatenate([pivots[:, : n - 1], last], axis=1)
 
 
-# Sweeping a block P of A turns it into −P⁻¹, and the rest into the Schur complement of P; once all blocks are swept, A
-# has become −A⁻¹. By Sylvester's law of inertia as many of the pivots are negative as eigenvalues of A. With R the rows
-# of P, and U what they are with −I in place of P, the swept matrix is A − UᵀP⁻¹U, in A zeros for the rows and columns
-# of P: two products, and one pass over A.
+# Sweeping a block P of A replaces P by −P⁻¹, and the rest by the Schur complement of P. After sweeping all blocks, A
+# has become −A⁻¹. By Sylvester's law of inertia, as many pivots as eigenvalues of A are negative. Let U be the rows of
+# P with P replaced by −I, and let A₀ be A with zeros in the rows and columns of P. Then the swept matrix is
+# A₀ − UᵀP⁻¹U, which takes two products and one pass over A.
 def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]) -> Matrices:
-    """Sweep the block whose rows begin with number ``at``, given its inverse."""
+    """Sweep the block that begins at row ``at``, given its inverse."""
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
     inside = (index >= at) & (index < at + rows.shape[1])
     rows = jnp.where(inside, -(index[None] == own[:, None]).astype(a.dtype), rows)
@@ -146,18 +146,18 @@ def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s
 
 
 def _away_from_zero(pivots: Float[Array, "..."], least: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the pivots, of which none is smaller than the least allowed."""
+    """Replace pivots smaller than ``least`` by ±``least``."""
     return jnp.where(jnp.abs(pivots) < least, jnp.where(pivots < 0, -least, least), pivots)
 
 
-# Written with XLA's operations, each of the n pivots of a matrix is half a dozen launches, of some 4 µs each whatever
-# they do. Here a matrix is one program, which keeps it in registers from the first pivot to the last.
+# With XLA operations, each of the n pivots takes about six launches of at least 4 µs. In this kernel, one program
+# inverts one matrix, which stays in registers for all pivots.
 def invert_in_registers(
     matrices: Matrices, least: Pivots, at: Int[Array, ""] | None = None, rows: int | None = None
 ) -> tuple[Float[Array, "m s s"], Float[Array, "m s"]]:
     """Return the inverses of blocks on the diagonal, and their pivots; see `_sweep`.
 
-    The blocks begin at the first row or at ``at``, an int32, and have all rows or as many as given, at most `_LARGEST`.
+    The blocks begin at row ``at`` (an int32; default 0), and have ``rows`` rows (default: all), at most `_LARGEST`.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -165,7 +165,7 @@ def invert_in_registers(
     m, n, _ = matrices.shape
     rows = n if rows is None else rows
     at = jnp.zeros((), jnp.int32) if at is None else at
-    # Triton's arrays have powers of two for sizes: what is beyond the block is the identity.
+    # Triton arrays have power-of-two sizes; blocks are padded with the identity.
     size = accelerators.padded_size(rows, _SMALLEST)
 
     def kernel(first, matrix, least, inverse, pivots) -> None:  # type: ignore[no-untyped-def]  # references of Pallas'
@@ -199,7 +199,7 @@ def invert_in_registers(
 
 
 def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Return the inverse of one matrix, and the pivots: of all rows left, the one with the largest is swept next."""
+    """Return the inverse and the pivots of one matrix. Each step sweeps the remaining row with the largest pivot."""
     n = a.shape[0]
     index = jax.lax.broadcasted_iota(jnp.int32, (n,), 0)
 

@@ -63,9 +63,7 @@ def make(full: bool, echo: Callable[[str], None]) -> Figure:
         row[0].set_ylabel("mm")
     for ax in panels[1]:
         ax.set_xlabel("mm")
-    fig.suptitle(
-        f"Diffusion tensors of a {name}, and their HKS; the natural boundary raises it (grey: beyond the colours)"
-    )
+    fig.suptitle(f"Diffusion tensors of a {name} and their HKS, which the Neumann boundary raises (grey: out of range)")
     return fig
 
 

@@ -16,7 +16,7 @@ from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.paper.figures import INDICES
 
-QUICK, FULL = ((51,), (50, 100)), ((201,), (50, 100, 200, 400))  # nodes per axis of the figures' fields, of the torus
+QUICK, FULL = ((51,), (50, 100)), ((201,), (50, 100, 200, 400))  # nodes per axis of the figures' fields and torus
 COARSE = 11
 
 Tensors = Float[np.ndarray, "n 2 2"]
@@ -102,8 +102,8 @@ def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",
         "",
-        "Triangles that violate it, of all, by the rule for an edge's length; and vertices whose circumcentric dual",
-        "cell has no positive area (lengths by the midpoint).",
+        "The numbers of triangles that violate it for each rule of edge lengths, and of vertices whose circumcentric",
+        "dual cell has no positive area (with midpoint lengths).",
         "",
         f"| field | triangles | {' | '.join(LENGTHS)} | vertices | without area |",
         "| --- |" + " ---: |" * (len(LENGTHS) + 3),

@@ -52,7 +52,7 @@ def signature_panels(
 
     Args:
         result: the signature to draw.
-        path: where to save the figure; None: nowhere.
+        path: the file in which to save the figure, if given.
         titles: a title for each time of a slice, by default “t = …”.
         first: a title and a scalar (*shape,), drawn in grey before the signature of a slice.
         title: the title of the whole figure of a slice.

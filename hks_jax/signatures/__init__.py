@@ -1,1 +1,1 @@
-"""From eigenpairs to scalar fields: signatures, kernels, distances, and what a truncated spectrum can resolve."""
+"""Scalar fields from eigenpairs: signatures, kernels, distances, and estimates of the truncation error."""

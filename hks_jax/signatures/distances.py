@@ -27,7 +27,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
     """Compute the diffusion distance d_t(x_s, x)² = Σᵢ exp(−2λᵢt) (φᵢ(x_s) − φᵢ(x))² (Coifman and Lafon 2006).
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         times: (n_times,) positive.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
@@ -42,7 +42,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
     """Compute the biharmonic distance d(x_s, x)² = Σᵢ (φᵢ(x_s) − φᵢ(x))² / λᵢ² over λᵢ > 0 (Lipman et al. 2010).
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Returns:
@@ -167,12 +167,12 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
 # Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
 # kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To
 # first order in h² the error of the squared distance is d²h² (d² − 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped
-# mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which is h²/12t ·
-# log 1/k with d² = 4t log 1/k.
+# mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which is
+# h²/12t · log 1/k with d² = 4t log 1/k.
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
-    """Return the least normalised kernel that the pairs resolve, and the least that the grid resolves."""
+    """Return the least normalised kernels that the pairs and the grid resolve."""
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:

@@ -30,8 +30,7 @@ def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, 
 #
 #     f[a, b, c] = ∫₀¹ s ∫₀¹ f''(a + s (b − a) + s u (c − b)) du ds,
 #
-# which is computed by Gauss quadrature in both variables. The equal (f[b, c] − f[a, b])/(c − a) is inaccurate for close
-# a, b, c.
+# by Gauss quadrature in both variables. The equal quotient (f[b, c] − f[a, b])/(c − a) is inaccurate for close a, b, c.
 def second_divided_difference(
     f: Function,
     low: Float[Array, "*n"],

@@ -76,10 +76,10 @@ def hks(
 ) -> Float[Array, "n_times *shape"]:
     """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
 
-    Sun, Ovsjanikov and Guibas 2009, eq. 5; Zobel, Reininghaus and Hotz, section 2.
+    See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2.
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         times: (n_times,) positive, in (metric length)².
         normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
             domain's area or volume (→ 1 for large t, except with a potential or a density); ``"flat"`` multiplies by
@@ -125,7 +125,7 @@ def hks_auto(
     methods, provided that this takes at most ten times the work of the spectrum-free times.
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         times: (n_times,) positive.
         normalisation: see `hks`.
         tolerance: the error allowed to both methods, relative to (4πt)^(−d/2).

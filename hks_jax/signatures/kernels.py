@@ -34,7 +34,7 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
     """Compute columns of the heat kernel, k_t(x_s, x) = Σᵢ exp(−λᵢt) φᵢ(x_s) φᵢ(x).
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         times: (n_times,) positive.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
 
@@ -56,7 +56,7 @@ def scale_invariant_hks(
     the modulus of the Fourier transform the shift. The default times scale with the spectrum, so invariance is exact.
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         n_frequencies: the number of Fourier moduli, from frequency 0.
         n_times: the number of samples of τ.
         times: (n,) log-spaced times for comparison at absolute scales; by default from 4 ln10/λ_last to 4 ln10/λ₁.
@@ -85,7 +85,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     WKS(e, x) = Σᵢ φᵢ(x)² exp(−(e − log λᵢ)²/2σ²) / Σᵢ exp(−(e − log λᵢ)²/2σ²) over the positive λᵢ.
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         energies: (n,) values of log λ, by default the 100 values of `default_energies`.
         sigma: the width σ > 0 in log λ, by default the width of `default_energies`.
 
@@ -133,7 +133,7 @@ def spectral_signature(
     respect to the tensors and to θ are exact at eigenvalues of any multiplicity.
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         function: maps (θ, λ) to f elementwise for λ of any shape, and is differentiable by JAX for λ > 0. Pass traced
             values in θ, not by closure. Define the function once, because every new function object is compiled again.
         parameters: θ, a pytree of floating point arrays with a leading axis m.

@@ -78,10 +78,12 @@ def heat_coefficients(
 # Let Z be the heat trace, n₀ the number of zero eigenvalues and T > 0. Then
 #
 #     Γ(s) ζ(s) = ∫₀^∞ t^(s−1) (Z(t) − n₀) dt,    Z(t) ~ Σⱼ aⱼ t^pⱼ,    pⱼ = (j − d)/2.
+#
 # Up to T each term of the expansion of Z is integrated and continued analytically. Beyond T each exponential is
 # integrated. With 1/Γ(s) = s + γs² + … the value at zero is
 #
 #     −log det′ = ζ′(0) = (a_d − n₀) (log T + γ) + Σ_{j≠d} aⱼ T^pⱼ/pⱼ + Σ E₁(λᵢT).
+#
 # The error is ∫₀^T (Z − Σⱼ aⱼ t^pⱼ) dt/t, whose leading term is the first omitted power. Richardson extrapolation from
 # the values at T, 2T, 4T, … removes these powers.
 def log_determinant(

@@ -176,7 +176,7 @@ def _resolution_bias(
 
 
 def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
-    """Return the medians (n) over the free nodes of numbers (n, nodes) between 0 and 1, which are 0 at the others.
+    """Return the medians (n,) over the free nodes of numbers (n, nodes) in [0, 1]; the numbers are 0 at other nodes.
 
     The accuracy is 1e-12, and NaN gives NaN. Bisection is ten times as fast as sorting in JAX.
     """
@@ -280,7 +280,7 @@ def truncation_map(
     largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6.
 
     Args:
-        pairs: from `eigenpairs`.
+        pairs: the result of `eigenpairs`.
         times: (n_times,) positive, in (metric length)².
 
     Returns:

@@ -34,9 +34,9 @@ class Colouring:
         reach: `Bounds.reach` for each axis, times the longest time.
         across: `Bounds.across` for each axis.
         error: an error bound at each time that includes rounding, relative to the smaller of (4πt)^(−d/2) and the
-            largest possible value at a node. For a lumped mass it holds except with probability 10⁻⁶, if `top` is too
-            small. For a consistent mass it is proven to first order in the polynomial for M⁻¹, for t → 0 and for a
-            constant metric. Errors for varying metrics were at most a fiftieth of it.
+            largest possible value at a node. For a lumped mass it holds unless `top` is too small, which has the
+            probability 10⁻⁶. For a consistent mass it is proven to first order in the polynomial for M⁻¹, for t → 0 and
+            for a constant metric. Errors for varying metrics were at most a fiftieth of it.
     """
 
     spacing: tuple[int, ...]

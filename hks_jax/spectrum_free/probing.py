@@ -45,10 +45,12 @@ def coloured_diagonal(
 
 # y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with  = 2PK/top − 1, and the result is Σₙ cₙ v∘yₙ. P approximates M⁻¹, and dM⁻¹
 # = −M⁻¹ dM M⁻¹. So the tangents of aₙ = PKyₙ are P(dK yₙ + K dyₙ − dM aₙ), and dy₀ = −P dM y₀.
+#
 # The transpose with the cotangent g is Clenshaw's recurrence pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂ from the last n down to 0,
 # where sₙ = Σₜ cₙ(t) g(t), f₀ = 1 and fₙ = 2. The cotangents are
 #
 #     of K: Σₙ (2fₙ/top) pₙ₊₁ ⊗ yₙ,    of M: −p₀ ⊗ y₀ − Σₙ (2fₙ/top) pₙ₊₁ ⊗ aₙ,    of cₙ(t): Σ g(t)∘v∘yₙ.
+#
 # The yₙ are needed in the order n = N − 1 … 0, and yₙ₋₁ = 2Âyₙ − yₙ₊₁ computes them in this order from the last two.
 # The three-term recurrence is as stable backwards as forwards: rounding errors grow like |Uₙ| ≤ n + 1 in both
 # directions. So the memory does not grow with the degree.

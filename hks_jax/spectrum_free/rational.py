@@ -1,6 +1,7 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by rational approximation and selected inversion.
 
-The Carathéodory–Fejér method gives exp(−x) ≈ Re Σ w/(x − z). The diagonal is then that of Re Σ w (tK − zM)⁻¹.
+The Carathéodory–Fejér method gives exp(−x) ≈ Re Σ w/(x − z). So the diagonal of Re Σ w (tK − zM)⁻¹ approximates the one
+sought.
 """
 
 from functools import lru_cache

@@ -78,7 +78,7 @@ def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
     ]
     report = json.loads((out / "report.json").read_text())
     assert report["input"]["order"] == "fit"
-    assert report["input"]["notes"][0] == "tensors fitted by weighted least squares to 13 of 13 images (b ≤ 1000)"
+    assert report["input"]["notes"][0] == "weighted least-squares fit to 13 of 13 images (b ≤ 1000 s/mm²)"
     repair = report["input"]["repair"]
     assert (repair["method"], repair["voxels"], repair["first"]) == ("nearest", 1, [[7, 6]])
     assert (

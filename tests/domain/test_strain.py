@@ -183,7 +183,7 @@ def test_indefinite_tensors_are_refused_with_the_maps(tmp_path, capsys):
     arguments = ["hks", str(file), "-o", str(out), "-q", "-k", "5", "--times", "1"]
     assert main(arguments) == 2
     error = capsys.readouterr().err
-    for words in ("indefinite by nature", "exp(S/s) with a scale s", f"shift c > {-least:.3g}", "--positive"):
+    for words in ("naturally indefinite", "exp(S/s) with a scale s", f"shift c > {-least:.3g}", "--positive"):
         assert words in error
     assert main(["info", str(file)]) == 0
     said = capsys.readouterr().out

@@ -265,7 +265,7 @@ def test_bad_meshes_are_refused(rng):
     refused(r"vertices: 1 of 5 belong to no cell \(the first is vertex 4\)", np.pad(TETRAHEDRON, [(0, 1), (0, 0)]))
     lost = TETRAHEDRON.copy()
     lost[2, 1] = np.nan
-    refused(r"vertices: 1 of them are NaN or infinite \(the first is 2\)", lost)
+    refused(r"vertices: 1 are NaN or infinite \(the first is vertex 2\)", lost)
     refused("metric: got shape .* one per tetrahedron", TETRAHEDRON, CELL, np.eye(3))
     negative = -np.eye(3)[None]
     refused(r"metric: 1 of 1 tensors are not .*\(the first at cell \(0,\)\)", TETRAHEDRON, CELL, negative)

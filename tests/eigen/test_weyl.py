@@ -83,9 +83,7 @@ def test_weyl_in_three_dimensions():
     field = flat((5, 5, 5), (1.0, 1.0, 1.0))
     pencil = hj.assemble(field)
     np.testing.assert_allclose(hj.weyl_count(pencil, [400.0], field), [8000 / (6 * np.pi**2) + 6 * 400 / (16 * np.pi)])
-    with pytest.raises(
-        ValueError, match=r"domain: got one of shape \(3, 3\); expected that of the problem, \(5, 5, 5\)"
-    ):
+    with pytest.raises(ValueError, match=r"domain: got shape \(3, 3\); expected the problem.s shape \(5, 5, 5\)"):
         hj.weyl_count(pencil, [1.0], flat((3, 3), (1.0, 1.0)))
     with pytest.raises(ValueError, match="values: got -1"):
         hj.weyl_count(pencil, [-1.0])

@@ -305,7 +305,7 @@ def test_forms_on_a_surface_see_space(rng):
     pairs = hj.eigenpairs(own, 5)
     assert pairs.eigenvalues[0] == 0
     assert (pairs.eigenvalues[1:] < hj.eigenpairs(built_in, 5).eigenvalues[1:]).all()
-    with unchecked(), pytest.raises(ValueError, match="mass: it has 64 negative"):
+    with unchecked(), pytest.raises(ValueError, match="mass: got a matrix with 64 negative"):
         hj.eigenpairs(hj.assemble(mesh, mass=lambda u, v, w: -u.value * v.value), 3)
 
 
@@ -319,9 +319,9 @@ def test_what_is_true_of_the_laplacian_alone_is_left_out():
     everything = hj.heat_trace(hj.eigenpairs(pencil, 17**2), [0.3])[0]
     assert estimate.tail[0] == pytest.approx(float(1 - hj.heat_trace(pairs, [0.3])[0] / everything), rel=0.3)
     own = hj.assemble(euclidean(5, 4.0), stiffness=lambda u, v, w: u.value * v.value)
-    with pytest.raises(ValueError, match="solver: 'chebyshev-filter' needs a stiffness that is positive"):
+    with pytest.raises(ValueError, match="solver: got 'chebyshev-filter', which needs a positive semidefinite"):
         hj.eigenpairs(own, 3, solver="chebyshev-filter")
-    with pytest.raises(ValueError, match="nothing is known of the null space"):
+    with pytest.raises(ValueError, match="unknown null space"):
         hj.hks_spectrum_free(own, [0.1])
     without = hj.hks_spectrum_free(pencil, [0.1, 0.3], method="selected-inversion")
     np.testing.assert_allclose(without, hj.hks(hj.eigenpairs(pencil, 17**2), [0.1, 0.3]), rtol=1e-8)

@@ -77,7 +77,7 @@ def test_multiplets_of_the_cube_are_complete(solver):
     signature = np.asarray(hj.hks(pairs, [0.2]))[0]
     for moved in (signature.transpose(1, 2, 0), signature.transpose(1, 0, 2), signature[::-1], signature[:, :, ::-1]):
         np.testing.assert_allclose(moved, signature, rtol=1e-9)
-    with pytest.warns(hj.AccuracyWarning, match=r"k = 15 cuts a multiple eigenvalue: its last 4"):
+    with pytest.warns(hj.AccuracyWarning, match=r"k = 15 cuts a multiple eigenvalue: the last 4"):
         hj.eigenpairs(hj.TensorField(unit_cube(7), IDENTITY), 15, solver=solver)
 
 

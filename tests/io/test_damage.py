@@ -114,7 +114,7 @@ def test_nifti_whose_header_contradicts_its_length(tmp_path, volume):
         content = bytearray(whole)
         struct.pack_into("<f" if place == 108 else "<h", content, place, value)
         assert refused(hj.io.read_tensors, path, bytes(content))
-    with pytest.raises(ValueError, match=r"u\.nii\.gz: not a readable NIfTI image"):
+    with pytest.raises(ValueError, match=r"u\.nii\.gz: the file is damaged or not a readable NIfTI image"):
         hj.io.read_tensors(_written(tmp_path / "u.nii.gz", gzip.compress(b"no image" * 100)))
 
 
@@ -143,15 +143,15 @@ def test_arrays_that_are_longer_or_shorter_than_declared(tmp_path):
         (b"<f8", b"<f4"),
     ):
         content = whole.replace(old, new)
-        with pytest.raises(ValueError, match=r"a\.npy: not a readable npy array"):
+        with pytest.raises(ValueError, match=r"a\.npy: the file is damaged or not a readable npy array"):
             load_npy(_written(tmp_path / "a.npy", content))
         # In an archive the checksum may be right and the array not what it says.
         with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
             archive.writestr("a.npy", content)
-        with pytest.raises(ValueError, match=r"a\.npz: not a readable npz archive"):
+        with pytest.raises(ValueError, match=r"a\.npz: the file is damaged or not a readable npz archive"):
             load_npz(tmp_path / "a.npz")
     for content in (whole[:-1], whole + b"\0", whole[:20], b"", whole.replace(b"NUMPY", b"NUMPI")):
-        with pytest.raises(ValueError, match=r"a\.npy: not a readable npy array"):
+        with pytest.raises(ValueError, match=r"a\.npy: the file is damaged or not a readable npy array"):
             load_npy(_written(tmp_path / "a.npy", content))
 
 
@@ -186,13 +186,13 @@ def test_checkpoints(tmp_path, rng):
             told += 1
     assert told > 60
     np.savez(file, other=values)
-    with pytest.raises(ValueError, match=r"checkpoint: .* is not one of a fit, it lacks best, history"):
+    with pytest.raises(ValueError, match=r"checkpoint: .* is not that of a fit, it lacks best, history"):
         checkpoint.load(file, "mark")
 
 
 @pytest.mark.parametrize("content", [b"", b"0 1000 x", b"0 nan 3", b"\xff\xfe0 1"])
 def test_tables_of_numbers(tmp_path, content):
-    with pytest.raises(ValueError, match=r"b\.bval: not a table of numbers"):
+    with pytest.raises(ValueError, match=r"b\.bval: the file is damaged or not a table of numbers"):
         dwi._numbers(_written(tmp_path / "b.bval", content))
 
 
@@ -230,7 +230,9 @@ def test_meshes_that_hold_something_else_than_they_declare(tmp_path, name, old, 
     assert len(hj.io.read_mesh(path).faces) == 2
     whole = path.read_bytes()
     assert old in whole
-    with pytest.raises(ValueError, match=f"{name}: not a (mesh that meshio can read|readable OFF mesh)") as told:
+    with pytest.raises(
+        ValueError, match=f"{name}: the file is damaged or not a (mesh that meshio can read|readable OFF mesh)"
+    ) as told:
         hj.io.read_mesh(_written(path, whole.replace(old, new, 1)))
     assert not isinstance(told.value.__cause__, MemoryError)
 

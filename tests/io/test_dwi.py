@@ -109,7 +109,7 @@ def test_b_values_in_another_unit_are_refused_until_it_is_told(scan, capsys, uni
         scan.fit(head())
     told = scan.fit(head(), unit=unit, b_max=1200)
     np.testing.assert_allclose(told.tensors, expected.tensors, atol=1e-12)
-    assert told.notes[0] == "tensors fitted by weighted least squares to 14 of 14 images (b ≤ 1000)"
+    assert told.notes[0] == "weighted least-squares fit to 14 of 14 images (b ≤ 1000 s/mm²)"
     assert told.unit == "mm²/s"
     images, b, g = map(str, scan.write())
     arguments = ["info", images, "--bval", b, "--bvec", g]

@@ -185,7 +185,7 @@ def test_damaged_files(tmp_path, tensors):
     (tmp_path / "cut.nrrd").write_bytes(path.read_bytes()[:-400])
     (tmp_path / "no.nrrd").write_bytes(b"not what the name says")
     for name in ("cut.nrrd", "no.nrrd"):
-        with pytest.raises(ValueError, match="not a readable NRRD file"):
+        with pytest.raises(ValueError, match="the file is damaged or not a readable NRRD file"):
             read_tensors(tmp_path / name)
     with pytest.raises(FileNotFoundError, match="no such file"):
         read_tensors(tmp_path / "absent.nrrd")

@@ -131,10 +131,10 @@ def test_damaged_files(tmp_path, tensors):
     for name, binary in (("a.vti", False), ("b.vti", True), ("a.vtk", False), ("b.vtk", True)):
         path = write(tmp_path / name, data, binary)
         path.write_bytes(path.read_bytes()[:-500])
-        with pytest.raises(ValueError, match="not readable VTK image data"):
+        with pytest.raises(ValueError, match="expected readable VTK image data"):
             read_tensors(path)
         path.write_bytes(b"not what the name says")
-        with pytest.raises(ValueError, match="not readable VTK image data"):
+        with pytest.raises(ValueError, match="expected readable VTK image data"):
             read_tensors(path)
     writer = vtkPolyDataWriter()
     from vtkmodules.vtkCommonDataModel import vtkPolyData
@@ -225,7 +225,7 @@ def test_a_vti_that_declares_what_it_does_not_hold(tmp_path, tensors, old, new, 
     content, n = re.subn(old.encode(), new.encode(), path.read_bytes())
     assert n
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"t\.vti: not readable VTK image data.*{message}"):
+    with pytest.raises(ValueError, match=rf"t\.vti: expected readable VTK image data.*{message}"):
         read_tensors(path)
 
 
@@ -278,5 +278,5 @@ def test_polygons_that_lead_astray(tmp_path, version, binary, old, new):
     assert len(hj.io.read_mesh(path).faces) == 96
     assert old in content
     path.write_bytes(content.replace(old, new, 1))
-    with pytest.raises(ValueError, match=r"s\.vtk: not readable polygonal data"):
+    with pytest.raises(ValueError, match=r"s\.vtk: expected readable polygonal data"):
         hj.io.read_mesh(path)

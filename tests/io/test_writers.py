@@ -140,7 +140,7 @@ def test_damaged_images_of_mrtrix(tmp_path):
         (whole[7:], "does not begin with"),
     ):
         (tmp_path / "t.mif").write_bytes(content)
-        with pytest.raises(ValueError, match=rf"t\.mif: not a readable MRtrix image.*{words}"):
+        with pytest.raises(ValueError, match=rf"t\.mif: the file is damaged or not a readable MRtrix image.*{words}"):
             hj.io.read_tensors(tmp_path / "t.mif")
     (tmp_path / "t.mih").write_bytes(whole)
     with pytest.raises(ValueError, match=r"MRtrix converts it into one file: mrconvert .*t\.mih .*t\.mif"):

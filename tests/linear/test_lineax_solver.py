@@ -145,7 +145,7 @@ def test_operators_that_are_singular_or_of_no_symmetry():
     solution = lx.linear_solve(singular, jnp.ones(3), SOLVER, throw=False)
     assert solution.result == lx.RESULTS.singular
     assert np.isnan(solution.value).all()
-    with pytest.raises(ValueError, match="operator: singular: 2 null vector"):
+    with pytest.raises(ValueError, match="operator: got a singular matrix with 2 null vector"):
         SOLVER.init(singular, {})
     with pytest.raises(ValueError, match="not known to be symmetric or Hermitian"):
         lx.linear_solve(lx.MatrixLinearOperator(jnp.eye(3)), jnp.ones(3), SOLVER)

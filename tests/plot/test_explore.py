@@ -101,7 +101,7 @@ def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(
         ({"tensors": np.full((*SHAPE, 2, 2), np.nan)}, "tensors: got NaN or infinite"),
         ({"maps": {"age": np.ones(3)}}, r"maps\['age'\]: got shape \(3,\)"),
         ({"labels": np.ones(SHAPE) / 2}, "labels: got fractional numbers"),
-        ({"labels": np.zeros(SHAPE)}, "labels: 0 everywhere"),
+        ({"labels": np.zeros(SHAPE)}, "labels: got 0 at all nodes"),
         ({"labels": np.zeros((3, 3))}, "labels: got shape"),
         ({"normalisation": "flatt"}, "normalisation: got 'flatt'"),
         ({"lengths": TIMES[1:]}, r"lengths: got shape \(6,\)"),
@@ -184,7 +184,7 @@ def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
     np.save(tmp_path / "labels.npy", np.zeros((3, 3)))
     assert "got labels of shape (3, 3)" in error(result, "--labels", tmp_path / "labels.npy")
     np.save(tmp_path / "labels.npy", np.full(SHAPE, 0.5))
-    assert "not whole" in error(result, "--labels", tmp_path / "labels.npy")
+    assert "got fractional numbers" in error(result, "--labels", tmp_path / "labels.npy")
     assert "pass --labels too" in error(result, "--names", tmp_path / "names.tsv")
     assert "ends in .html" in error(result, "-o", tmp_path / "page.png")
     assert "no such file" in error(tmp_path / "nowhere")

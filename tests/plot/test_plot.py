@@ -357,7 +357,7 @@ def test_hks_curves_errors():
     ax = new_figure(3, 3).subplots()
     with pytest.raises(ValueError, match=r"values: got shape \(2, 5, 4\) .*; expected .* \(1, 5, 4\)"):
         hks_curves(ax, np.zeros((2, 5, 4)), [1.0], grid, [[0, 0]])
-    with pytest.raises(ValueError, match=r"points: \(9.0, 0.0\) lies outside"):
+    with pytest.raises(ValueError, match=r"points: got \(9.0, 0.0\) outside"):
         hks_curves(ax, np.ones((1, 5, 4)), [1.0], grid, [[9, 0]])
     with (
         unchecked(),

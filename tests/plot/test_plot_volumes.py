@@ -97,7 +97,7 @@ def test_errors():
         volume_panels(ramp()[None], [1.0], GRID, node=(1, 2, 9))
     holed = ramp().astype(float)
     holed[1, 2, 3] = np.nan
-    with pytest.raises(ValueError, match=r"node: \(1, 2, 3\) has no value; .* is \(2, "):
+    with pytest.raises(ValueError, match=r"node: got \(1, 2, 3\), which has no value; .* such as \(2, "):
         volume_panels(holed[None], [1.0], GRID, node=(1, 2, 3))
     with pytest.raises(ValueError, match="axes: got 1; expected 3"):
         orthogonal_slices(new_figure(3, 3).subplots(1, 1, squeeze=False)[0], ramp(), GRID)

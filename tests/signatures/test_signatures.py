@@ -306,7 +306,7 @@ def test_too_small_times_are_reported():
         hj.hks(whole, [0.004])
     # The advice is the same whatever the time, and enough.
     said = [hj.truncation(whole, [t]).messages()[0] for t in (1e-6, 1e-3, 4e-3)]
-    (least,) = {float(re.search(r"from about (\S+),", text)[1]) for text in said}
+    (least,) = {float(re.search(r"at least about (\S+),", text)[1]) for text in said}
     assert 0.095 < hj.truncation(whole, [least]).resolution_bias[0] < 0.105
     smallest = hj.truncation(pairs, [0.5]).smallest_time
     assert hj.truncation(pairs, smallest[None]).tail[0] < 0.011
@@ -331,7 +331,7 @@ def test_bad_times(pairs, times, message):
 @pytest.mark.parametrize(
     ("sources", "message"),
     [
-        ((0, 8), r"sources: 1 of 1 are outside the mask \(the first is \(0, 8\)\)"),
+        ((0, 8), r"sources: got 1 of 1 nodes outside the mask \(the first is \(0, 8\)\)"),
         ((0, 9), "sources: got indices 0 … 9; expected nodes of shape"),
         ((0.0, 1.0), "expected integer node indices"),
         ([1, 2, 3], r"sources: got shape \(3,\); expected \(s, 2\) node indices"),
@@ -385,7 +385,7 @@ def test_batches_and_other_objects_are_refused(field, pairs):
     for function in (hj.hks, hj.heat_trace, hj.truncation, hj.truncation_map):
         with pytest.raises(ValueError, match=r"pairs: got a batch with eigenvalues of shape \(3, 5\).*jax.vmap"):
             function(batch, [1.0, 2.0, 3.0])
-        with unchecked(), pytest.raises(TypeError, match="pairs: got TensorField; expected what `eigenpairs` returns"):
+        with unchecked(), pytest.raises(TypeError, match="pairs: got TensorField; expected the result of `eigenpairs`"):
             function(field, [1.0])
     each = jax.vmap(lambda p: hj.heat_trace(p, jnp.array([1.0, 2.0])))(batch)
     np.testing.assert_allclose(each[0], hj.heat_trace(hj.eigenpairs(field, 5), [1.0, 2.0]), rtol=1e-10)

@@ -338,7 +338,7 @@ def test_a_volume_too_large_for_selected_inversion_is_left_to_colouring(monkeypa
         assert choose_method(pencil, times, "auto", 1e-3).degree > 1
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda t: hj.hks_spectrum_free(pencil, t))(times)
-    with pytest.raises(ValueError, match=r"a mesh of 1600 free vertices, .* more than 0\.001 GB\. Use eigenpairs"):
+    with pytest.raises(ValueError, match=r"a mesh with 1600 free vertices, .* more than 0\.001 GB\. Use eigenpairs"):
         hj.hks_spectrum_free(hj.examples.bumpy_torus_mesh(40), times)
 
 

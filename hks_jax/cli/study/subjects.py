@@ -57,8 +57,8 @@ class _RowParser(argparse.ArgumentParser):
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     """Read the table, and update the arguments for all subjects by those of each row.
 
-    A row with invalid options becomes a subject with a problem. The function raises ValueError only for errors of the
-    table: a missing `participant_id`, a label that BIDS does not allow, or a duplicate subject and session.
+    A row with invalid options becomes a subject with a problem. The function raises ValueError for a missing
+    `participant_id`, for a label that BIDS does not allow, and for a duplicate subject and session.
     """
     rows, parser = read_table(path), _RowParser(add_help=False)
     add_options(parser, f"@file {READING} @noise @atlas @names")

@@ -1,1 +1,1 @@
-"""Solves on the complement of known eigenvectors, which derivatives need."""
+"""Linear solves on the complement of computed eigenvectors, for derivatives."""

@@ -1,11 +1,11 @@
-"""What derivatives of eigenpairs solve with: the interface, and what its methods have in common, in NumPy or in JAX.
+"""The interface of linear solvers for derivatives of eigenpairs, and their common functions, in NumPy or JAX.
 
-The derivatives of a truncated spectrum need them. On the M-orthogonal complement of the p lowest eigenvectors K − λᵢM
-is positive definite, and so is K − σM for *every* σ below the next eigenvalue Λ, whatever its sign elsewhere.
-Preconditioned with it, the spectrum of conjugate gradients lies between 1 and (Λ − λᵢ)/(Λ − σ). So the rows are grouped
-by their λᵢ, each group has its own shift σ among them, and a few factorisations bring every row to convergence in a few
-steps. `HostAdjoint` does so with SciPy's factorisations, `FactorisedAdjoint` with those in JAX; `FilteredAdjoint` has a
-polynomial instead.
+Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
+eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
+indefinite on the whole space. Preconditioned with K − σM, the spectrum of K − λᵢM lies between 1 and (Λ − λᵢ)/(Λ − σ).
+So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice for
+fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those in JAX, and
+`FilteredAdjoint` a polynomial.
 """
 
 from abc import abstractmethod
@@ -24,14 +24,14 @@ from hks_jax.linear.pencil import P, SymmetricPencil
 from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
 
 Array = Any
-"""NumPy's or JAX's, the same for all arguments and the result."""
+"""An array of NumPy or JAX; all arguments and the result are of the same library."""
 Scalar = Float[Array, ""]
 Values = Float[Array, " p"]
-"""The p computed eigenvalues, the lowest, ascending."""
+"""The p lowest eigenvalues, in ascending order."""
 Vectors = Float[Array, "p n_dof"]
-"""Their M-orthonormal eigenvectors Φ."""
+"""The M-orthonormal eigenvectors Φ of these eigenvalues."""
 Rows = Float[Array, "k n_dof"]
-"""Right-hand sides or solutions; row i belongs to λᵢ."""
+"""Right-hand sides or solutions as rows; row i belongs to λᵢ."""
 OfRows = Float[Array, " k"]
 Columns = Float[Array, "n_dof b"]
 Shifts = Float[Array, " groups"]
@@ -39,23 +39,22 @@ Shifts = Float[Array, " groups"]
 SINGULAR = 1e-8
 """The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
 _LEAST = 100
-"""The size of a row that vanishes but for rounding, in units of ε times its former size; and the finest tolerance."""
+"""A row below this, in units of ε times its size before projection, counts as zero. Also the least tolerance in ε."""
 _FACTORISATION = 200
-"""What one factorisation costs, in solves of one row: about 100, doubled as small rows take few steps."""
+"""The cost of a factorisation in solves of one row: about 100, but doubled, because small rows take few steps."""
 _MOST_GROUPS = 16
 _ROWS = 128
-"""Rows that the known eigenvectors are taken out of at once: fewer read them more often from memory."""
+"""The number of rows projected together; with fewer rows, the eigenvectors are read from memory more often."""
 
 
 class Adjoint(eqx.Module, Generic[P]):
-    """How derivatives solve with K − λᵢM on the complement of the computed eigenvectors; all settings static.
+    """A linear solver with K − λᵢM on the complement of the computed eigenvectors; all settings are static.
 
-    Every eigensolver has one in its field ``adjoint``, and takes any other that can solve with the pencil.
+    Every eigensolver has a default in its field ``adjoint``; any other that supports the pencil may replace it.
 
     Attributes:
-        warns: whether `solve` itself warns of rows that do not converge, traced or not.
-        tolerance: of the error in the energy norm, relative to the largest row; not below what the
-            eigenvectors' dtype allows.
+        warns: whether `solve` itself warns of rows that do not converge, even if values are traced.
+        tolerance: the error in the energy norm, relative to the largest row. Rounding of eigenvectors is a lower bound.
     """
 
     warns: ClassVar[bool] = False
@@ -65,26 +64,26 @@ class Adjoint(eqx.Module, Generic[P]):
         require_number("tolerance", self.tolerance, 1)
 
     def prepare(self, pencil: P, values: Values, k: int) -> Any:
-        """Return what `solve` for the first k of p eigenvalues needs and no right-hand side changes."""
+        """Return the data that `solve` needs for the first k of p eigenvalues, independent of right-hand sides."""
         return None
 
     @abstractmethod
     def solve(self, prepared: Any, pencil: P, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0, where Q = I − MΦΦᵀ, p ≥ k and p < n_dof.
 
-        `prepare` has prepared it. What did not converge is NaN. Traceable.
+        ``prepared`` is the result of `prepare`. Rows that did not converge are NaN. Works under `jit`.
         """
 
 
 def attainable(tolerance: float, dtype: Any) -> float:
-    """Return the tolerance, or what rounded eigenvectors allow if that is more: beyond it is noise."""
+    """Return the tolerance, but at least the error caused by rounding of the eigenvectors."""
     return max(tolerance, _LEAST * float(np.finfo(dtype).eps))
 
 
 def definite_product(
     stiffness: Callable[[Array], Array], mass: Callable[[Array], Array], shifts: Float[Array, " b"], beyond: Scalar
 ) -> Callable[[Columns], tuple[Columns, Float[Array, " b"]]]:
-    """Return x ↦ (K − λᵢM) xᵢ, with the energy below which an eigenvalue equal to λᵢ is left on the complement."""
+    """Return x ↦ (K − λᵢM) xᵢ, and the energy below which K − λᵢM counts as singular on the complement."""
 
     def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
         image = mass(x)
@@ -94,43 +93,43 @@ def definite_product(
 
 
 def first_beyond(values: Values) -> Scalar:
-    """Return an estimate Λ of the first eigenvalue that is left; the last of the known ones is positive."""
+    """Estimate Λ, the first eigenvalue on the complement, given computed eigenvalues of which the last is positive."""
     return values[-1] * (1 + 1 / values.size)
 
 
 def amplification(values: Values, k: int) -> OfRows:
-    """Return the norms Λ/(Λ − λᵢ), relative to that for λ = 0, of the inverses on the complement."""
+    """Return Λ/(Λ − λᵢ), the norms of the inverses on the complement, relative to the norm for λ = 0."""
     beyond = first_beyond(values)
     return beyond / (beyond - values[:k])
 
 
-# The accuracy asked for is relative to the right-hand sides bᵢ as they were given, before Q = I − MΦΦᵀ took the known
-# eigenvectors out of them. What is left may be rounding alone: along T itself dK and dM are multiples of K and M, so
-# that bᵢ is one of Mφᵢ and Qbᵢ = 0. Relative to itself that noise has no solution, since most of it lies in the span of
-# MΦ, where it was taken out. It is zero. So it is in reverse mode, whose bᵢ are the cotangents of the solutions:
-# where all nodes count alike, for instance, they are multiples of Mφᵢ again.
+# The tolerance is relative to the right-hand sides bᵢ before the projection Q = I − MΦΦᵀ. The projections Qbᵢ may be
+# pure rounding errors. For example, if the tensors T change by a multiple of T, dK and dM are multiples of K and M, so
+# that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Such noise lies mostly in the span of MΦ, so that a solution with a small
+# error relative to the noise does not exist. Therefore the row counts as zero. The same holds in reverse mode, where
+# the bᵢ are cotangents of the solutions. For example, if all nodes have equal weights, the bᵢ are multiples of Mφᵢ.
 #
-# Small rows need fewer digits, or none: their share in sums over all rows is small. Where the operator
-# amplifies more, because λᵢ is near Λ, they count for more.
+# Small rows need fewer digits, or none, because they contribute little to sums over all rows. Rows with λᵢ near Λ have
+# a larger weight, because the inverse amplifies them.
 def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: float, dtype: Any) -> OfRows:
-    """Return the errors to reduce rows to, in the energy norm, relative to each row's own; infinite for zero.
+    """Return the wanted errors in the energy norm, relative to each row's own norm; infinite for rows that are zero.
 
     Args:
         before: the `norms` of the right-hand sides bᵢ.
-        after: those of their projections Qbᵢ.
-        amplified: how much larger the solution of a row becomes than that of another as large.
-        tolerance: the accuracy of the largest row.
-        dtype: what the eigenvectors and the rows were rounded to.
+        after: the `norms` of the projections Qbᵢ.
+        amplified: the `amplification` of each row.
+        tolerance: the wanted relative error of the largest row.
+        dtype: the dtype to which eigenvectors and rows were rounded.
     """
     xp, largest = amplified.__array_namespace__(), before.max()
-    # Where all rows are zero, none is asked for.
+    # If all rows are zero, no row is solved.
     share = after / xp.where(largest > 0, largest, 1) * amplified
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
 
 
 def norms(rows: Rows, lumped: Float[Array, " n_dof"]) -> OfRows:
-    """Return ‖rᵢ‖ in the norm of M⁻¹, M replaced by its diagonal."""
+    """Return ‖rᵢ‖ in the norm of D⁻¹, where D is the diagonal of M."""
     xp = rows.__array_namespace__()
     return xp.sqrt(xp.sum(rows * rows / lumped[None], axis=1))
 
@@ -138,10 +137,10 @@ def norms(rows: Rows, lumped: Float[Array, " n_dof"]) -> OfRows:
 def group_numbers(
     distance: Float[np.ndarray, " m"], rows: int, tolerance: float, most: int = _MOST_GROUPS
 ) -> Int[np.ndarray, " m"]:
-    """Return the group of each distance from Λ, of a limited number of groups in geometric progression.
+    """Divide distances from Λ into groups in geometric progression, and return the group of each distance.
 
-    With s groups of distances that differ by up to a ratio ρ the condition is ρ^(1/2s); s weighs factorisations against
-    the steps for all rows, which count as often as they are solved for.
+    If the largest and least distances have the ratio ρ, s groups have the condition ρ^(1/2s). The number s minimises
+    the cost of factorisations and of steps for all rows.
     """
     ratio = max(distance.max() / distance.min(), 1 + 1e-12)
 
@@ -154,7 +153,7 @@ def group_numbers(
 
 
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
-    """Return for each group of rows the shift of the least condition: its distance from Λ is a geometric mean."""
+    """Return each group's shift of least condition, whose distance from Λ is a geometric mean."""
     xp = values.__array_namespace__()
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
@@ -163,7 +162,7 @@ def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
 
 
 def middles_of_gaps(values: Values, targets: Shifts, otherwise: Scalar) -> Shifts:
-    """Return the middle of the gap of known eigenvalues nearest to each target; ``otherwise`` where all are equal."""
+    """Return the midpoint of the computed gap nearest to each target; ``otherwise`` if all eigenvalues are equal."""
     xp = values.__array_namespace__()
     gaps = xp.diff(values)
     typical = (values[-1] - values[0]) / (values.size - 1)
@@ -173,26 +172,26 @@ def middles_of_gaps(values: Values, targets: Shifts, otherwise: Scalar) -> Shift
 
 
 def unsolved(failed: int | str, total: int) -> str:
-    """Say that solves did not converge, and for how many of all rows."""
+    """Return the message that the solves for some rows did not converge."""
     return (
-        f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, and their part is NaN. k, "
-        "or an end of the interval, may cut a cluster of eigenvalues, or the eigenpairs themselves did not converge: "
-        "take another k, interval or solver, or set multiplet='drop' in `eigenpairs`"
+        f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, so their derivatives are "
+        "NaN. Either k or an end of the interval cuts a cluster of eigenvalues, or the eigenpairs did not converge. "
+        "Use another k, interval or solver, or set multiplet='drop' in `eigenpairs`"
     )
 
 
 def without_known(pencil: SymmetricPencil, vectors: Vectors) -> OfColumns:
-    """Return x ↦ x − ΦΦᵀMx, of columns."""
+    """Return the projection x ↦ x − ΦΦᵀMx for columns."""
     mass = pencil.mass.of_columns()
     return lambda x: x - matmul(products_with_columns(vectors, mass(x)).T, vectors).T
 
 
-# All that is as large as the eigenvectors is computed in place: to fill a new array of that size, whose memory the
-# system has to provide, takes as long as products with it.
+# Arrays as large as the eigenvectors are updated in place. Filling a new array of this size takes as long as products
+# with it, because the system must provide its memory.
 def projected(
     pencil: SymmetricPencil, vectors: Vectors, rhs: Rows, tolerance: float, amplified: OfRows
 ) -> tuple[Rows, OfRows]:
-    """Return Q rhs, Q = I − MΦΦᵀ, and the `wanted_errors` of its rows."""
+    """Return Q rhs, where Q = I − MΦΦᵀ, and the `wanted_errors` of its rows."""
     lumped = pencil.mass.diagonal()
 
     def project(b: Rows, _: Array) -> tuple[Rows, OfRows]:
@@ -205,7 +204,7 @@ def projected(
 
 
 def cleaned(pencil: SymmetricPencil, vectors: Vectors, x: Rows) -> Rows:
-    """Return x − ΦΦᵀMx, of rows."""
+    """Return the projection x − ΦΦᵀMx of rows."""
 
     def clean(x: Rows) -> tuple[Rows]:
         return (x - matmul(inner_products(vectors, pencil.mass.apply(x)), vectors),)
@@ -214,7 +213,7 @@ def cleaned(pencil: SymmetricPencil, vectors: Vectors, x: Rows) -> Rows:
 
 
 def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[Array, ...]:
-    """Return the projections of rows, of some at a time: of a few of them twice, which changes nothing."""
+    """Project blocks of rows, one after another. The last block may overlap; projecting twice changes nothing."""
     size = even_size(len(rows[0]), _ROWS)
     starts, _ = row_blocks(len(rows[0]), size)
 
@@ -228,12 +227,12 @@ def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[
 
 
 def solve_in_blocks(
-    of_group: Callable[[Int[Array, ""]], Any],  # returns what the blocks of a group share
-    solve: Callable[..., Columns],  # x for (what the group shares, rhs, wanted, *of_rows) of one block, as columns
-    size: int,  # rows of a block
+    of_group: Callable[[Int[Array, ""]], Any],  # returns the common data of a group's blocks
+    solve: Callable[..., Columns],  # (common data, rhs, wanted, *of_rows) ↦ x of one block, as columns
+    size: int,  # the number of rows per block
     first: Int[np.ndarray, " groups"],  # the first row of each group of blocks
     rhs: Rows,
-    wanted: OfRows,  # the error wanted of each row; where it is infinite there is nothing to solve
+    wanted: OfRows,  # the wanted error of each row; if infinite, the row is not solved
     *of_rows: OfRows,
 ) -> Rows:
     """Solve for blocks of rows, one after another."""
@@ -247,7 +246,7 @@ def solve_in_blocks(
         def solve_block(number: Array, x: Rows) -> Rows:
             start = jnp.asarray(starts)[number]
             b, error, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in (x, wanted, *of_rows))
-            unsolved = start + np.arange(size) >= number * size  # the last block may overlap the one before
+            unsolved = start + np.arange(size) >= number * size  # the last block may overlap the previous one
             solution = solve(shared, b.T, jnp.where(unsolved, error, jnp.inf), *own).T
             return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
 

@@ -1,9 +1,9 @@
-"""Solves with K − λᵢM on the complement of known eigenvectors, all in JAX.
+"""Linear solves with K − λᵢM on the complement of computed eigenvectors, all in JAX.
 
-The method is that of `hks_jax.eigen.complement.adjoint`: conjugate gradients, preconditioned with a factorisation of
-K − σM for each group of neighbouring eigenvalues. Groups are made by index and not by value, so that shapes are static:
-by Weyl's law eigenvalues are spread evenly enough for that. The factorisations depend on the matrices alone, and serve
-all products with a Jacobian at one point.
+The method is described in `hks_jax.eigen.complement.adjoint`: conjugate gradients with a factorisation of K − σM as
+preconditioner for each group of neighbouring eigenvalues. Groups are formed by index instead of value, so that shapes
+are static; by Weyl's law, the distribution of eigenvalues is regular enough. All products with the Jacobian at one
+point share the factorisations.
 """
 
 from typing import Any
@@ -26,16 +26,16 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import matmul, products_with_columns
 
 BLOCK = 16
-"""Rows solved at once."""
+"""The number of rows solved together."""
 WINDOW = 32
-"""Eigenvectors next to a shift that every step takes out."""
+"""The number of eigenvectors nearest to a shift that every step projects out."""
 _GROWTH = 4e7
-"""By what rounding in the direction of known eigenvectors grows at most: 1e4 to 1e5 as a rule, measured."""
+"""A bound of the growth of rounding errors along computed eigenvectors; measured values are usually 1e4 to 1e5."""
 _MEMORY = 5e8
-"""Bytes that factorisations may take together."""
+"""The maximal total size of the factorisations in bytes."""
 
 Shifted = tuple[Factorisation, Shifts]
-"""Factorisations of K − σM, stacked, and their shifts."""
+"""Stacked factorisations of K − σM, and their shifts."""
 Groups = tuple[Int[np.ndarray, " groups"], Int[np.ndarray, " groups"]]
 """The first row of each group, and its last row; static."""
 
@@ -43,11 +43,11 @@ Groups = tuple[Int[np.ndarray, " groups"], Int[np.ndarray, " groups"]]
 class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     """Conjugate gradients, preconditioned with a factorisation of K − σM for each group of neighbouring eigenvalues.
 
-    For any pencil that can be factorised: grids, above all in 2D, meshes, sparse matrices.
+    The solver supports every pencil that can be factorised: grids (mainly in 2D), meshes, and sparse matrices.
 
     Attributes:
-        tolerance: of the error in the energy norm, relative to the largest row.
-        solves: how often one preparation serves, about. Many solves are worth more factorisations.
+        tolerance: the error in the energy norm, relative to the largest row.
+        solves: the expected number of solves per preparation. For many solves, more factorisations are computed.
     """
 
     tolerance: float = eqx.field(default=1e-8, static=True)
@@ -57,13 +57,13 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
         if known_here((pencil, values)):
-            # One after another: the solver has compiled that.
+            # Factorise the shifts in sequence by the function that the eigensolver has already compiled.
             dissection = jax.device_put(dissection)
             shifts = self._shifts(pencil, np.asarray(values), self.groups(dissection, len(values), k, values.dtype))
             each = [factorise(dissection, pencil.shifted(jnp.asarray(shift))) for shift in shifts]
             stacked = jax.tree.map(lambda *x: np.stack(x), *((f.downward, f.upward, f.pivots) for f in each))
             return Factorisation(dissection, *jax.device_put(stacked)), jax.device_put(shifts)
-        # Compiled without the dissection: what a compiled function hands through is copied.
+        # The compiled function does not return the dissection, because XLA would copy it.
         factors, shifts = self._factorise(dissection, pencil, values, k)
         return Factorisation(dissection, *factors), shifts
 
@@ -102,7 +102,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return x if clean_enough else complement.cleaned(pencil, vectors, x)
 
     def groups(self, dissection: Dissection, p: int, k: int, dtype: np.dtype) -> Groups:
-        """Group blocks of the first k of p rows, each by the distance that its middle row has; see `group_numbers`."""
+        """Group blocks of the first k of p rows by the distances of their middle rows; see `group_numbers`."""
         start = np.arange(0, k, BLOCK)
         end = np.minimum(start + BLOCK, k)
         distance = self._distance(p, k, (start + end - 1) / 2)
@@ -112,10 +112,10 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         _, first = np.unique(number, return_index=True)
         return start[first], np.append(start[first[1:]], k) - 1
 
-    # What differs where eigenvalues are left on both sides of those that are known follows.
+    # `InteriorAdjoint` overrides the following methods.
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return how far the eigenvalues of rows are from Λ, by Weyl's law in 2D."""
+        """Return the distances of the rows' eigenvalues from Λ, by Weyl's law in 2D."""
         return p + 1 - row
 
     def _shifts(self, pencil: Any, values: Values, groups: Groups) -> Shifts:
@@ -123,11 +123,11 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return complement.shifts_between(values, beyond - values[last], beyond - values[first])
 
     def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
-        """Return how much larger the solutions of rows become than those of others as large."""
+
         return complement.amplification(values, k)
 
-    # Where r has some φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ): by much for those next
-    # to σ above all, which is why no others are taken out before the end, or before that makes it start again.
+    # If r has a component along φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ). This factor is
+    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the others follow at the end or a restart.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
@@ -141,30 +141,30 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return conjugate_gradients(product, precondition, b, wanted, clean=without_known).converged
 
 
-# Eigenvalues are left on both sides of the known ones: K − λᵢM is indefinite on the complement. But let a shift σ, like
-# λᵢ, lie between Λ₋, the last eigenvalue that is left below, and Λ₊, the first that is left above. Then every λⱼ that
-# is left lies on the same side of both, and
+# On the complement, eigenvalues lie on both sides of the computed ones, so that K − λᵢM is indefinite. Let Λ₋ be the
+# last eigenvalue of the complement below the computed ones, and Λ₊ the first above. Let the shift σ, like λᵢ, lie
+# between Λ₋ and Λ₊. Then every λⱼ of the complement lies on the same side of σ and λᵢ, and
 #
 #     A = (K − σM)⁻¹ (K − λᵢM)
 #
-# has on the complement the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0. It is symmetric in the inner product xᵀMy. So conjugate
-# gradients in that inner product solve A xᵢ = (K − σM)⁻¹ bᵢ. As A is computed with the very K − λᵢM, the accuracy of
-# the factorisation limits how fast they converge, and not the solution.
+# has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. A is symmetric in the inner product xᵀMy. So conjugate
+# gradients in this inner product solve A xᵢ = (K − σM)⁻¹ bᵢ. Products with A use the exact K − λᵢM. So an inaccurate
+# factorisation slows convergence, but does not change the solution.
 #
-# With the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋) the condition of A is at most the ratio of ω(λᵢ) and ω(σ): for λᵢ < σ, say, the
-# eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). The odds take the place of the distance from
-# Λ, their limit for Λ₋ → −∞: rows are grouped by their odds in geometric progression, and the shift of a group is the
-# geometric mean.
+# Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋). The condition of A is at most the ratio of ω(λᵢ) and ω(σ); for example, if
+# λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). The odds replace the distance from
+# Λ, to which they are proportional in the limit Λ₋ → −∞. Rows are grouped by their odds in geometric progression, and
+# the odds of a group's shift are the geometric mean.
 class InteriorAdjoint(FactorisedAdjoint):
     """Conjugate gradients in the inner product of M, with a factorisation of K − σM for each group of rows.
 
-    Where `Adjoint` has the lowest eigenvalues, here are the k pairs that the rows belong to, ascending from the origin
-    of a `LocatedPencil`, and then others next to them, on either side and in any order. Where there is no other they
-    are zero vectors, with one of the known eigenvalues. The error is measured in the norm of M.
+    The pairs are the k pairs of the rows, ascending from the origin of a `LocatedPencil`, followed by guard pairs on
+    either side in any order. Guards that do not exist are zero vectors with one of the computed eigenvalues. The error
+    is measured in the norm of M.
     """
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return the odds, if eigenvalues are spread evenly, and as many others known on both sides."""
+        """Return the odds for equidistant eigenvalues with equally many guards on both sides."""
         others = (p - k) / 2
         return (k + others - row) / (row + others + 1)
 
@@ -172,7 +172,7 @@ class InteriorAdjoint(FactorisedAdjoint):
         (first, last), (low, high) = groups, _left(pencil, values)
         odds = (high - values) / (values - low)
         mean = jnp.sqrt(odds[first] * odds[last])
-        # Where all known are one eigenvalue, there is the gap between it and the origin, above which it is the first.
+        # If all computed eigenvalues are equal, use the gap between the origin and this eigenvalue.
         return complement.middles_of_gaps(jnp.sort(values), (high + mean * low) / (1 + mean), values[0] / 2)
 
     def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
@@ -191,11 +191,11 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
             return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
-        # Of the traces of known eigenvectors that rounding leaves, A amplifies those next to σ alone.
+        # Rounding leaves components along computed eigenvectors, of which A amplifies only those near σ.
         right = factor.solve(b)
         return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 
 
 def _left(pencil: LocatedPencil, values: Values) -> tuple[Scalar, Scalar]:
-    """Return estimates of Λ₋ and Λ₊, the eigenvalues next to the known ones that are left."""
+    """Estimate Λ₋ and Λ₊, the eigenvalues of the complement nearest to the computed ones."""
     return jnp.min(values) - pencil.spacing, jnp.max(values) + pencil.spacing

@@ -28,33 +28,34 @@ from hks_jax.linear.loops import while_loop
 from hks_jax.traced import is_traced
 
 _FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
-"""Rounds on the coarsest grid, from random functions, and on those between."""
+"""The numbers of rounds on the coarsest grid, which starts from random functions, and on each intermediate grid."""
 _ROOM = 12
-"""Degrees of freedom per vector that a coarse grid must have."""
+"""The least number of degrees of freedom per vector on a coarse grid."""
 _LEAST_NODES = 6
-"""Nodes along each axis below which a grid is not coarsened."""
+"""The least number of nodes along each axis at which a grid is coarsened."""
 _LARGE = 1 << 21
-"""Numbers in all vectors from which on a round takes so long that its blocks are told one by one."""
+"""The total size of the vectors above which a round is so long that progress is reported after each block."""
 
 Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
 
 
 class ChebyshevFilter(Eigensolver[Pencil]):
-    """Chebyshev-filtered subspace iteration on stencils: no factorisation, memory for the vectors and little more.
+    """Chebyshev-filtered subspace iteration on stencils, without a factorisation; memory is mainly for the vectors.
 
-    For grids, above all in 3D, where factorisations fill in, and on accelerators. Filters run in single precision
-    without loss: they act on residuals, which are computed in the matrices' own. Multiple eigenvalues are found whole,
-    since all are sought at once, but there is no certificate that none was missed. Traceable whole; called plainly it
-    can be interrupted, and reports progress, between two rounds.
+    The solver is for grids, mainly in 3D, where factorisations have much fill-in, and for accelerators. Filters run in
+    single precision without loss of accuracy, because they act on residuals that are computed in the precision of the
+    matrices. All pairs are computed simultaneously, so that multiple eigenvalues are complete; but no certificate shows
+    that none was missed. All works under `jit`. Outside `jit`, the solver can be interrupted and reports progress
+    between two rounds.
 
     Attributes:
-        tolerance: relative residual that counts as converged.
-        block: vectors filtered together; with it grows the memory beyond that for all vectors.
-        spare: how many vectors to iterate beyond k, as a part of k: more converge faster, and cost more.
-        max_rounds: rounds on the finest grid before giving up.
+        tolerance: the relative residual at which a pair counts as converged.
+        block: the number of vectors filtered together. The workspace is proportional to this number.
+        spare: the number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds.
+        max_rounds: the maximal number of rounds on the finest grid.
         single_precision: whether filters run in float32.
-        mesh: devices to share the work among, a `jax.sharding.Mesh` with one axis: each filters some of the vectors,
-            and holds all of them on a part of the grid (docs/devices.md). None: one device.
+        mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
+            all vectors on a part of the grid (docs/devices.md). None is one device.
     """
 
     name: ClassVar[str] = "chebyshev-filter"
@@ -75,9 +76,9 @@ class ChebyshevFilter(Eigensolver[Pencil]):
             checked_mesh(self.mesh)
 
     def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs; the bound is NaN: there is no certificate."""
+        """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate."""
         if not isinstance(pencil.stiffness, StencilOperator):
-            raise ValueError("solver: chebyshev-filter needs a grid; use 'shift-invert' for a mesh")
+            raise ValueError("solver: got 'chebyshev-filter', which needs a grid; use 'shift-invert' for a mesh")
         assert isinstance(pencil.space, GridSpace)
         plan = self.plan(k, pencil.space)
         compute = _compiled if is_traced(pencil) else _lowest
@@ -85,11 +86,11 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
     def guards(self, k: int, n_dof: int) -> int:
-        """Return as many as are iterated anyway, so that what is left to linear solves is far away."""
+        """Return half of the number of spare vectors: as guards, they keep linear solves well conditioned."""
         return max(8, int(self.spare * k) // 2)
 
     def max_pairs(self, n_dof: int) -> int:
-        """Return how many pairs leave most of the spectrum to be damped."""
+        """Return the largest k for which the filter still damps most of the spectrum."""
         return max(n_dof // 8 - self.block, 0)
 
     def plan(self, k: int, space: GridSpace) -> Plan:
@@ -124,7 +125,7 @@ _compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
 def _converge(
     grid: GridFilter, rounding: Float[Array, ""], state: FilterState, max_rounds: int, report: Report
 ) -> FilterState:
-    """Return the state after rounds on the finest grid, each told, and of large problems the blocks of each."""
+    """Return the state after the rounds on the finest grid. Report each round and, for large problems, each block."""
     plan, told = grid.plan, report is not silent and not is_traced(state)
     in_steps = told and plan.mesh is None and state.vectors.size >= _LARGE
     pace = Pace(float(grid.excess(rounding, state)) if told else math.nan)
@@ -153,10 +154,10 @@ def _converge(
 
 
 class Pace:
-    """How long a subspace iteration still takes, from the convergence and the cost of the rounds so far.
+    """An estimate of the remaining time of a subspace iteration, from the convergence and cost of earlier rounds.
 
-    The largest residual falls by about the same factor in every round, and a round takes time in proportion to the
-    products that its polynomials have. Nothing is estimated before one round is over.
+    The estimate assumes that each round reduces the largest residual by the same factor. The time of a round is assumed
+    to be proportional to its number of matrix–vector products. The first estimate follows the first round.
     """
 
     def __init__(self, excess: float) -> None:
@@ -166,23 +167,23 @@ class Pace:
         self._begin = time.perf_counter()
 
     def round_done(self, excess: float, work: int) -> None:
-        """Remember the products of a round, and the residual after it."""
+        """Record the number of products in a round, and the residual after this round."""
         now = time.perf_counter()
         self._factor, self._excess = self._excess / excess if excess > 0 else math.inf, excess
         self._work, self._seconds, self._begin = work, now - self._begin, now
 
     def seconds_left(self, done: int = 0, work: int = 0) -> float | None:
-        """Return the seconds left, with `done` of `work` products of this round done, if any; None where unknown."""
+        """Return the remaining seconds after `done` of `work` products of this round; None if unknown."""
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
-        # Later rounds have fewer pairs to filter: this one's work, where it is known, is the better guess for all.
+        # Later rounds filter fewer pairs. So the work of this round, if known, is a better estimate than the last.
         per_round = self._seconds * ((work or self._work) / self._work if self._work else 1.0)
         return (rounds - (done / work if work else 0.0)) * per_round
 
 
 def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:
-    """Return the pencils from the fine grid to the coarsest."""
+    """Return the pencils of all grids, from the finest to the coarsest."""
     grids, free = [nodal_pencil(pencil)], pencil.space.free
     while True:
         free = free[(slice(None, None, 2),) * free.ndim]
@@ -192,5 +193,5 @@ def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:
 
 
 def _replicated(mesh: Mesh | None, grid: GridFilter) -> GridFilter:
-    """Return the arrays with a copy on every device."""
+    """Copy the arrays to every device."""
     return grid if mesh is None else jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, EVERYWHERE))(grid)

@@ -1,6 +1,6 @@
-"""Coarser grids for a pencil of stencils: every second node of each axis, by Galerkin's principle.
+"""Galerkin coarsening of a pencil of stencils to every second node of each axis.
 
-The eigenfunctions of the coarse problem, interpolated, are where an iteration on the fine grid starts.
+An iteration on the fine grid starts from the interpolated eigenfunctions of the coarse grid.
 """
 
 import math
@@ -18,19 +18,19 @@ from hks_jax.fem.space import axis_colours
 from hks_jax.fem.stencil import Stencil
 
 _COLUMNS = 16
-"""Columns in one product."""
+"""The number of columns in one product."""
 
 
 @jax.jit
 def coarsen(fine: NodalPencil) -> NodalPencil:
-    """Return the pencil on every second node of each axis, its matrices PᵀKP and PᵀMP, P the interpolation."""
+    """Return PᵀKP and PᵀMP, where P interpolates from every second node of each axis."""
     every_second = (slice(None, None, 2),) * len(fine.shape)
     free, domain = fine.free[every_second], fine.domain[every_second]
     shape = free.shape
     axes = [_axis_colours(n, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
     counts = [int(own.max()) + 1 for _, own, _ in axes]
     padded = -(-math.prod(counts) // _COLUMNS) * _COLUMNS
-    # What is along axes is all that the program has for constants; behind the barrier the compiler leaves them alone.
+    # The only constants of the program are arrays along axes. The barrier prevents constant folding.
     colours, of_neighbour = _colouring(jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes]), counts)
     indicators = (colours.ravel() == np.arange(padded, dtype=np.int32)[:, None]).reshape(-1, _COLUMNS, colours.size)
     indicators, of_neighbour = jax.lax.optimization_barrier((indicators, of_neighbour))
@@ -41,7 +41,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
         return tuple(to_rows(*restrict(image)) for image in fine.products()(raised))
 
     def coupled(images: Float[Array, "blocks b coarse"]) -> Stencil:
-        # A node's image under the sum of a colour's basis functions is its coupling to the one of them near by.
+        # Basis functions of one colour have disjoint neighbourhoods. So the image of the sum of these functions at a
+        # node is the entry that couples the node to the nearest function.
         entries = jnp.take_along_axis(images.reshape(padded, *shape), jnp.maximum(of_neighbour, 0), axis=0)
         return Stencil(jnp.where(of_neighbour >= 0, entries, 0), fine.periodic)
 
@@ -50,7 +51,7 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
 
 
 def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array, "*shape b"]:
-    """Interpolate from every second node multilinearly; beyond a rim, constantly; zero at nodes that are not free."""
+    """Interpolate multilinearly from every second node, constantly beyond the rim; zero at nodes not free."""
     every_second = (slice(None, None, 2),) * len(fine.shape)
     weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, fine.periodic)
     x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, fine.periodic)
@@ -73,7 +74,7 @@ def _interpolate(x: Float[Array, "*coarse b"], shape: tuple[int, ...], periodic:
 
 
 def _axis_colours(n: int, wraps: bool) -> Int[np.ndarray, "3 n"]:
-    """Return the colours along an axis of the node before, a node itself and the one after; −1 if there is none."""
+    """Return the colours along an axis of the previous node, the node itself and the next node; −1 for no node."""
     own = axis_colours(n, 3, wraps)
     rimmed = np.pad(own, 1, mode="wrap") if wraps else np.pad(own, 1, constant_values=-1)
     return np.stack([rimmed[:-2], own, rimmed[2:]]).astype(np.int32)
@@ -82,7 +83,7 @@ def _axis_colours(n: int, wraps: bool) -> Int[np.ndarray, "3 n"]:
 def _colouring(
     axes: Sequence[Int[Array, "3 _n"]], counts: Sequence[int]
 ) -> tuple[Int[Array, "*shape"], Int[Array, "offsets *shape"]]:
-    """Return colours in which a node and its neighbours all differ, and for each offset the neighbour's; −1 if none."""
+    """Return a colouring in which neighbours differ, and for each offset the neighbour's colour (−1 if none)."""
     d = len(axes)
     number: Any = np.zeros((1,) * (2 * d), np.int32)
     exists: Any = np.ones((1,) * (2 * d), bool)

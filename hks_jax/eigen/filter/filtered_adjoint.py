@@ -1,8 +1,7 @@
-"""Solves with K − λᵢM on the complement of known eigenvectors, matrix-free: conjugate gradients with a polynomial.
+"""Matrix-free linear solves with K − λᵢM on the complement of computed eigenvectors, by conjugate gradients.
 
-The polynomial of the filter, with its sign changed, is the preconditioner, in single precision;
-residuals and steps are computed in the rows' own. The known eigenvectors are taken out after each step, by products of
-matrices for a block of right-hand sides at once.
+The preconditioner is the negative filter polynomial, in single precision. Residuals and steps have the precision of the
+right-hand sides. Each step projects out the computed eigenvectors, for a block of right-hand sides at once.
 """
 
 import math
@@ -23,18 +22,18 @@ from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 _GAIN = 20.0
-"""What the preconditioner's polynomial is at λ: more costs more products with K, less more projections."""
+"""The polynomial's value at λ. A larger value takes more products with K, and a smaller value more projections."""
 _MOST_DEGREE = 60
 _WIDEST = 0.9
-"""Where the band of the polynomial begins at the latest, as a part of its upper end."""
+"""The largest lower end of the polynomial's band, as a fraction of its upper end."""
 
 
 class FilteredAdjoint(Adjoint[Pencil]):
-    """Conjugate gradients, preconditioned with a Chebyshev polynomial: no factorisation. For grids, above all in 3D.
+    """Conjugate gradients with a Chebyshev preconditioner, without a factorisation; for grids, mainly in 3D.
 
     Attributes:
-        tolerance: of the error in the energy norm, relative to the largest row.
-        block: right-hand sides solved at once.
+        tolerance: the error in the energy norm, relative to the largest row.
+        block: the number of right-hand sides solved together.
     """
 
     tolerance: float = eqx.field(default=1e-10, static=True)
@@ -44,20 +43,20 @@ class FilteredAdjoint(Adjoint[Pencil]):
         require_count("block", self.block)
 
     def prepare(self, pencil: Pencil, values: Values, k: int) -> Scalar:
-        """Return the upper end of the spectrum of D⁻¹K."""
+        """Return an upper bound of the spectrum of D⁻¹K."""
         if not isinstance(pencil.stiffness, StencilOperator):
-            raise ValueError("adjoint: FilteredAdjoint needs a grid; use FactorisedAdjoint for a mesh")
+            raise ValueError("adjoint: got FilteredAdjoint, which needs a grid; use FactorisedAdjoint for a mesh")
         return upper_end(nodal_pencil(pencil))
 
     def solve(self, prepared: Scalar, pencil: Pencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         space, nodal, high = pencil.space, nodal_pencil(pencil), prepared
         tolerance, beyond = complement.attainable(self.tolerance, rhs.dtype), complement.first_beyond(values)
-        # The polynomial is one of D⁻¹K, whose values are the quotients φᵀKφ / φᵀDφ: on coarse grids a fraction of λ.
+        # The polynomial acts on D⁻¹K, whose values for φ are φᵀKφ / φᵀDφ. On coarse grids these are a fraction of λ.
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-        # Nearer to the band it does not reach its gain, and would no longer be definite.
+        # At values nearer to the band, the polynomial would not reach its gain, and not be definite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)

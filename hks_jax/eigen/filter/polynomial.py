@@ -13,46 +13,46 @@ from hks_jax.linear.chebyshev import Columns, chebyshev_iteration, gershgorin, l
 from hks_jax.linear.products import aligned
 
 _STEPS = 64
-"""Lanczos steps for the upper end of the spectrum."""
+"""The number of Lanczos steps for the upper bound of the spectrum."""
 MOST_DEGREE = 1000
-"""Enough for a band a hundred thousand times as wide as what is below it."""
+"""The maximal degree. It suffices for a band that is 10⁵ times as wide as the interval below it."""
 
 
 class Band(NamedTuple):
-    """The interval of D⁻¹K whose modes are damped, D the lumped mass."""
+    """The interval of eigenvalues of D⁻¹K that are damped, where D is the lumped mass."""
 
     low: Float[Array, ""]
     high: Float[Array, ""]
 
     def degree_for(self, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:
-        """Return the degree at which the polynomial is ``gain`` at a value below the band: gain = cosh(degree · a).
+        """Return the degree at which the polynomial equals ``gain`` at a value below the band: gain = cosh(degree · a).
 
-        At most `MOST_DEGREE`: where the band is so wide that more is needed, pairs do not converge, which is told.
+        The degree is at most `MOST_DEGREE`. If a wide band needs a higher degree, pairs do not converge.
         """
         below = jnp.maximum(self.low - value, 0)
         degree = jnp.arccosh(jnp.asarray(gain, value.dtype)) / jnp.arccosh(1 + 2 * below / (self.high - self.low))
-        return jnp.fmin(degree, MOST_DEGREE)  # not NaN either, where the band is empty
+        return jnp.fmin(degree, MOST_DEGREE)  # also if the degree is NaN, because the band is empty
 
 
-# Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx, and p the Chebyshev polynomial
-# that is at most 1 on the band and grows fast below it. Damping x by p(M⁻¹K)/p(λ) can be written as a correction,
+# Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx. Let p be the Chebyshev
+# polynomial with |p| ≤ 1 on the band, which grows fast below it. Applying p(M⁻¹K)/p(λ) to x gives x plus a correction,
 #
 #     x + q(M⁻¹K) M⁻¹r,    q(z) = (p(z)/p(λ) − 1)/(z − λ),
 #
-# in which M⁻¹ acts on the residual only: an approximate inverse leaves the limit exact, and so does single precision
-# (residual-based filtering, R-ChFSI). With the lumped mass D for M, a mode of eigenvalue μ, and of ratio β = D⁻¹M < 1,
-# has z = βμ and its part in D⁻¹r is β(μ − λ) instead of z − λ. The two agree to second order in h²λ if λ is replaced
-# by the lumped quotient ζ = xᵀKx / xᵀDx and the correction is scaled by ζ/λ: for β(μ) ≈ 1 − ch²μ,
+# in which M⁻¹ acts only on the residual. So an approximate inverse, or single precision, does not change the limit
+# (residual-based filtering, R-ChFSI). If the lumped mass D replaces M, a mode of eigenvalue μ, for which D⁻¹M is the
+# factor β < 1, has z = βμ, and its coefficient in D⁻¹r is β(μ − λ) instead of z − λ. The two agree to second order in
+# h²λ if the lumped quotient ζ = xᵀKx / xᵀDx replaces λ and the correction is scaled by ζ/λ: for β(μ) ≈ 1 − ch²μ,
 #
 #     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · λ/ζ + ….
 #
-# Where the mesh is coarse in one direction only, β depends on the direction of a mode as well, and near the edge of the
-# band the order by βμ may not be that by μ; where it is coarse for the wanted modes altogether, modes of many times
-# their eigenvalues, β ≈ 3⁻ᵈ, come before them. Then W = Σⱼ (I − D⁻¹M)ʲ D⁻¹, n more terms of Neumann's series, takes
-# the place of D⁻¹: βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large, and as dψ/dμ = 1 − (n + 2)(1 − β)ⁿ⁺¹
-# the scale ζ/λ becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
+# If the mesh is coarse in one direction only, β also depends on the direction of a mode, and βμ and μ may order the
+# modes near the edge of the band differently. If the mesh is too coarse for the wanted modes, other modes with β ≈ 3⁻ᵈ
+# and much larger μ have smaller values βμ. Then W = Σⱼ (I − D⁻¹M)ʲ D⁻¹, with n more terms of the Neumann series,
+# replaces D⁻¹. Then βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large. Since
+# dψ/dμ = 1 − (n + 2)(1 − β)ⁿ⁺¹, the scale ζ/λ becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
 #
-# D⁻¹ may be W throughout. q < 0 on both sides of ζ, so that −q(D⁻¹K)D⁻¹ is also a symmetric positive definite
+# W may replace D⁻¹ everywhere. Since q < 0 on both sides of ζ, −q(D⁻¹K)D⁻¹ is also a symmetric positive definite
 # preconditioner for K − λM.
 def correction(
     pencil: NodalPencil,
@@ -63,10 +63,10 @@ def correction(
     whole: Columns | float = 0.0,
     terms: Int[Array, ""] | int = 0,
 ) -> Columns:
-    """Return q(D⁻¹K) D⁻¹ residual with the polynomial that belongs to ``value`` ζ (at most the band's low end).
+    """Return q(D⁻¹K) D⁻¹ residual, where q belongs to ζ = ``value``, which is at most the band's low end.
 
-    With ``terms`` n > 0, W in place of D⁻¹; value and band are then those of WK. Where a column of ``whole`` is not
-    zero it is x, the residual's is Kx, and p(D⁻¹K)/p(ζ) damps x as it is: D⁻¹Kx − ζx takes the place of D⁻¹r.
+    If n = ``terms`` > 0, W replaces D⁻¹, and value and band refer to WK. If a column x of ``whole`` is not zero, the
+    residual's column must be Kx; then D⁻¹Kx − ζx replaces D⁻¹r, which amounts to p(D⁻¹K)/p(ζ) applied to x.
     """
     dtype = residual.dtype
     stiffness, mass = (
@@ -85,14 +85,14 @@ def correction(
         w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - aligned(reference.astype(dtype), whole) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
-    # Apart, so that without further terms all of a step is one computation.
+    # The cases are separate, so that XLA fuses a whole step if there are no further terms.
     return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
 
 
 @jax.jit
 def upper_end(pencil: NodalPencil) -> Float[Array, ""]:
-    """Return a bound of the spectrum of D⁻¹K."""
+    """Return an upper bound of the spectrum of D⁻¹K."""
     lumped, sums = pencil.lumped[..., None], pencil.lumped_or_zero[..., None]
     bound = lanczos_bound(pencil.stiffness.of_columns(), lambda r: r / lumped, sums, sums.size, _STEPS)
-    # Gershgorin's discs never fail, but are twice too large where tensors vary.
+    # The Gershgorin bound never fails, but is up to twice too large if tensors vary.
     return jnp.minimum(bound, gershgorin(pencil.stiffness.coefficients, 1 / pencil.lumped))

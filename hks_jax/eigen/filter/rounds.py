@@ -1,4 +1,4 @@
-"""Rounds of filtering: what a subspace gains from Chebyshev polynomials, and Rayleigh–Ritz after each."""
+"""Rounds of subspace iteration: a Chebyshev filter, followed by a Rayleigh–Ritz projection."""
 
 from collections.abc import Callable
 from functools import partial
@@ -22,82 +22,82 @@ from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
-"""How far one round damps what is not wanted: much more, and the lumped mass in the filter is what limits it."""
+"""The factor by which one round damps unwanted modes. At larger factors the lumped mass would limit the filter."""
 _SPREAD = 1e5
-"""How much more than a mode at the edge of the band the lowest may grow: beyond it, rounding does."""
+"""The largest growth of the lowest mode relative to the edge of the band. Beyond it, rounding errors dominate."""
 _LEAST_DEGREE = 4
 _MARGIN = 1.1
-"""What may be missing from the last vector's eigenvalue by Weyl's law."""
+"""The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
-"""How far the lumped mass may shift modes of like eigenvalues apart, and how far above the wanted ones it must leave
-those of more than twice their eigenvalues, before the filter needs a better inverse."""
+"""The limits beyond which the lumped mass gets further terms: the spread of the relative shifts of similar eigenvalues,
+and the least ψ, relative to the last wanted eigenvalue, of modes above twice that eigenvalue."""
 _MOST_TERMS = 15
-"""Further terms of its Neumann series, at most."""
+"""The maximal number of further terms of the Neumann series of the inverse mass."""
 
 Scalar = Float[Array, ""]
 Number = Int[Array, ""]
 Values = Float[Array, " m"]
 OwnRows = Float[Array, "own nodes"]
-"""The whole vectors that this device filters."""
+"""The complete vectors that this device filters."""
 
 
 class Plan(NamedTuple):
     """The sizes of a computation; static."""
 
-    wanted: int  # how many eigenpairs
-    size: int  # how many vectors, whole blocks
-    block: int  # vectors filtered together
-    n_null: int  # zero eigenvalues
-    tolerance: float  # relative residual that counts as converged
+    wanted: int  # the number of eigenpairs
+    size: int  # the number of vectors, a multiple of `block`
+    block: int  # the number of vectors filtered together
+    n_null: int  # the number of zero eigenvalues
+    tolerance: float  # the relative residual at which a pair counts as converged
     single_precision: bool  # whether filters run in float32
-    mesh: Mesh | None  # the devices that vectors are shared among; None for one
+    mesh: Mesh | None  # the devices that share the vectors; None for one device
 
 
 class FilterState(NamedTuple):
-    """What is known between two rounds."""
+    """The state between two rounds."""
 
     values: Values  # Ritz values θ, ascending
-    vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; on several devices, padded nodes, each device's slab
+    vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; several devices have one slab of padded nodes each
     residuals: Values  # ‖Kx − θMx‖/‖Mx‖
-    lumped_values: Values  # xᵀKx / xᵀDx with the lumped mass D
-    terms: Number  # further terms of the mass's inverse that were needed so far
-    rounds: Number  # rounds so far on this grid
+    lumped_values: Values  # xᵀKx / xᵀDx, where D is the lumped mass
+    terms: Number  # the number of further terms in the inverse mass
+    rounds: Number  # the number of rounds so far on this grid
 
 
 class Filtering(NamedTuple):
     """The polynomials of a round."""
 
-    band: Band  # what they damp
-    terms: Number  # further terms of the mass's inverse
-    degrees: Int[Array, " blocks"]  # by block; 0 where all has converged
-    values: Values  # ψ of each vector, at which its polynomial is scaled
-    factor: Values  # by which corrections are multiplied
+    band: Band  # the damped interval
+    terms: Number  # the number of further terms in the inverse mass
+    degrees: Int[Array, " blocks"]  # the degree for each block; 0 if all its vectors have converged
+    values: Values  # ψ of each vector; its polynomial is scaled to 1 there
+    factor: Values  # the factor of each vector's correction
 
 
 class GridFilter(eqx.Module):
-    """Subspace iteration on one grid. What is compiled for one serves all grids of its shape."""
+    """Subspace iteration on one grid. All grids of one shape share the compiled functions."""
 
     pencil: NodalPencil  # K and M
-    high: Scalar  # a bound of the spectrum of D⁻¹K
+    high: Scalar  # an upper bound of the spectrum of D⁻¹K
     plan: Plan = eqx.field(static=True)
 
     @property
     def slabs(self) -> Slabs | None:
-        """How the grid is cut between rounds; None on one device."""
+        """The slabs into which the grid is divided between rounds; None on one device."""
         return self.pencil.cut(self.plan.mesh)
 
     def allowed(self, rounding: Scalar, state: FilterState) -> Values:
-        """Return the residuals up to which pairs count as converged."""
+        """Return the largest residuals at which pairs count as converged."""
         scale = jnp.maximum(state.values, state.values[self.plan.n_null])
         return allowed_residuals(scale, rounding, self.plan.tolerance)
 
     def unconverged(self, rounding: Scalar, state: FilterState) -> Number:
-        """Return how many of the wanted pairs have not converged."""
+        """Return the number of wanted pairs that have not converged."""
         return jnp.sum(~(state.residuals <= self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
     def excess(self, rounding: Scalar, state: FilterState) -> Scalar:
-        """Return the largest residual of the wanted pairs, as a multiple of the one that counts as converged."""
+        """Return the largest ratio of a wanted pair's residual to its allowed residual."""
         return jnp.max((state.residuals / self.allowed(rounding, state))[: self.plan.wanted])
 
     @jax.jit
@@ -123,7 +123,7 @@ class GridFilter(eqx.Module):
 
     @jax.jit
     def from_coarse(self, coarse: "GridFilter", state: FilterState) -> FilterState:
-        """Return the state that interpolation from the next coarser grid gives."""
+        """Return the state interpolated from the next coarser grid."""
         slabs, shape, block = coarse.slabs, coarse.pencil.shape, self.plan.block
 
         def run(grid: GridFilter, vectors: Float[Array, "m coarse_nodes"]) -> FilterState:
@@ -140,10 +140,10 @@ class GridFilter(eqx.Module):
     def improve_told(
         self, rounding: Scalar | None, state: FilterState, done: Callable[[int, int], Any] | None = None
     ) -> FilterState:
-        """Filter the blocks in which something has not converged (without ``rounding``, all), and Rayleigh–Ritz.
+        """Filter the blocks that have not converged (all, if ``rounding`` is None), then apply Rayleigh–Ritz.
 
-        Called plainly, on one device, it can be interrupted between two blocks, and tells after each how many products
-        are done of all. `improve` is compiled whole.
+        Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done`` is
+        called with the numbers of finished and of all products. `improve` is the compiled version.
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
@@ -167,17 +167,17 @@ class GridFilter(eqx.Module):
 
     @jax.jit
     def choose(self, rounding: Scalar | None, state: FilterState) -> Filtering:
-        """Return the polynomials of a round: the band that they damp, and their degrees."""
+        """Return the polynomials of a round: the damped band, and their degrees."""
         plan = self.plan
         spare = jnp.arange(plan.size) >= plan.wanted
         terms, filtered_values, factor = _lumping(plan, state)
         high = (1 + terms).astype(self.high.dtype) * self.high
-        # Where the vectors beyond the wanted ones are no eigenvectors yet, the band begins where Weyl's law says.
+        # The spare vectors may be far from eigenvectors; then the band begins at an estimate from Weyl's law.
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
         left = spare | (True if rounding is None else ~(state.residuals <= self.allowed(rounding, state)))
-        # The spare vectors need no more than the last wanted one.
+        # The spare vectors need no higher degree than the last wanted vector.
         goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)
         degrees = jnp.ceil(jnp.clip(band.degree_for(goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
@@ -186,7 +186,7 @@ class GridFilter(eqx.Module):
 
     @partial(jax.jit, donate_argnames="vectors")
     def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
-        """Return the rows with a block filtered: the one of this number among all, the `own`th among these rows."""
+        """Filter one block of rows; `number` is its index among all blocks, and `own` its index among these rows."""
         pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
         dtype = jnp.float32 if self.plan.single_precision else values.dtype
         band, degree = chosen.band, chosen.degrees[number]
@@ -196,7 +196,7 @@ class GridFilter(eqx.Module):
             theta, zeta, scale = (
                 jax.lax.dynamic_slice_in_dim(v, number * block, block) for v in (values, chosen.values, chosen.factor)
             )
-            # What is in the band itself has no residual worth the name: it is damped as it is.
+            # The residual of a vector in the band is not small, so the polynomial is applied to the vector itself.
             inside = zeta > band.low
             image, moved = products(x)
             residual = image - jnp.where(inside, 0, theta * moved)
@@ -205,7 +205,7 @@ class GridFilter(eqx.Module):
             z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
             return rows + row_by_row(to_rows(z))
 
-        # The condition has nothing but the block: what goes through one is copied.
+        # The condition gets only the block, because XLA copies the operands of a condition.
         rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block))
         rows = jax.lax.cond(degree > 0, filtered, lambda unchanged: unchanged, rows)
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
@@ -225,9 +225,9 @@ class GridFilter(eqx.Module):
 
 
 def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
-    """Return how many further terms the inverse of the mass needs, and with them ψ and the scale of each vector."""
+    """Return the number of further terms in the inverse mass, and each vector's ψ and scale with these terms."""
     values, wanted = state.values, state.values[plan.wanted - 1]
-    # 1 − β of the modes: what the lumped mass takes from their eigenvalues.
+    # 1 − β of each mode: the relative decrease of its eigenvalue by the lumped mass.
     missing = 1 - jnp.where(values > 0, state.lumped_values / jnp.where(values > 0, values, 1), 1)
     powers = jnp.arange(1, _MOST_TERMS + 2, dtype=values.dtype)[:, None]
     lost = missing[None] ** powers
@@ -235,12 +235,12 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
     spread = jnp.max(jnp.where(near, lost, 0), axis=1) - jnp.min(jnp.where(near, lost, jnp.inf), axis=1)
     beyond = jnp.min(jnp.where((values > 2 * wanted)[None], (1 - lost) * values[None], jnp.inf), axis=1)
     enough = (spread <= _SPLIT) & (beyond >= _APART * wanted)
-    # Never fewer than before: what they keep away would come back.
+    # The number never decreases, because the modes that further terms suppress would return.
     terms = jnp.maximum(state.terms, jnp.where(jnp.any(enough), jnp.argmax(enough), _MOST_TERMS))
     return terms, (1 - lost[terms]) * values, 1 - (terms + 1).astype(values.dtype) * lost[terms]
 
 
 def _layout(slabs: Slabs | None) -> FilterState:
-    """Return how a state is laid out: the vectors in slabs, the rest on every device."""
+    """Return the sharding of a state: vectors are in slabs, all else is on every device."""
     vectors = EVERYWHERE if slabs is None else PartitionSpec(None, slabs.name)
     return FilterState(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]

@@ -1,10 +1,10 @@
-"""A subspace of nodal functions kept as rows, on one device or several, and Rayleigh–Ritz in it, block by block.
+"""A subspace of nodal functions, stored as rows on one device or several, and blockwise Rayleigh–Ritz in it.
 
-Filters want whole functions, a few on each device; Rayleigh–Ritz wants all functions on a part of the grid. Between
-rounds vectors lie in slabs, (m, nodes of the slab) on each device. For the filters, blocks of rows are dealt out in
-turn, since the low ones converge first: device i of p has the blocks i, i + p, i + 2p, ….
+A filter needs complete functions, a few on each device. Rayleigh–Ritz needs all functions on a part of the grid.
+Between rounds, each device stores all vectors on its slab, (m, nodes of the slab). For the filters, device i of p gets
+the blocks i, i + p, i + 2p, … of rows; this balances the load, because low modes converge first.
 
-``slabs`` is None on a single device: then nothing is exchanged.
+``slabs`` is None on a single device, where no communication is needed.
 """
 
 import math
@@ -24,29 +24,29 @@ from hks_jax.linear.products import matmul
 
 EVERYWHERE = PartitionSpec()
 _CHUNK = 1 << 14
-"""Nodes rotated at once."""
+"""The number of nodes at which vectors are rotated together."""
 
 Values = Float[Array, " m"]
 Rows = Float[Array, "m nodes"]
 
 
 def shared(slabs: Slabs | None, function: Callable, in_specs: Any, out_specs: Any) -> Callable:
-    """Return the function as run by every device on its share."""
+    """Return the function that every device applies to its share."""
     if slabs is None:
         return function
-    # Loops of different lengths, and results that are the same on all devices, are more than the check can follow.
+    # `check_vma` cannot verify loops of different lengths, nor that results agree on all devices.
     return jax.shard_map(function, mesh=slabs.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
 
 def own_blocks(slabs: Slabs | None, count: int) -> Int[Array, " own"]:
-    """Return the numbers of the blocks of rows, of ``count``, that this device filters."""
+    """Return the indices of the blocks of rows, out of ``count``, that this device filters."""
     if slabs is None:
         return jnp.arange(count)
     return jax.lax.axis_index(slabs.name) + slabs.mesh.size * jnp.arange(count // slabs.mesh.size)
 
 
 def to_own_rows(slabs: Slabs | None, block: int, x: Float[Array, "m slab"]) -> Float[Array, "own nodes"]:
-    """Return this device's blocks of rows, whole, of the vectors in slabs."""
+    """Return this device's blocks of complete rows, given the vectors in slabs."""
     if slabs is None:
         return x
     m, width = x.shape
@@ -71,13 +71,13 @@ def block_of(x: Rows, number: Array, block: int, shape: tuple[int, ...]) -> Floa
 
 
 def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows) -> tuple[Values, Rows]:
-    """Return Ritz values, ascending, and M-orthonormal Ritz vectors in place of the rows; all on this device's slab."""
+    """Return the Ritz values in ascending order and the M-orthonormal Ritz vectors as rows, on this device's slab."""
     m, nodes = x.shape
     products = pencil.products()
 
     def among_rows(number: Array) -> tuple[Array, ...]:
         images = products(block_of(x, number, block, pencil.shape))
-        # As columns: were they turned into rows, XLA would compute the stencils in that order, seven times slower.
+        # Images stay columns. If images became rows, XLA would compute stencils in that layout, seven times slower.
         return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
     both = _total(slabs, jax.lax.map(among_rows, jnp.arange(m // block)))
@@ -118,5 +118,5 @@ def _total(slabs: Slabs | None, tree: Any) -> Any:
 
 
 def _of_first(slabs: Slabs | None, x: Array) -> Array:
-    """Return what the first device has: devices of different kinds need not round alike."""
+    """Broadcast the value of the first device, because rounding may differ between devices."""
     return x if slabs is None else slabs.total(jnp.where(jax.lax.axis_index(slabs.name) == 0, x, 0))

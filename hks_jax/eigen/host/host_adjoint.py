@@ -1,7 +1,6 @@
-"""Solves with K − λᵢM on the complement of known eigenvectors, on the host.
+"""Linear solves with K − λᵢM on the complement of computed eigenvectors, on the host.
 
-Conjugate gradients, preconditioned with SciPy's factorisations of K − σM: the method of
-`hks_jax.eigen.complement.adjoint`.
+The method is described in `hks_jax.eigen.complement.adjoint`; the preconditioners are SciPy's factorisations.
 """
 
 import os
@@ -26,23 +25,23 @@ from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.traced import is_traced
 
 _BLOCK = 16
-"""Columns solved at once: enough for fast products, few enough for the cache."""
+"""The number of columns solved together: enough for fast products, and few enough for the cache."""
 
 
 class HostAdjoint(Adjoint[Pencil]):
     """Conjugate gradients, preconditioned with SciPy's factorisations, in float64 on the host.
 
-    Under `jit` and `vmap` it runs through a host callback, one problem at a time.
+    Under `jit` and `vmap`, the solver runs in a host callback, one problem at a time.
 
     Attributes:
-        tolerance: of the error in the energy norm, relative to the largest row.
+        tolerance: the error in the energy norm, relative to the largest row.
     """
 
     warns: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-12, static=True)
 
     def solve(self, prepared: None, pencil: Pencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
-        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`. It warns of rows that do not converge."""
+        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`. Unconverged rows cause a warning."""
         data, matrices = host_matrices(pencil)
         tolerance = complement.attainable(self.tolerance, rhs.dtype)
 
@@ -50,8 +49,8 @@ class HostAdjoint(Adjoint[Pencil]):
             values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
             if not all(np.isfinite(array).all() for array in (values, vectors, b)):
                 warn_of_accuracy(
-                    f"derivative: {int(np.isnan(values).sum())} of the {values.size} eigenpairs that it needs (guards "
-                    "beyond k included) did not converge, and it is NaN. Allow more restarts, or a larger basis"
+                    f"derivative: {int(np.isnan(values).sum())} of the {values.size} required eigenpairs (including "
+                    "guards beyond k) did not converge, so the derivative is NaN. Allow more restarts or a larger basis"
                 )
                 return np.full(rhs.shape, np.nan, rhs.dtype)
             K, M = matrices(data_k, data_m, nulls)
@@ -70,7 +69,7 @@ class HostAdjoint(Adjoint[Pencil]):
 def _solve(
     K: csc_matrix, M: csc_matrix, values: Values, vectors: Vectors, rhs: Rows, tolerance: float, dtype: np.dtype
 ) -> Rows:
-    """Solve in float64, given what eigenvectors and right-hand sides were rounded to before; see `Adjoint.solve`."""
+    """Solve in float64; ``dtype`` is the dtype of the given eigenvectors and right-hand sides. See `Adjoint.solve`."""
     phi = np.ascontiguousarray(vectors.T)
     m_phi = M @ phi
     x = np.zeros_like(rhs)
@@ -89,10 +88,10 @@ def _solve(
 
         product = complement.definite_product(K.dot, M.dot, values[block], beyond)
         b = np.ascontiguousarray(rhs[block].T)
-        with np.errstate(divide="ignore", invalid="ignore"):  # of columns that are done
+        with np.errstate(divide="ignore", invalid="ignore"):  # in finished columns
             x[block] = conjugate_gradients(product, precondition, b, wanted[block]).converged.T
 
-    # Blocks are solved side by side, each with one BLAS thread: SuperLU's many small BLAS calls do not gain by more.
+    # Blocks are solved in parallel with one BLAS thread each: SuperLU's small BLAS calls gain nothing from more.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
         for rows, shift in _groups(values, beyond, active, tolerance):
             blocks = [rows[start : start + _BLOCK] for start in range(0, rows.size, _BLOCK)]
@@ -101,7 +100,7 @@ def _solve(
 
 
 def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: float) -> list[tuple[np.ndarray, float]]:
-    """Split rows into groups of neighbouring eigenvalues, and give each a shift."""
+    """Divide rows into groups of neighbouring eigenvalues, each with a shift."""
     if active.size == 0:
         return []
     distance = beyond - values[active]

@@ -1,4 +1,4 @@
-"""Pencils as SciPy matrices: what the host computes for solvers in JAX, through callbacks where they are traced."""
+"""Pencils as SciPy matrices, for computations on the host."""
 
 from collections.abc import Callable
 
@@ -15,12 +15,12 @@ from hks_jax.linear.pencil import SymmetricPencil
 
 
 def factorise_on_host(matrix: csc_matrix) -> SuperLU:
-    """Factorise a symmetric matrix without pivoting, under a symmetric ordering, which fills in least."""
+    """Factorise a symmetric matrix with a symmetric ordering, for least fill-in, and without pivoting."""
     return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bool]:
-    """Return how many eigenvalues lie below σ, by pivots of K − σM, and whether that is certain by `try_out`'s test."""
+    """Return the number of eigenvalues below σ, by the inertia of K − σM, and whether `try_out`'s test confirms it."""
     matrix = (K - shift * M).tocsc()
     try:
         factor = factorise_on_host(matrix)
@@ -31,7 +31,7 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
     for _ in range(2):
         before, residual = residual, residual - matrix @ factor.solve(residual)
         rates.append(np.linalg.norm(residual) / max(np.linalg.norm(before), np.finfo(float).tiny))
-    # Were rows exchanged, pivots would not be those of a congruence.
+    # If SuperLU exchanged rows, the pivots would not show the inertia.
     sound = bool(max(rates) < CONTRACTION and (factor.perm_r == factor.perm_c).all())
     return int((factor.U.diagonal() < 0).sum()), sound
 
@@ -39,10 +39,10 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
 def host_matrices(
     pencil: SymmetricPencil,
 ) -> tuple[tuple[Array, Array, Array], Callable[..., tuple[csc_matrix, csc_matrix]]]:
-    """Return the entries of K and M with the null vectors, and the function that makes SciPy matrices of them.
+    """Return the entries of K and M with the null vectors, and a function that makes SciPy matrices of them.
 
-    The matrices are float64. What rounding left of Kv, v a null vector, would act as a potential: it is subtracted from
-    the diagonal where each node belongs to one null vector alone.
+    The matrices are float64. For a null vector v, rounding errors in Kv would act as a potential. These errors are
+    subtracted from the diagonal if each node belongs to exactly one null vector.
     """
     (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
     n = pencil.size

@@ -24,22 +24,22 @@ from hks_jax.traced import is_traced
 HostPairs = tuple[np.ndarray, np.ndarray, float]
 
 _ROUNDS = 20
-"""How often to look for missed copies of a multiple eigenvalue; each round finds at least one."""
+"""The maximal number of ARPACK runs. Each run after the first finds at least one missed eigenvalue."""
 _TOLD = 25
-"""Solves from one report to the next."""
+"""The number of solves between two reports."""
 
 
 class ShiftInvert(Eigensolver[Pencil]):
-    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M, factorised by SuperLU; float64 on the host.
+    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M, factorised by SuperLU, in float64 on the host.
 
-    That no eigenvalue below the last was missed is checked by the inertia of a second factorisation. Under `jit` and
-    `vmap` it runs through a host callback, one problem at a time; called plainly it can be interrupted, and reports
+    The inertia of a second factorisation checks that no eigenvalue below the last was missed. Under `jit` and `vmap`,
+    the solver runs in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports
     progress.
 
     Attributes:
-        tolerance: relative residual that counts as converged; ARPACK itself runs to machine precision.
-        max_restarts: implicit restarts before giving up.
-        basis: size of the Lanczos basis, more than k (for derivatives, than 9 + k + k/20); None takes 2k + 20.
+        tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
+        max_restarts: the maximal number of implicit restarts.
+        basis: the size of the Lanczos basis, more than k (for derivatives, more than 9 + k + k/20). None is 2k + 20.
     """
 
     name: ClassVar[str] = "shift-invert"
@@ -50,7 +50,7 @@ class ShiftInvert(Eigensolver[Pencil]):
     adjoint: Adjoint = eqx.field(default=HostAdjoint(), static=True, kw_only=True)
 
     def max_pairs(self, n_dof: int) -> int:
-        """Return n_dof − 1: a Lanczos basis must be larger than what is wanted."""
+        """Return n_dof − 1, because a Lanczos basis must have more than k vectors."""
         return n_dof - 1
 
     def __check_init__(self) -> None:
@@ -65,13 +65,12 @@ class ShiftInvert(Eigensolver[Pencil]):
 
         def solve(volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
             K, M = matrices(*data)
-            # The shift keeps K + sM positive definite; Weyl's λ₁, or a mean eigenvalue, is the scale on which it is
-            # small.
+            # A shift that is small relative to Weyl's λ₁, or to a mean eigenvalue, keeps K + sM positive definite.
             if dimension is None or not np.isfinite(volume):
                 shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
             else:
                 shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
-            # ARPACK's products with a basis gain little by threads, and wait for them where cores have other work.
+            # ARPACK's products with the basis gain little from threads, and would wait for them on busy cores.
             with threadpool_limits(1, user_api="blas"):
                 return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift, report))
 
@@ -79,7 +78,7 @@ class ShiftInvert(Eigensolver[Pencil]):
         if is_traced(inputs):
             shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))
             return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
-        return jax.device_put(solve(*inputs))  # `asarray` leaves them NumPy's where JAX differentiates
+        return jax.device_put(solve(*inputs))  # `asarray` would return NumPy arrays while JAX differentiates
 
     def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float, report: Report) -> HostPairs:
         n = K.shape[0]
@@ -100,7 +99,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             if solves % _TOLD == 0:
                 to_come = expected_solves(solves - before, basis, wanted) - (solves - before)
                 of_each = (time.perf_counter() - factorised) / solves
-                # The count of the eigenvalues at the end takes another factorisation.
+                # The final count of eigenvalues takes another factorisation.
                 left = to_come * of_each + factorised - begun
                 report(Status(f"{solves} solves of about {solves + to_come}", left))
             y = factor.solve(x)
@@ -121,31 +120,32 @@ class ShiftInvert(Eigensolver[Pencil]):
             order = np.argsort(np.concatenate([values, further]))[:k]
             values = np.concatenate([values, further])[order]
             vectors = np.concatenate([vectors, others], axis=1)[:, order]
-            # Lanczos with single vectors can miss copies of a multiple eigenvalue. By Sylvester's law of inertia the
-            # negative pivots of K − σM count the eigenvalues below σ: look again, past what is found, for the missing.
+            # Lanczos with single vectors can miss pairs of a multiple eigenvalue. By Sylvester's law of inertia, the
+            # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search again, orthogonally
+            # to the others.
             below = values[-1] - 1e-6 * max(values[-1], shift)
-            if below <= 0:  # nothing but constants
+            if below <= 0:  # only null vectors
                 return _padded(values, vectors, k, max(below, 0.0))
             negative, sound = inertia_on_host(K, M, below)
             missing = negative - int((values < below).sum())
             if not sound or missing <= 0:
                 return _padded(values, vectors, k, below if sound else np.nan)
-            report(f"{missing} missed: looking again")
+            report(f"{missing} eigenpairs are missing: searching again")
             wanted = min(missing + 2, n - 1)
         return nothing
 
 
-# ARPACK keeps what has converged and half of the rest of the basis when it restarts; a few solves more each time are
-# its own. With k from 10 to 200 it restarted once in the plane, and three or four times on cubes with multiple
-# eigenvalues, of which the first estimate is 1.7 times too short.
+# At a restart, ARPACK keeps the converged vectors and half of the remaining basis; each restart takes a few additional
+# solves. With k from 10 to 200 it restarted once in the plane, and three or four times on cubes with multiple
+# eigenvalues, where the first estimate is too short by a factor of 1.7.
 def expected_solves(done: int, basis: int, wanted: int) -> int:
-    """Return how many solves there will be if the restart that is under way, or else the first, is the last."""
+    """Return the expected total number of solves, assuming that the current restart (or the first) is the last."""
     restart = (basis - wanted) // 2 + 4
     return basis + max(1, -(-(done - basis) // restart)) * restart
 
 
 def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> HostPairs:
-    """Return eigenvalues ascending and eigenvectors as rows, NaN where there are fewer than k."""
+    """Return the eigenvalues in ascending order and the eigenvectors as rows, padded with NaN to k pairs."""
     order, missing = np.argsort(values), k - values.size
     return (
         np.pad(values[order], (0, missing), constant_values=np.nan),
@@ -155,7 +155,7 @@ def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: flo
 
 
 def lower_bound(pencil: Pencil) -> Float[Array, ""]:
-    """Return a number below which inertia finds no eigenvalue; NaN where it is not certain."""
+    """Return a lower bound of the spectrum, which inertia confirms; NaN if the search fails."""
     data, matrices = host_matrices(pencil)
     K, M = matrices(*data)
     typical = float(np.median(np.abs(K.diagonal()) / M.diagonal())) or 1.0

@@ -1,1 +1,1 @@
-"""Spectrum slicing by block Lanczos on factorisations."""
+"""Spectrum slicing by shift-invert block Lanczos."""

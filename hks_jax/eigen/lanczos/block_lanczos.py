@@ -1,4 +1,4 @@
-"""The eigensolver for what can be factorised: spectrum slicing by block Lanczos, certified to miss no eigenvalue."""
+"""The eigensolver for sparse factorisable pencils: spectrum slicing by block Lanczos, with a certificate by inertia."""
 
 import math
 from functools import partial
@@ -25,22 +25,22 @@ from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 SLICE = 170
-"""Eigenvalues per slice: fewer cost more factorisations, more cost more orthogonalisation."""
+"""The number of eigenvalues per slice. Smaller slices take more factorisations, larger ones more orthogonalisation."""
 _DENSE = 3000
-"""Unknowns up to which all pairs are computed where slicing fails."""
+"""The largest number of unknowns for which the dense solver takes over if slicing fails."""
 
 
 class BlockLanczos(Eigensolver[SymmetricPencil]):
-    """Spectrum slicing: shift-invert block Lanczos on nested-dissection factorisations, all in JAX.
+    """Spectrum slicing: shift-invert block Lanczos with nested-dissection factorisations, all in JAX.
 
-    For grids and meshes, 2D above all (in 3D the factors fill in). The same code runs on CPUs and accelerators, and is
-    traceable whole. Called plainly it can be interrupted, and reports progress, between two slices; and only then finds
-    any number of copies of an eigenvalue, if need be, up to 3000 unknowns, by computing all pairs.
+    The solver is for grids and meshes, mainly in 2D (in 3D, factors have much fill-in). The same code runs on CPUs and
+    accelerators, and works under `jit`. Outside `jit`, the solver can be interrupted, reports progress between two
+    slices, and finds eigenvalues of any multiplicity, if necessary (up to 3000 unknowns) by the dense solver.
 
     Attributes:
-        tolerance: relative residual that counts as converged.
-        block: vectors per Lanczos block. Multiplicities may be larger.
-        slice_size: eigenvalues per slice; None chooses.
+        tolerance: the relative residual at which a pair counts as converged.
+        block: the number of vectors per Lanczos block. Multiplicities may exceed this number.
+        slice_size: the number of eigenvalues per slice; None is automatic.
     """
 
     name: ClassVar[str] = "block-lanczos"
@@ -54,25 +54,25 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             require_count("slice_size", self.slice_size)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs; of a `LocatedPencil`, from its origin upwards."""
+        """Return the k lowest eigenpairs; for a `LocatedPencil`, the first k above its origin."""
         plan = self.plan(k, min(pencil.n_null, k))
         state = self.slice(expected(pencil, plan), plan, report)
         assert state.vectors is not None
         values, vectors, bound = _lowest(pencil, state.values, state.vectors, state.complete_below, k)
         if is_traced(bound) or (state.finished and not math.isnan(bound)) or pencil.size > _DENSE:
             return values, vectors, bound
-        report("not all found: computing all pairs")
+        report("slicing missed pairs: computing all pairs with the dense solver")
         first = int(pencil.negative) if isinstance(pencil, LocatedPencil) else 0
         values, vectors, bound = Dense().lowest(pencil, first + k)
-        at = first + jnp.arange(k)  # beyond the end there are no more
+        at = first + jnp.arange(k)  # indices beyond the end give NaN
         return values.at[at].get(mode="fill"), vectors.at[at].get(mode="fill"), bound
 
     def max_pairs(self, n_dof: int) -> int:
-        """Return how many pairs leave room for a Lanczos basis."""
+        """Return the largest k that leaves room for a Lanczos basis."""
         return max((n_dof - 16 * self.block) // 4, 0)
 
     def plan(self, k: int, nulls: int = 0) -> Plan:
-        """Return the sizes of the computation, of whose k eigenvalues some are known to be zero."""
+        """Return the sizes of a computation of k eigenvalues, of which the first ``nulls`` are zero."""
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
         return Plan(k, self.block, size, 3 * slices + 12, self.tolerance, nulls)
@@ -86,7 +86,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         def step(state: SlicingState) -> SlicingState:
             factor, searchable, state = cut(problem, dissection, plan, state)
             state = when(searchable, partial(search, problem, factor, plan), state)
-            if report is not silent and not is_traced(state):  # to put numbers into words, the host waits for them
+            if report is not silent and not is_traced(state):  # a report makes the host wait for its numbers
                 known, bound = min(int(state.known), plan.wanted), float(state.complete_below)
                 report(f"{known} of {plan.wanted} eigenpairs, all below {bound:.6g}")
             return state
@@ -95,13 +95,13 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
-    """Return whether Weyl's law says where a spectrum begins and how dense it is; else inertia has to find out."""
+    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia is used."""
     return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
 
 
 @jit_quickly(static_argnames="plan")
 def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
-    """Return what to expect of a spectrum: on a domain by Weyl's law, else by what was counted beforehand."""
+    """Return the pencil with estimates of its spectrum, by Weyl's law on a domain or else by previous counts."""
     if isinstance(pencil, LocatedPencil):
         spacing = pencil.spacing
         return Problem(pencil, pencil.first, spacing, spacing, spacing, pencil.negative)
@@ -118,7 +118,7 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
 def _lowest(
     pencil: SymmetricPencil, values: Float[Array, " capacity"], vectors: Stored, bound: Float[Array, ""], k: int
 ) -> RawPairs:
-    """Return the lowest known pairs, NaN where there are fewer than k, and the bound, NaN if one was found twice."""
+    """Return the k lowest computed pairs (NaN for missing pairs), and the bound (NaN if a pair was found twice)."""
     order = jnp.argsort(values)[:k]
     values, vectors = values[order], vectors[order]
     known = jnp.isfinite(values)
@@ -128,9 +128,9 @@ def _lowest(
 
 
 def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, pencil: LocatedPencil) -> RawPairs:
-    """Return the first k pairs from the origin, then the guards: those that follow, and those before the origin.
+    """Return the first k pairs above the origin, then guard pairs: the following ones, and those below the origin.
 
-    Where the spectrum has fewer guards the others are zero vectors, with the eigenvalue of the first pair.
+    If the spectrum has too few guards, the remaining guards are zero vectors with the eigenvalue of the first pair.
     """
     if isinstance(solver, Dense):
         values, vectors, bound = solver.lowest(pencil, pencil.size)
@@ -149,7 +149,7 @@ def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, 
 def _from(
     first: Int[Array, ""], existing: Int[Array, ""] | int, values: Values, vectors: Vectors
 ) -> tuple[Values, Vectors]:
-    """Return pairs from the first wanted one on, then those before it."""
+    """Rotate the pairs so that the first wanted pair comes first. Pairs that do not exist become zero vectors."""
     there = jnp.arange(values.size) < existing
     values, vectors = jnp.where(there, values, values[first]), jnp.where(there[:, None], vectors, 0)
     return jnp.roll(values, -first), jnp.roll(vectors, -first, axis=0)

@@ -1,4 +1,4 @@
-"""A growing M-orthonormal basis of long vectors, and the algebra of blocks: by XLA's operations, or by kernels."""
+"""A growing M-orthonormal Krylov basis, and operations on its blocks, by XLA's operations or by kernels."""
 
 from collections.abc import Callable
 from itertools import accumulate
@@ -14,15 +14,15 @@ from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import gram, matmul, products_with_columns
 
 _PIECE = 128
-"""Rows kept together: vectors are projected on whole pieces, but not on those that are still empty."""
+"""The number of rows per piece. Projections use complete pieces, and skip empty ones."""
 _SMALL = 1e-7
-"""Components up to here are taken away in single precision: what it leaves of them is rounding."""
+"""The largest components that may be projected out in single precision; the remainder is then at rounding level."""
 _NODES = 2048
-"""Degrees of freedom combined at once: what is read and what comes of it stay in the cache."""
+"""The number of degrees of freedom combined together: operands and results fit into the cache."""
 
 
 class Piece(NamedTuple):
-    """Rows of the basis; in single precision too, where that is not their own."""
+    """Rows of the basis, with a copy in single precision if the rows are in double precision."""
 
     rows: Float[Array, "rows n_dof"]
     single: Float[Array, "rows n_dof"] | None
@@ -34,11 +34,11 @@ Small = Float[Array, "b b"]
 
 
 def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
-    """Return a basis of the known vectors, with room for ``size`` rows in all; the others are zero.
+    """Return a basis that begins with the known vectors and has room for ``size`` rows; the other rows are zero.
 
-    Known vectors and size are multiples of ``block``, which is how many rows are written at once. On accelerators it is
-    one array in its own precision: to find out what may be left out, they wait longer than to compute it; and its
-    vectors are columns, as blocks are, for which no kernel has to transpose any.
+    The number of known vectors and the size are multiples of ``block``, the number of rows written at once. On
+    accelerators, the basis is a single array, because skipping empty pieces would take longer than computing with them.
+    There, basis vectors are columns, as in blocks, so that no kernel has to transpose.
     """
     if accelerators.at_hand():
         return jnp.pad(known.T, ((0, 0), (0, size - len(known))))
@@ -52,10 +52,10 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
 
 
 def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
-    """Return the basis with columns as its rows from the given one on, a multiple of b."""
+    """Write the columns of a block into the basis, from the given row on, which is a multiple of b."""
     if not isinstance(basis, tuple):
         return jax.lax.dynamic_update_slice_in_dim(accelerators.row_by_row(basis), block, row, axis=1)
-    # The barrier keeps XLA from transposing anew for each piece.
+    # The barrier keeps XLA from repeating the transposition for each piece.
     block, written = jax.lax.optimization_barrier(block.T), []
     for piece, at in zip(basis, _starts(basis), strict=True):
         size = len(piece.rows)
@@ -65,12 +65,12 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
     return tuple(written)
 
 
-# One step of shift-invert Lanczos amplifies what a block has in a converged eigenvector by some ten to a hundred times:
-# what two steps make of rounding is c = VᵀMx of 1e-14 to 1e-9. Its sums need double precision, as rounding is otherwise
-# as large as c itself. To take Vc away does not: single precision leaves 6e-8 c. Where the shift is so near to an
-# eigenvalue that c is not small, V is taken in its own precision.
+# One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So two
+# steps amplify rounding errors to c = VᵀMx of 1e-14 to 1e-9. The sums in c need double precision, because rounding
+# would otherwise be as large as c. Single precision suffices to subtract Vc, with an error of 6e-8 c. If c is large,
+# because the shift is close to an eigenvalue, V is used in double precision.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
-    """Return what columns x, given as Mx, have in the first vectors of the basis: VVᵀMx."""
+    """Return the projection VVᵀMx of columns x, given Mx, on the first ``filled`` vectors V of the basis."""
     if not isinstance(basis, tuple):
         return matmul(accelerators.row_by_row(basis), gram(basis, images))
     used = [filled > at for at in _starts(basis)]
@@ -100,7 +100,7 @@ def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]
 
 
 def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
-    """Return many linear combinations of all rows of the basis."""
+    """Return linear combinations of all rows of the basis."""
     if not isinstance(basis, tuple):
         return matmul(mix, basis.T)
     n = basis[0].rows.shape[1]
@@ -108,7 +108,7 @@ def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     mixes = jnp.split(mix, _starts(basis)[1:], axis=1)
 
     def some(number: Array, sums_so_far: Float[Array, "q n_dof"]) -> Float[Array, "q n_dof"]:
-        at = jnp.minimum(number * width, n - width)  # the last may overlap the one before
+        at = jnp.minimum(number * width, n - width)  # the last range may overlap the previous one
         parts = [jax.lax.dynamic_slice_in_dim(piece.rows, at, width, axis=1) for piece in basis]
         sums = sum(map(matmul, mixes, parts), jnp.zeros((), mix.dtype))
         return jax.lax.dynamic_update_slice_in_dim(sums_so_far, sums, at, axis=1)
@@ -124,17 +124,16 @@ def _starts(basis: Basis) -> list[int]:
 def _put(
     rows: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], place: Int[Array, ""], inside: Bool[Array, ""]
 ) -> Float[Array, "rows n_dof"]:
-    """Return rows with the block put in place, or, where it does not belong to them, as they are."""
+    """Write the block into the rows if ``inside``; otherwise return the rows unchanged."""
     block = block.astype(rows.dtype)
-    # A loop of one turn or none writes where the block belongs: chosen by a mask, as many rows of every piece would be
-    # read and written.
+    # A loop of at most one iteration touches only the piece that contains the block; a mask would touch every piece.
     return jax.lax.fori_loop(
         0, inside.astype(int), lambda _, rows: jax.lax.dynamic_update_slice_in_dim(rows, block, place, axis=0), rows
     )
 
 
 def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) -> tuple[Block, Small]:
-    """Return x = (K − σM)⁻¹M · block without that block and the one before, and what it has in the block itself."""
+    """Orthogonalise x = (K − σM)⁻¹M · block against this block and the previous one; also return its coefficients."""
 
     def plain() -> tuple[Array, Array]:
         diagonal = gram(image, x)
@@ -149,7 +148,7 @@ def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) 
 
 
 def without(block: Block, image: Block, x: Block) -> Block:
-    """Return x without what it has of M-orthonormal columns, given also their image under M."""
+    """Orthogonalise x against M-orthonormal columns, given also their image under M."""
 
     def by_kernels() -> Array:
         return column_kernels.remainder(x, block, column_kernels.parts_of_products(image, x))[0]
@@ -160,10 +159,10 @@ def without(block: Block, image: Block, x: Block) -> Block:
 def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
-    The inner products are factorised by their eigenvalues; in kernels, for which these take long, by a pivoted Cholesky
-    factorisation. Nothing becomes infinite by dividing by rounding errors.
+    The Gram matrix is factorised by its eigenvalues. Kernels use a pivoted Cholesky factorisation, which is faster
+    there. Both bound the divisors below, so that nothing becomes infinite.
     """
-    identity = jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, which no kernel has to compute
+    identity = jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, so that no kernel computes it
 
     def plain() -> tuple[Array, Array, Array]:
         y, total = x, identity
@@ -192,7 +191,7 @@ def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Block) -
 
 
 def _factored(products: Small) -> tuple[Small, Small]:
-    """Return F with FFᵀ = G, the inner products, and F⁻ᵀ."""
+    """Return F with FFᵀ = G, where G is the Gram matrix, and F⁻ᵀ."""
     norms = jnp.sqrt(jnp.diagonal(products))
     norms = jnp.where(norms > 0, norms, 1)
     sizes, mix = lapack.eigh(products / norms[None] / norms[:, None])

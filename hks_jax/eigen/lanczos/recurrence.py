@@ -18,23 +18,23 @@ from hks_jax.linear.products import matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _STRETCH = 16
-"""Called plainly, how many steps are one computation on a CPU, between which it can be interrupted."""
+"""The number of steps per compiled call outside `jit` on a CPU. Between calls, the computation can be interrupted."""
 
 Known = Float[Array, "w n_dof"]
 RitzPairs = tuple[Float[Array, " ritz"], Float[Array, "ritz n_dof"]]
-"""Ritz values θ = 1/(λ − σ), largest magnitude first, and M-orthonormal Ritz vectors; zero where there are fewer."""
+"""Ritz values θ = 1/(λ − σ) by descending magnitude, and M-orthonormal Ritz vectors, padded with zeros."""
 
 
 class ShiftedSolve(NamedTuple):
-    """How to apply (K − σM)⁻¹."""
+    """The data for applying (K − σM)⁻¹."""
 
     factor: Factorisation  # the factorisation of K − σM
     shift: Float[Array, ""]  # σ
-    passes: Int[Array, ""] | None  # 1, or 2 where the factorisation is inaccurate; None: 1, with nothing else compiled
+    passes: Int[Array, ""] | None  # 1, or 2 with a refinement step; None is 1 without compiling the refinement
 
 
 class _Blocks(NamedTuple):
-    """Two neighbouring blocks of the basis, and the image under M of the latter."""
+    """Two consecutive blocks of the basis, the image of the second under M, and their coupling."""
 
     before: Block
     block: Block
@@ -43,34 +43,35 @@ class _Blocks(NamedTuple):
 
 
 class _Recurrence(NamedTuple):
-    """What has been computed so far."""
+    """The state of the recurrence."""
 
-    basis: Basis  # known eigenvectors and the blocks so far, M-orthonormal rows; the rest is zero
-    blocks: _Blocks  # the last two blocks, of which the latter is not yet in the basis
-    # the blocks on the diagonal of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, and those below it
+    basis: Basis  # M-orthonormal rows: the known eigenvectors, then the blocks so far; the rest is zero
+    blocks: _Blocks  # the last two blocks; the second is not yet in the basis
+    # the diagonal and subdiagonal blocks of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV
     matrix: Float[Array, "steps two b b"]
 
 
 def block_lanczos(
     pencil: SymmetricPencil,
     shifted: ShiftedSolve,
-    start: Block,  # the first block, any vectors
-    known: Known,  # M-orthonormal eigenvectors, or zero rows; w a multiple of b, 0 where nothing is known
-    room: int,  # for how many blocks there is room; static
-    steps: int | Int[Array, ""],  # how many blocks to compute, even; traced, as many as there is room for
+    start: Block,  # any vectors, from which the first block is made
+    known: Known,  # M-orthonormal eigenvectors or zero rows; w is a multiple of b and may be 0
+    room: int,  # the maximal number of blocks; static
+    steps: int | Int[Array, ""],  # the number of blocks to compute, even; under `jit`, `room` blocks are computed
     wanted: int,
 ) -> RitzPairs:
-    """Run Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
+    """Run block Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
-    Neighbouring blocks are kept orthogonal by the recurrence, and in double precision two at a time by one pass against
-    the whole basis, which reads it from memory half as often and leaves it M-orthonormal to rounding.
+    The recurrence keeps consecutive blocks orthogonal. In double precision, every second step projects two blocks on
+    the whole basis. Thus the basis is read half as often, and stays M-orthonormal to rounding.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
-    # Traced, all of them are one loop: were its length to differ within a batch, each turn would copy all of the state.
+    # Under `jit`, the loop takes `room` steps, because a length that varies within a batch would copy the whole state
+    # in every iteration.
     steps = room if traced else int(steps)
     if not traced and shifted.passes is not None and int(shifted.passes) == 1:
         shifted = shifted._replace(passes=None)
-    # On accelerators two steps are a computation without a loop, so that nothing has to wait for the device.
+    # On accelerators, a compiled call has two steps and no loop, so that the host never waits for the device.
     alone = accelerators.at_hand() and not traced
     stretch = room if traced else 2 if alone else _STRETCH
     for done in range(0, steps, stretch):
@@ -80,7 +81,7 @@ def block_lanczos(
 
 @jit_quickly(static_argnames="room")
 def _begin(pencil: SymmetricPencil, start: Block, known: Known, room: int) -> _Recurrence:
-    """Return the state before the first step: the first block is orthogonal to the known vectors."""
+    """Return the initial state, whose first block is orthogonal to the known vectors."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2 if len(known) else 0):
         block = block - matmul(products_with_columns(known, mass(block)).T, known).T
@@ -101,9 +102,9 @@ def _advance(
     first: int | Array,
     last: int | Array,
 ) -> _Recurrence:
-    """Take the steps from the first to before the last, or two ``alone``; their blocks begin at row ``offset``."""
-    # Next to the shift an eigenvalue's θ may be a thousand times as large as the others, and what rounding leaves of
-    # its eigenvector in a block grows as much in a step: in single precision every step projects on the whole basis.
+    """Take the steps first, …, last − 1, or two steps if ``alone``. The basis has the blocks from row ``offset`` on."""
+    # If an eigenvalue is close to the shift, its θ may be 1000 times as large as other θ. A step amplifies the rounding
+    # error along this eigenvector by as much. So in single precision, every step projects on the whole basis.
     every = 2 if state.blocks.block.dtype == jnp.float64 else 1
     two = accelerators.at_hand()
 
@@ -111,7 +112,7 @@ def _advance(
         steps = _stepping(pencil, shifted, offset)
 
         def turn(number: Array, state: _Recurrence) -> _Recurrence:
-            if two:  # of every step in two it is known whether to project
+            if two:  # statically known which of two steps projects
                 return steps(2 * number, state, (every == 1, True))
             return steps(number, state, ((number + 1) % every == 0,))
 
@@ -119,7 +120,7 @@ def _advance(
         return turn(jnp.asarray(ends[0]), state) if alone else jax.lax.fori_loop(*ends, turn, state)
 
     if two and not alone and shifted.passes is not None:
-        # How often to solve is asked once, and not in each step, for which the host would wait.
+        # The host waits for the number of passes only once, and not in each step.
         once = partial(advance, shifted._replace(passes=None))
         return jax.lax.cond(_in_any(shifted.passes > 1), partial(advance, shifted), once, state)
     return advance(shifted, state)
@@ -128,7 +129,7 @@ def _advance(
 def _stepping(
     pencil: SymmetricPencil, shifted: ShiftedSolve, offset: int
 ) -> Callable[[Array, _Recurrence, tuple[bool | Array, ...]], _Recurrence]:
-    """Return how to take steps: of the first one's number, the state, and whether each projects on the whole basis."""
+    """Return a function that takes steps, given the first index, the state, and whether each step projects."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     factor, shift, passes = shifted
 
@@ -143,7 +144,7 @@ def _stepping(
             x = factor.solve(rhs)
             return x + factor.solve(residual_of(x))
 
-        # A loop, so that the solve is compiled once.
+        # A loop compiles the solve only once.
         def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, residual = state
             x = x + factor.solve(residual)
@@ -152,7 +153,7 @@ def _stepping(
         return jax.lax.fori_loop(0, passes, refine, (jnp.zeros_like(rhs), rhs))[0]
 
     def step(number: Array, basis: Basis, blocks: _Blocks, now: bool | Array) -> tuple[Basis, _Blocks, Array]:
-        # Write the last block into the basis, and find the one that follows it.
+        # Write the current block into the basis, and compute the next block.
         before, block, image, coupling = blocks
         b = block.shape[1]
         onward, diagonal = krylov_basis.recur(block, image, before, coupling, solve(image))
@@ -182,11 +183,11 @@ def _stepping(
     return steps
 
 
-# Of a condition that differs within a batch both branches would be computed, for all of it. To solve again is right
-# where it is not needed, too.
+# If a condition varies within a batch, XLA computes both branches for all problems. An unnecessary refinement does no
+# harm, so the whole batch takes one branch.
 @jax.custom_batching.custom_vmap
 def _in_any(condition: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Return a condition; within a batch, whether it holds for any problem of it."""
+    """Return the condition; in a batch, whether it holds for any problem."""
     return condition
 
 
@@ -200,7 +201,7 @@ def _ritz_pairs(state: _Recurrence, offset: int, steps: int | Int[Array, ""], wa
     room, _, b, _ = state.matrix.shape
     i = jnp.arange(room)
     diagonal, below = state.matrix[:, 0], state.matrix[:-1, 1]
-    # The last block is coupled to one that is not in the basis.
+    # The last coupling belongs to a block outside the basis.
     below = jnp.where((i[:-1] < steps - 1)[:, None, None], below, 0)
     full = jnp.zeros((room, b, room, b), below.dtype).at[i, :, i, :].set(diagonal)
     full = full.at[i[:-1], :, i[1:], :].set(below)

@@ -1,9 +1,10 @@
-"""Spectrum slicing: the lowest eigenpairs of a pencil, interval by interval, none missed.
+"""Spectrum slicing: the lowest eigenpairs of a pencil, slice by slice, with a certificate that none is missed.
 
-Each slice factorises K − σM at a shift σ a little above what is known already. The inertia says how many eigenvalues
-lie below σ; block Lanczos, kept orthogonal to the known eigenvectors near by, finds them and about as many above. What
-converged is known from then on. A last factorisation above the last eigenvalue wanted is the certificate: as many
-eigenvalues as are known lie below it. Few vectors at a time keep orthogonalisation cheap, however many are wanted.
+Each slice factorises K − σM at a shift σ slightly above the known eigenvalues. The inertia gives the number of
+eigenvalues below σ. Block Lanczos, kept orthogonal to the known eigenvectors close to σ, finds the missing ones and
+about as many above σ. Converged pairs become known. The certificate is a last factorisation at a shift above the wanted
+eigenvalues: its inertia equals the number of known eigenvalues below. Small slices keep orthogonalisation cheap for any
+number of wanted pairs.
 """
 
 from functools import partial
@@ -26,26 +27,26 @@ from hks_jax.linear.products import gram, matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _ERROR = 0.1
-"""How far the error of solves may reach towards the tolerance of the lowest eigenvalue sought."""
+"""The largest error of solves, relative to the allowed residual of the lowest missing eigenvalue."""
 _EXCUSE = 30
-"""How much more than usual rounding may spoil residuals, where nothing converges otherwise."""
+"""The factor by which residuals may exceed the usual level of rounding if nothing converges otherwise."""
 _MOVES = 3
-"""How often in a row to move a shift at which the inertia is not to be trusted, before it must do."""
+"""The maximal number of consecutive moves of a shift whose inertia is uncertain; then the shift is used anyway."""
 _TURNS = 12
-"""Inverse iterations in a search, at most."""
+"""The maximal number of inverse iterations in a search."""
 _COPY = 1e-6
-"""How far below an eigenvalue, relative, there is none of its copies."""
+"""A relative distance that exceeds the differences of the computed values of a multiple eigenvalue."""
 
 Scalar = Float[Array, ""]
 Interval = tuple[Scalar, Scalar]
 Order = Int[Array, " ritz"]
-"""In which order to store Ritz vectors, those that are taken first."""
+"""The order in which Ritz vectors are stored; the accepted ones come first."""
 
 
 def cut(
     problem: Problem, dissection: Dissection, plan: Plan, state: SlicingState
 ) -> tuple[Factorisation, Bool[Array, ""], SlicingState]:
-    """Factorise at the state's shift; return with it whether to search there, and the state, with room for that."""
+    """Factorise at the state's shift; also return whether to search there, and the state with room for the results."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
     trial = try_out(factor, problem.pencil, state.shift, state.noise)
     searchable, full, following = _consider(problem, factor.negative, trial, plan, state._replace(vectors=None))
@@ -56,30 +57,29 @@ def cut(
 def _consider(
     problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, state: SlicingState
 ) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
-    """Return whether to search at the state's shift, whether to make room for it, and the state: if it is not to be
-    searched, finished or with a better shift."""
+    """Decide whether to search at the current shift, and whether to free storage first; also return the new state."""
     known, below = jnp.sum(state.values < state.shift), negative - problem.negative
     missing = below - known
     complete = trial.sound & (missing == 0)
     last = jnp.sort(state.values)[plan.wanted - 1]
-    all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # with copies of the last, or less few
-    finished = complete & (all_wanted | (negative == problem.pencil.size))  # or there are no more
-    # Where a nearer shift leaves as many, they are copies of one eigenvalue: that is searched, as often as it takes.
+    all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
+    finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no more exist
+    # If as many eigenvalues are missing at a nearer shift, these are equal. Then search there, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
-    # Of more copies than are wanted some are enough: the certificate is below them.
+    # If a multiplicity exceeds the wanted number, a part suffices; the certificate is then below the multiplet.
     cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
-    # Another shift costs a factorisation, refined solves more: they are for where it is no better.
+    # A new shift costs a factorisation, and refined solves cost more. So refine only if a new shift is no better.
     moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
 
-    # Beyond a wide gap there may be very many at once: then the bracket between complete and too far is cut.
+    # Very many eigenvalues may follow a wide gap. Then divide the bracket between the complete part and the shift.
     start = jnp.maximum(state.reached, state.complete_below)
     share = jnp.maximum(plan.slice_size / (2.5 * jnp.maximum(missing, 1).astype(state.shift.dtype)), 1 / 4)
     nearer = start + share * (state.shift - start)
-    # 0.7 of the mean distance of eigenvalues leaves an eigenvalue of a part of the domain behind. Upward where all are
-    # known, downward where some are missing.
+    # A move by 0.7 mean gaps avoids an eigenvalue of a part of the domain. The shift moves up if all eigenvalues below
+    # it are known, and otherwise down.
     down = state.shift - 0.7 * (state.shift - state.reached) / jnp.maximum(missing, 1).astype(state.shift.dtype)
     up = state.shift + 0.7 * _spacing(problem, plan, state)
     beside = jnp.where(jnp.where(trial.sound, missing <= 0, state.known >= plan.wanted), up, down)
@@ -100,7 +100,7 @@ def _consider(
 
 
 def _needed(problem: Problem, plan: Plan, lowest: Scalar, excuse: Scalar | float = 1.0) -> Scalar:
-    """Return how small residuals ‖Kφ − λMφ‖/‖Mφ‖ must be if the lowest eigenvalue not known yet is to converge."""
+    """Return the largest residual ‖Kφ − λMφ‖/‖Mφ‖ at which the lowest missing eigenvalue counts as converged."""
     rounding = excuse * indistinct(problem.pencil, lowest.dtype)
     return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, plan.tolerance)
 
@@ -112,8 +112,8 @@ def search(problem: Problem, factor: Factorisation, plan: Plan, state: SlicingSt
     if not is_traced(state.multiple) and state.multiple:
         order, vectors, following = _nearest(problem, shifted, plan, state)
     else:
-        # Where one slice is enough nothing is known as a rule, and there are no rows of zeros to stay orthogonal to. Of
-        # several slices the first would have to be compiled apart.
+        # If one slice suffices, usually no vector is known, and the window is empty. With several slices, an empty
+        # first window would need a separate compilation.
         nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
         known, interval, steps = _window(problem, plan, state, 0 if nothing else plan.window)
         ritz = block_lanczos(problem.pencil, shifted, state.start, known, plan.steps, steps, plan.ritz)
@@ -121,17 +121,17 @@ def search(problem: Problem, factor: Factorisation, plan: Plan, state: SlicingSt
         vectors = ritz[1]
         if not is_traced(following.stuck) and following.stuck and state.below > 0:
             order, vectors, following = _nearest(problem, shifted, plan, state)
-    # Apart, so that nothing else is in memory besides the two arrays of vectors.
+    # A separate call, so that memory holds only the two arrays of vectors.
     return following._replace(vectors=_stored(state.vectors, vectors, order, state.known))
 
 
-# Lanczos finds no more copies of an eigenvalue than a block has columns, and nothing where there are fewer different
-# eigenvalues than it takes steps. Inverse iteration finds as many as it has vectors, if they are near to the shift: of
-# copies that are more any will do.
+# Block Lanczos finds a multiple eigenvalue at most as often as a block has columns. Block Lanczos fails if the number
+# of steps exceeds that of distinct eigenvalues. Inverse iteration finds as many eigenvalues near the shift as it has
+# vectors. If a multiplicity is larger, any vectors of the eigenspace will do.
 def _nearest(
     problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
-    """Search by inverse iteration, orthogonal to all that is known; see `_accept`. For concrete values."""
+    """Search by inverse iteration, orthogonal to all known eigenvectors; see `_accept`. Only for concrete values."""
     missing = int(state.below - jnp.sum(state.values < state.shift))
     count = min(missing + plan.block, plan.ritz, problem.pencil.size - int(state.known))
     x = jax.random.normal(jax.random.key(int(state.slices)), (problem.pencil.size, count), state.shift.dtype)
@@ -152,7 +152,7 @@ def _nearest(
 def _inverse_iteration(
     pencil: SymmetricPencil, shifted: ShiftedSolve, vectors: Stored, known: Int[Array, ""], x: Block
 ) -> tuple[Float[Array, " b"], Block, Float[Array, " b"]]:
-    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the first vectors, and their residuals."""
+    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the known ones, and residuals."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     x = shifted.factor.solve(mass(x))
     for _ in range(2):
@@ -168,10 +168,10 @@ def _inverse_iteration(
 def _window(
     problem: Problem, plan: Plan, state: SlicingState, rows: int
 ) -> tuple[Float[Array, "rows n_dof"], Interval, Int[Array, ""]]:
-    """Return how to search around the state's shift.
+    """Return the data of a search around the state's shift.
 
-    These are so many of the known eigenvectors nearest to it, to stay orthogonal to, zero where there are fewer; the
-    interval in which nothing else is known; and how many Lanczos blocks to compute.
+    The data are the known eigenvectors nearest to the shift, padded with zeros, to which the search stays orthogonal;
+    the interval that contains no other known eigenvalue; and the number of Lanczos blocks.
     """
     assert state.vectors is not None
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))[:rows]
@@ -181,14 +181,14 @@ def _window(
     low = jnp.fmax(jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf), bottom)
     high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
-    # The last slice has fewer eigenvalues to find. More than wanted: the certificate needs a gap above the last.
+    # The last slice is smaller, but contains some unwanted eigenvalues, because the certificate needs a gap.
     size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2 + 2 * plan.block, plan.slice_size)
     return vectors, (low, high), jnp.minimum(steps_for(plan, size), plan.steps)
 
 
 @jit_quickly(donate_argnames="known_vectors")
 def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: Order, known: Int[Array, ""]) -> Stored:
-    """Return the known vectors with others, in that order, behind them: in place."""
+    """Append vectors, in the given order, to the known vectors, in place."""
     return jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], known, 0)
 
 
@@ -196,9 +196,9 @@ def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: O
 def _accept(
     problem: Problem, plan: Plan, ritz: RitzPairs, interval: Interval, state: SlicingState
 ) -> tuple[Order, SlicingState]:
-    """Take what converged of the Ritz pairs in the interval, and choose the next shift.
+    """Accept the converged Ritz pairs in the interval, and choose the next shift.
 
-    What is known outside that interval may have been found again: nothing out there is taken. The state has no vectors.
+    Ritz pairs outside the interval may repeat known pairs, and are not accepted. The state has no vectors.
     """
     (theta, vectors), (low, high) = ritz, interval
     shift, index, dtype = state.shift, jnp.arange(plan.capacity), vectors.dtype
@@ -207,20 +207,20 @@ def _accept(
     values, residuals, _ = measure_pairs(problem.pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
     scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
-    # Where nothing converged, as on a domain much longer than wide, it is rounding that is worse than usual: the
-    # residuals say so.
+    # If nothing converged, as on a very elongated domain, rounding exceeds the usual level, and the limit is raised.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
     allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), plan.tolerance)
     converged = (residuals <= allowed) & (theta != 0)
-    # Above the first that did not converge, or farther away than those looked at, some are missing.
+    # Pairs may be missing above the first that did not converge, and farther from the shift than the examined pairs.
     above = near > shift
     limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
     reach = shift + 1 / jnp.min(jnp.where(theta != 0, jnp.abs(theta), jnp.inf))
     end = jnp.minimum(jnp.minimum(limit, reach), high)
     accepted = converged & (values > low) & (values < end)
     complete = state.below == jnp.sum(state.values < shift) + jnp.sum(accepted & (values < shift))
-    # What is known is kept out of later searches. If it has parts in the missing eigenvectors, which may be of much
-    # smaller eigenvalues, these do not converge any more: then only what is accurate enough for them is taken.
+    # Later searches stay orthogonal to the known vectors. If these had components along missing eigenvectors, which may
+    # have much smaller eigenvalues, the missing pairs could not converge. So if pairs are missing, accept only vectors
+    # whose accuracy suffices for the missing pairs.
     needed = _needed(problem, plan, jnp.maximum(state.reached, first_nonzero), excuse)
     accepted &= complete | (residuals <= needed)
 
@@ -229,20 +229,20 @@ def _accept(
     new = jnp.where(jnp.arange(plan.ritz) < count, values[order], jnp.inf)
     all_values = jax.lax.dynamic_update_slice_in_dim(state.values, new, state.known, 0)
     known = state.known + count
-    # Between the shift and the end all are known.
+    # All eigenvalues between the shift and `end` are known.
     gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
 
-    # Where some below the shift are missing, go to where the lowest that did not converge seems to be. If there is
-    # none, they are anywhere: a multiplet was found in part. Where nothing converges from the bottom on, go below it:
-    # there the matrix is definite, and its factorisation as accurate as can be.
+    # If eigenvalues below the shift are missing, move to the lowest Ritz value that did not converge. If all converged,
+    # a multiplet was found in part, and its place is unknown. If nothing converges from the lower end of the spectrum
+    # on, move below this end, where the matrix is definite and its factorisation most accurate.
     lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
     seen, stuck = lowest < shift, ~complete & (count == 0)
     again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)
     bottom = (state.reached <= 0) & (problem.negative == 0)
     again = jnp.where(stuck & bottom, -jnp.abs(shift) / jnp.maximum(state.below, 1).astype(dtype), again)
     leftover = jnp.argsort(jnp.where(above & ~accepted, near, jnp.inf))[: plan.block]
-    # Where all below the shift are known, and nothing converged above it, as above a multiplet far from all others, go
-    # to where others seem to be.
+    # If all eigenvalues below the shift are known and none converged above it, as above an isolated multiplet, move to
+    # the next Ritz values.
     beyond = jnp.sort(jnp.where(above, near, jnp.inf))[min(plan.slice_size // 4, plan.ritz - 1)]
     onward = jnp.where((count == 0) & jnp.isfinite(beyond), shift + 1.1 * (beyond - shift), -jnp.inf)
     noise = 0.01 * jnp.std(vectors) * jnp.roll(state.noise, state.slices, axis=0)
@@ -265,7 +265,7 @@ def _accept(
 
 
 def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
-    """Return the mean distance of the last few known eigenvalues; of few, at least what is expected."""
+    """Return the mean gap of the last known eigenvalues; if few are known, at least the expected gap."""
     few = jnp.minimum(state.known, plan.slice_size)
     ordered = jnp.sort(state.values)
     last = ordered[jnp.maximum(state.known - 1, 0)]
@@ -274,14 +274,14 @@ def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
 
 
 def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
-    """Return where to cut next: within the next slice, or in a gap above the last eigenvalue wanted."""
+    """Return the next shift: within the next slice, or in a gap above the last wanted eigenvalue."""
     ordered, known = jnp.sort(state.values), state.known
     index = jnp.arange(plan.capacity)
     spacing = _spacing(problem, plan, state)
     left = (plan.wanted - jnp.sum(ordered <= state.reached)).astype(ordered.dtype)
     slices = jnp.ceil(left / plan.slice_size)
     ahead = jnp.maximum(state.reached, state.complete_below) + spacing * (left / jnp.maximum(slices, 1) / 2 + 1)
-    # The widest gap among the next few is safest, and nothing is known above the last.
+    # The widest of the next gaps is the safest place; the gap above the last known eigenvalue is estimated.
     gaps = jnp.where(index < known - 1, jnp.roll(ordered, -1) - ordered, spacing)
     last_few = (index >= plan.wanted - 1) & (index < plan.wanted + 7) & (index < known)
     widest = jnp.argmax(jnp.where(last_few, gaps, -1))

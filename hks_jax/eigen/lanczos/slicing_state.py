@@ -1,4 +1,4 @@
-"""What spectrum slicing knows between two slices, and the sizes of its computation."""
+"""The state of spectrum slicing between two slices, and the sizes of its computation."""
 
 from typing import NamedTuple
 
@@ -10,89 +10,90 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.linear.pencil import SymmetricPencil
 
 _NODES = 1 << 16
-"""Degrees of freedom of all eigenvectors that are moved at once."""
+"""The number of degrees of freedom at which eigenvectors are permuted together."""
 
 Stored = Float[Array, "capacity n_dof"]
 
 
 class Problem(NamedTuple):
-    """A pencil, and what is known of its spectrum beforehand. The eigenvalues sought are counted from zero upwards."""
+    """A pencil, and estimates of its spectrum. The wanted eigenvalues are the lowest that are not negative."""
 
     pencil: SymmetricPencil  # K and M
     first: Float[Array, ""]  # the first shift
-    spacing: Float[Array, ""]  # the mean distance of eigenvalues to expect
-    lowest: Float[Array, ""]  # how large to expect the lowest one that is not zero
-    unit: Float[Array, ""]  # residuals of eigenvalues that are smaller than this are measured by it
-    negative: Int[Array, ""]  # how many eigenvalues are negative, and not sought
+    spacing: Float[Array, ""]  # the expected mean gap of eigenvalues
+    lowest: Float[Array, ""]  # the expected lowest nonzero eigenvalue
+    unit: Float[Array, ""]  # the lower bound of the eigenvalue in relative residuals
+    negative: Int[Array, ""]  # the number of negative eigenvalues, which are not wanted
 
 
 class Plan(NamedTuple):
     """The sizes of a computation; static."""
 
-    wanted: int  # how many eigenpairs
-    block: int  # vectors per Lanczos block
-    slice_size: int  # eigenvalues that a slice is expected to find, half of them below its shift
-    max_slices: int  # factorisations before giving up
-    tolerance: float  # relative residual that counts as converged
-    nulls: int  # how many of the wanted eigenvalues are zero, by what is known of the matrices
+    wanted: int  # the number of eigenpairs
+    block: int  # the number of vectors per Lanczos block
+    slice_size: int  # the expected number of eigenvalues per slice, half of them below its shift
+    max_slices: int  # the maximal number of factorisations
+    tolerance: float  # the relative residual at which a pair counts as converged
+    nulls: int  # the number of wanted eigenvalues that are known to be zero
 
     @property
     def steps(self) -> int:
-        """Lanczos blocks that a slice takes at most."""
+        """The maximal number of Lanczos blocks in a slice."""
         return int(steps_for(self, self.slice_size))
 
     @property
     def ritz(self) -> int:
-        """Ritz pairs looked at in each slice, in whole blocks."""
+        """The number of Ritz pairs examined in each slice, a multiple of the block size."""
         return min(self.steps, -(-self.slice_size * 6 // 5 // self.block)) * self.block
 
     @property
     def window(self) -> int:
-        """Known eigenvectors that a slice stays orthogonal to, so as not to find them again.
+        """The number of known eigenvectors to which a slice stays orthogonal, so that it does not find them again.
 
-        Those far away are not found before what is nearer, but of a large multiplet a slice finds only a part.
+        Remote eigenvectors may be omitted, because Lanczos finds near ones first. A large multiplet is found only in
+        part.
         """
         size = max(self.slice_size // 4, min(self.slice_size // 2, 48))
         return -(-size // self.block) * self.block
 
     @property
     def capacity(self) -> int:
-        """Room for eigenpairs."""
+        """The maximal number of stored eigenpairs."""
         return self.wanted + self.block + self.ritz
 
 
-# Measured: of m Lanczos vectors in blocks of b about (m − 12 b)/2.1 converge to 1e-8.
+# Measured: with m Lanczos vectors in blocks of b, about (m − 12 b)/2.1 pairs converge to 1e-8.
 def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
-    """Return the number of Lanczos blocks, even, that finds a number of eigenvalues."""
+    """Return the number of Lanczos blocks, rounded up to even, for ``size`` eigenvalues to converge."""
     return 2 * -(-(21 * size + 120 * plan.block) // (20 * plan.block))
 
 
 class SlicingState(NamedTuple):
-    """What is known between two slices."""
+    """The state between two slices. A pair is called known if it has been computed and accepted."""
 
-    values: Float[Array, " capacity"]  # known eigenvalues in the order found; infinite where there is none
-    vectors: Stored | None  # their M-orthonormal eigenvectors; None where they are handed over apart
-    known: Int[Array, ""]  # how many there are
-    shift: Float[Array, ""]  # where to cut next
-    # eigenvalues from zero to the shift, by the inertia of the factorisation there; −1 if that is not trusted
+    values: Float[Array, " capacity"]  # known eigenvalues in the order of acceptance, padded with infinity
+    vectors: Stored | None  # their M-orthonormal eigenvectors; None if passed as a separate argument
+    known: Int[Array, ""]  # the number of known pairs
+    shift: Float[Array, ""]  # the next shift
+    # the number of eigenvalues from zero to the shift, by inertia; −1 if the factorisation was too inaccurate
     below: Int[Array, ""]
-    multiple: Bool[Array, ""]  # whether many of them are not known, and copies of one eigenvalue
-    far: Float[Array, ""]  # the last shift below which there were too many to search there,
-    far_below: Int[Array, ""]  # and how many; 0 before there is one
-    reached: Float[Array, ""]  # known up to this without a gap, as far as is known
-    complete_below: Float[Array, ""]  # every eigenvalue below it is known, by the inertia of a factorisation
-    start: Float[Array, "n_dof block"]  # where Lanczos starts next
-    noise: Float[Array, "n_dof block"]  # independent normal numbers
-    slices: Int[Array, ""]  # factorisations so far
-    moved: Int[Array, ""]  # how often in a row the shift was moved because the factorisation was inaccurate there
-    passes: Int[Array, ""]  # how often to solve: once, or again with the residual
+    multiple: Bool[Array, ""]  # whether the many missing eigenvalues are probably equal
+    far: Float[Array, ""]  # the last shift at which too many eigenvalues were missing for a search
+    far_below: Int[Array, ""]  # the number of eigenvalues below `far`; 0 at first
+    reached: Float[Array, ""]  # the end of the range from zero that seems to have no missing eigenvalue
+    complete_below: Float[Array, ""]  # inertia certifies that every eigenvalue below this is known
+    start: Float[Array, "n_dof block"]  # the start block of the next Lanczos run
+    noise: Float[Array, "n_dof block"]  # independent normal random numbers
+    slices: Int[Array, ""]  # the number of factorisations so far
+    moved: Int[Array, ""]  # the number of consecutive moves of the shift because of inaccurate factorisations
+    passes: Int[Array, ""]  # the number of solves per step: 1, or 2 with a refinement step
     stuck: Bool[Array, ""]  # whether the last search found none of the missing pairs
-    finished: Bool[Array, ""]  # whether all is found and certified
+    finished: Bool[Array, ""]  # whether all wanted pairs are known and certified
 
 
 @jit_quickly(static_argnames="plan")
 def first_state(problem: Problem, plan: Plan) -> SlicingState:
-    """Return the state in which nothing is known."""
+    """Return the initial state, without known pairs."""
     n, dtype = problem.pencil.size, problem.pencil.stiffness.dtype
     noise = jax.random.normal(jax.random.key(0), (n, plan.block), dtype)
     return SlicingState(
@@ -118,17 +119,17 @@ def first_state(problem: Problem, plan: Plan) -> SlicingState:
 
 @jit_quickly(static_argnames="plan")
 def unfinished(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
-    """Return whether to go on: not all is found, and there are tries left."""
+    """Return whether another slice is needed and allowed."""
     return ~state.finished & (state.slices < plan.max_slices)
 
 
 def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
-    """Return whether to forget some known pairs: there is no room for those of a search, or it is stuck."""
+    """Return whether to discard some known pairs, because the storage is full or the search is stuck."""
     return state.stuck | (state.known > plan.capacity - plan.ritz)
 
 
 def make_room(plan: Plan, state: SlicingState) -> SlicingState:
-    """Forget the highest of the known eigenpairs, which are more than wanted; if stuck, all above what was reached."""
+    """Discard the highest known pairs, which exceed the wanted number; if stuck, all pairs above ``reached``."""
     assert state.vectors is not None
     return _with_room(plan, state.vectors, state._replace(vectors=None))
 
@@ -145,7 +146,7 @@ def _with_room(plan: Plan, vectors: Stored, state: SlicingState) -> SlicingState
 
 
 def _reordered(vectors: Stored, order: Int[Array, " capacity"], kept: Bool[Array, " capacity"]) -> Stored:
-    """Return the rows in that order, zero where none is kept: in place where they may be overwritten."""
+    """Permute the rows and zero those that are not kept, in place if the argument is donated."""
 
     def some(at: int | Array, width: int, vectors: Array) -> Array:
         part = jax.lax.dynamic_slice_in_dim(vectors, at, width, axis=1)

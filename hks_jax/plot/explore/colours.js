@@ -1,4 +1,4 @@
-// Colour tables of 256 entries, colour bars, and numbers as text.
+// Colour tables with 256 entries, colour bars, and numbers as text.
 const tables = Object.fromEntries(
   Object.entries(about.colours).map(([name, text]) => [name, Uint8Array.from(atob(text), (c) => c.charCodeAt(0))]),
 );
@@ -7,7 +7,7 @@ function entry(fraction) {
   return 3 * Math.max(0, Math.min(255, Math.round(255 * fraction)));
 }
 
-// A scale: which colours, from which value to which. What is constant but for rounding looks constant.
+// A scale consists of colours and the values of the first and the last. Values that differ by rounding get one colour.
 function scaleOf(table, low, high) {
   const least = 1e-5 * (Math.max(Math.abs(low), Math.abs(high)) || 1);
   if (high - low < least) [low, high] = [low - least / 2, high + least / 2];
@@ -35,7 +35,7 @@ function showBar(bar, scale, centre) {
 
 const raised = (text) => [...text].map((c) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[c] ?? "⁻").join("");
 
-// Three digits, or as many as belong to the largest number beside it; powers of ten where there would be many zeros.
+// Three digits, or as many as the largest number beside it needs; a power of ten instead of many zeros.
 function number(x, largest = Math.abs(x)) {
   if (!Number.isFinite(x)) return "–";
   if (x === 0 || Math.abs(x) < 1e-6 * largest) return "0";
@@ -48,7 +48,7 @@ function number(x, largest = Math.abs(x)) {
   return x.toFixed(Math.max(0, 2 - exponent)).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
 }
 
-// A round number, without the zeros at its end.
+// A rounded number without trailing zeros.
 const tickText = (x, largest) => number(x, largest).replace(/\.(\d*?)0+$/, (_, kept) => (kept ? `.${kept}` : ""));
 
 const withUnit = (text, unit) => (unit ? `${text} ${unit}` : text);

@@ -1,11 +1,11 @@
-// What a reader sets, and the elements to set it with.
+// The state that a reader sets, and the elements that set it.
 const AXES = ["x", "y", "z"];
 const [nearest, farthest] = [0, times.length - 1];
 
 const state = {
   time: Math.floor(farthest / 3),
   axis: 2,
-  index: [0, 0, 0], // the slice shown, along each axis
+  index: [0, 0, 0], // the index of the slice along each axis
   quantity: quantities[0],
   layer: 0,
   from: nearest,
@@ -44,10 +44,10 @@ function setUp() {
   element("software").textContent = about.software;
   element("reading").textContent = isFlat
     ? `${power}·HKS is 1 where space is flat and no boundary is near. At small t it is above 1 where the curvature is positive, ` +
-      "below 1 where it is negative. Natural (Neumann) boundaries raise it nearby, up to twofold along a straight side; " +
-      "fixed ones (Dirichlet) lower it to 0; the mean of both is nearly free of them. At large t it grows everywhere, as heat has filled the domain: " +
+      "below 1 where it is negative. Neumann (natural) boundaries raise it nearby, up to twofold along a straight side. " +
+      "Dirichlet boundaries lower it to 0. The mean of both has nearly no boundary effect. At large t it grows everywhere, because heat has filled the domain; " +
       "HKS / mean then shows the differences."
-    : "This signature is normalised; only its differences from place to place mean something.";
+    : "This signature is normalised, so only its differences between places are meaningful.";
   element("time").max = element("from").max = element("to").max = farthest;
   element("time").value = state.time;
   element("to").value = farthest;
@@ -115,7 +115,7 @@ function setPoint(name, place) {
   if (name === "A") measure();
 }
 
-// The next node inside from a place, in steps along one axis; null where there is none.
+// The next inside node from a position in steps along one axis, or null if there is none.
 function stepFrom(place, axis, step) {
   const next = [...place];
   let last = null;
@@ -129,7 +129,7 @@ function stepFrom(place, axis, step) {
   return last;
 }
 
-// Along the edges of a surface, as far as they lead that way on the screen.
+// Steps along the edges of a surface that lead in this direction on the screen.
 function walk(place, [axis, step]) {
   let node = place[0];
   const [right, up] = axis === 0 ? [Math.sign(step), 0] : [0, Math.sign(step)];

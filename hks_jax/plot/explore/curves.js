@@ -1,4 +1,4 @@
-// The signature over t: lines and bands in one chart, on a logarithmic axis of t.
+// A chart of the signature over t, with lines and bands on a logarithmic axis of t.
 const SVG = "http://www.w3.org/2000/svg";
 
 function shapeOf(name, attributes, text) {
@@ -54,7 +54,7 @@ class Chart {
     return first === last ? 0.5 : Math.log(time / first) / Math.log(last / first);
   }
 
-  // series: {name, colour, line, low, high, thin}, with `line` and the ends of a band at each time.
+  // A series is {name, colour, line, low, high, thin}, with `line` and the bounds of a band at each time.
   draw(series, { quantity, now, from, to }) {
     const width = this.svg.clientWidth || 500;
     const height = this.svg.clientHeight || 320;

@@ -1,4 +1,4 @@
-// The numbers of the page, and what is computed from them: curves, means, distances.
+// The numbers of the page, and curves, means and distances that are computed from them.
 const element = (id) => document.getElementById(id);
 const about = JSON.parse(element("about").textContent);
 
@@ -7,7 +7,7 @@ function bytes(id) {
   const text = atob(block.textContent);
   const found = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) found[i] = text.charCodeAt(i);
-  block.remove(); // the text takes more memory than the numbers
+  block.remove(); // the text needs more memory than the numbers
   return found;
 }
 
@@ -17,12 +17,12 @@ const shape = [...about.shape, 1, 1].slice(0, 3);
 const dimension = about.dimension;
 const times = about.times;
 const inside = bytes("inside");
-const values = floats("values"); // time by time, for the nodes inside in the order of the grid
-const deviations = about.noise ? floats("deviation") : null; // that noise gives them
+const values = floats("values"); // for each time, at the inside nodes in the order of the grid
+const deviations = about.noise ? floats("deviation") : null; // the standard deviations of the values due to noise
 const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
 const labels = about.labels.length ? new Int32Array(bytes("labels").buffer) : null;
 
-// Between places of the grid, flat = (i·ny + j)·nz + k, and nodes, which are counted inside alone.
+// Maps between positions in the grid, flat = (i·ny + j)·nz + k, and the numbers of inside nodes.
 const nodeOfPlace = new Int32Array(inside.length).fill(-1);
 let count = 0;
 for (let p = 0; p < inside.length; p++) if (inside[p]) nodeOfPlace[p] = count++;
@@ -56,7 +56,7 @@ const mean = times.map((_, t) => {
   return sum / count;
 });
 
-// A quantity is what is stored times a factor at each time.
+// A quantity is the stored signature times a factor at each time.
 const ones = times.map(() => 1);
 const power = dimension === 2 ? "4πt" : "(4πt)³⁄²";
 const relative = { name: "HKS / mean", long: "HKS divided by its mean at each t", factor: mean.map((m) => 1 / m), centre: 1 };
@@ -74,7 +74,7 @@ const quantities = isFlat
 
 const curve = (node, quantity, of = values) => times.map((_, t) => of[t * count + node] * quantity.factor[t]);
 
-// Weights of the trapezoidal rule over log t from one time to another; they sum to 1.
+// Weights of the trapezoidal rule over log t between two times, normalised to the sum 1.
 function weights(from, to) {
   const w = times.map(() => 0);
   for (let t = from; t < to; t++) {
@@ -98,7 +98,7 @@ function distances(node, from, to) {
   return found.map(Math.sqrt);
 }
 
-// Mean and standard deviation at each time over some nodes.
+// The mean and the standard deviation over some nodes at each time.
 function statistics(nodes, quantity) {
   return times.map((_, t) => {
     let sum = 0;
@@ -110,13 +110,13 @@ function statistics(nodes, quantity) {
   });
 }
 
-// Three quartiles over some nodes: for each of them its values over t.
+// The three quartiles over some nodes at each time.
 function quartiles(nodes, quantity) {
   const sorted = times.map((_, t) => Float64Array.from(nodes, (n) => values[t * count + n] * quantity.factor[t]).sort());
   return [0.25, 0.5, 0.75].map((q) => sorted.map((sample) => sample[Math.round(q * (nodes.length - 1))]));
 }
 
-// Quantiles of numbers, of a sample where there are many.
+// Quantiles of numbers or, if there are many, of a sample.
 function quantiles(count, numberAt, wanted) {
   const stride = Math.max(1, Math.floor(count / 20000));
   const sample = new Float64Array(Math.ceil(count / stride));

@@ -1,4 +1,4 @@
-// An image of one slice on a canvas: its colours, the chosen points, a region's outline; and what the pointer does there.
+// An image of one slice on a canvas with colours, chosen points and a region's outline, and its pointer events.
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 class SliceImage {
@@ -14,7 +14,7 @@ class SliceImage {
     canvas.addEventListener("pointerleave", () => events.hover(null));
   }
 
-  // The plane: `across` is drawn to the right, `up` upwards.
+  // The axis `across` of the plane points to the right, and the axis `up` points upwards.
   lay(plane) {
     this.plane = plane;
     const { across, up } = plane;
@@ -25,7 +25,7 @@ class SliceImage {
     const dense = window.devicePixelRatio || 1;
     this.canvas.width = Math.round(width * dense);
     this.canvas.height = Math.round(height * dense);
-    // Of the grid's coordinates, in pixels of the canvas.
+    // The grid's coordinates in pixels of the canvas.
     const room = about.ends ? 15 * dense : 0;
     const lengths = [shape[across] * about.spacing[across], shape[up] * about.spacing[up]];
     const zoom = Math.min((this.canvas.width - 2 * room) / lengths[0], (this.canvas.height - 2 * room) / lengths[1]);
@@ -65,7 +65,7 @@ class SliceImage {
     const at = this.place(event);
     if (this.lasso) {
       this.lasso.push(at);
-      this.drawLasso(); // on top of what is there: nothing else has changed
+      this.drawLasso(); // over the present image, because nothing else has changed
     } else if (event.buttons & 1 && event.pointerType !== "touch") {
       this.events.pick(this.gridPlace(at), event.shiftKey);
     }
@@ -77,7 +77,7 @@ class SliceImage {
     this.lasso = null;
     if (drawn) this.events.redraw();
     if (!event) return;
-    // Less than two cells wide: a click, as is the end of every touch that did not scroll.
+    // A lasso narrower than two cells is a click, and so is the end of every touch that did not scroll.
     const wide = drawn && [0, 1].some((a) => {
       const along = drawn.map((at) => at[a]);
       return Math.max(...along) - Math.min(...along) >= 2;
@@ -86,7 +86,7 @@ class SliceImage {
     else if (drawn || event.pointerType === "touch") this.events.pick(this.gridPlace(this.place(event)), event.shiftKey);
   }
 
-  // colour(node, out): writes three numbers from 0 to 255.
+  // colour(node, out) writes three numbers from 0 to 255.
   draw(colour, { points, chosen, sticks }) {
     const { axis, across, up, index } = this.plane;
     const [nu, nv] = [shape[across], shape[up]];

@@ -1,6 +1,6 @@
-// What is drawn follows from the state alone: every change of it draws all of it again, once a frame.
+// The drawing depends only on the state. Every change of the state redraws everything, at most once per frame.
 let apart = new Float64Array(count); // the distance of each node from A
-let farApart = 1; // nearly the largest of them
+let farApart = 1; // a high quantile of these distances
 
 function measure() {
   apart = distances(nodeAt(state.points.A), state.from, state.to);
@@ -8,10 +8,10 @@ function measure() {
   takeAlike();
 }
 
-// A tenth of the way is a tenth of the distances' range, squared: small ones matter most.
+// The slider is quadratic in the distance, because small distances matter most.
 const alikeLimit = () => (element("alike").value / 100) ** 2 * (farApart || 1);
 
-const spreads = new Map(); // by quantity: what its colours span at each time
+const spreads = new Map(); // the range of the colours at each time, by quantity
 
 function spreadAt(t) {
   const { quantity } = state;
@@ -32,7 +32,7 @@ function signatureScale() {
   const stretch = 2 ** -element("contrast").value;
   if (quantity.centre !== null) {
     const halves = spans.map(([half]) => half).sort((a, b) => a - b);
-    // Signatures are positive: 0 is as far below 1 as 2 is above.
+    // Signatures are positive, so the colours reach from 0 to 2 at most before the contrast changes them.
     const half = Math.max(Math.min(halves[halves.length >> 1], 1) * stretch, 1e-6);
     return scaleOf("diverging", quantity.centre - half, quantity.centre + half);
   }
@@ -51,7 +51,7 @@ const byScale = (scale, numberAt) => (node, rgb) => {
   [rgb[0], rgb[1], rgb[2]] = [scale.table[e], scale.table[e + 1], scale.table[e + 2]];
 };
 
-// What noise could make of flat space, or of the mean, fades into grey; the more, the fewer deviations it is off.
+// Values within the noise of flat space, or of the mean, fade to grey, and more so for fewer standard deviations.
 function faded(colour) {
   const { time, quantity } = state;
   const middle = quantity === relative ? mean[time] : isFlat ? 1 : quantiles(count, (n) => values[time * count + n], [0.5])[0];
@@ -200,7 +200,7 @@ function save() {
   download(csv(columns), "hks-curves.csv");
 }
 
-// The largest coordinate, which says how many digits are worth showing.
+// The largest coordinate, which determines the number of digits.
 const reach = surface
   ? surface.vertices.reduce((most, x) => Math.max(most, Math.abs(x)), 0)
   : Math.max(...[[0, 0, 0], shape.map((n) => n - 1)].flatMap((corner) => position(corner).map(Math.abs)));
@@ -272,7 +272,7 @@ function render() {
 
 state.points.A = surface ? [frontVertex(), 0, 0] : [...about.start, 0].slice(0, 3);
 state.index = [...state.points.A];
-// Where most of the domain is far above 1 already, as in small volumes, all of it would be of one colour.
+// If most of the domain is far above 1, as in small volumes, all of it would have one colour.
 const typical = () => quantiles(count, (n) => values[state.time * count + n], [0.5])[0];
 if (isFlat && typical() > 2) state.quantity = relative;
 setUp();

@@ -1,5 +1,5 @@
-// An image of a surface on a canvas: orthographic, turned by hand, each pixel coloured from the three vertices around it.
-const view = { turn: 30, tilt: 20 }; // degrees: about the vertical z, and how far from above
+// An orthographic image of a surface on a canvas, turned by dragging. The three vertices of its face colour a pixel.
+const view = { turn: 30, tilt: 20 }; // the angle about the vertical axis z and the elevation, in degrees
 
 const surface = about.mesh ? { vertices: floats("vertices"), faces: new Int32Array(bytes("faces").buffer) } : null;
 
@@ -17,14 +17,14 @@ if (surface) {
   }
 }
 
-// What is to the right, up and towards the reader.
+// The directions to the right, up and towards the reader.
 function frameOfView() {
   const [a, e] = [view.turn, view.tilt].map((degrees) => (degrees * Math.PI) / 180);
   const [ca, sa, ce, se] = [Math.cos(a), Math.sin(a), Math.cos(e), Math.sin(e)];
   return [[-sa, ca, 0], [-se * ca, -se * sa, ce], [ce * ca, ce * sa, se]];
 }
 
-// Each vertex's pixel and depth, the face nearest to the reader at each pixel, and the weights of its vertices.
+// The pixel and depth of each vertex, the nearest face at each pixel, and the weights of its vertices.
 let drawn = null;
 
 function rasterise(width, height) {
@@ -71,7 +71,7 @@ function rasterise(width, height) {
   return drawn;
 }
 
-// Whether nothing hides a vertex: the surface's own slope may raise a neighbouring pixel a little.
+// Whether a vertex is visible, with a tolerance because the surface's slope may raise a neighbouring pixel.
 function isVisible(node, { at, depth, width, height }) {
   const [x, y] = [Math.floor(at[3 * node]), Math.floor(at[3 * node + 1])];
   if (x < 0 || y < 0 || x >= width || y >= height) return false;
@@ -89,7 +89,7 @@ class SurfaceImage extends SliceImage {
     this.raster = rasterise(this.canvas.width, this.canvas.height);
   }
 
-  // The vertex nearest to a place on the canvas, in pixels from its lower left corner.
+  // The vertex nearest to a position on the canvas, in pixels from its lower left corner.
   gridPlace([x, y]) {
     const { face, weights, width, height } = this.raster;
     const [column, row] = [Math.floor(x), Math.floor(height - y)];
@@ -161,7 +161,7 @@ function setView(turn, tilt) {
   [element("turn").value, element("tilt").value] = [view.turn, view.tilt];
 }
 
-// The vertices that are seen within a polygon, in pixels from the lower left corner.
+// The visible vertices in a polygon, in pixels from the lower left corner.
 function verticesInPolygon(polygon) {
   return nodesWhere((node) => {
     const [x, y] = [drawn.at[3 * node], drawn.height - drawn.at[3 * node + 1]];
@@ -169,7 +169,7 @@ function verticesInPolygon(polygon) {
   });
 }
 
-// The neighbour of a vertex that is farthest in a direction on the screen, if any is.
+// The neighbour of a vertex that is farthest in a direction on the screen, if there is one.
 function neighbourTowards(node, right, up) {
   const { faces } = surface;
   let [best, most] = [null, 0];

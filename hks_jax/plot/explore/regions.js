@@ -1,4 +1,4 @@
-// Regions: what a lasso, a distance or a label takes; and curves as a table.
+// Regions by a lasso, a distance or a label, and curves as a table.
 
 // Whether a ray from a point crosses a polygon an odd number of times.
 function isInPolygon(polygon, x, y) {
@@ -10,7 +10,7 @@ function isInPolygon(polygon, x, y) {
   return odd;
 }
 
-// The nodes of a slice whose middle lies in a polygon.
+// The nodes of a slice whose cell centres lie in a polygon.
 function nodesInPolygon(polygon, { axis, across, up, index }) {
   const found = [];
   const place = [0, 0, 0];
@@ -34,7 +34,7 @@ function nodesWhere(holds) {
 
 const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
 
-// Columns: t, then those given as [name, numbers at each time].
+// The columns are t and the given columns [name, numbers at each time].
 function csv(columns) {
   const head = [withUnit("t", about.unit && `(${about.unit})`), ...columns.map(([name]) => name)];
   const rows = times.map((t, i) => [t, ...columns.map(([, numbers]) => Number(numbers[i].toPrecision(9)))]);
