@@ -1,4 +1,4 @@
-"""Tests for tracers, which stand for the values of a computation in JAX transformations."""
+"""Tests whether values are concrete or traced."""
 
 from typing import Any
 
@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 
 def is_traced(tree: Any) -> bool:
-    """Return whether any leaf is a tracer, as under `jax.jit`."""
+    """Return whether any leaf is traced, as under `jax.jit`."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def is_staged() -> bool:
-    """Return whether every operation returns a tracer, as under `jax.jit`, even if its arguments are constants."""
+    """Return whether every operation is staged for a later computation, so that it returns a tracer."""
     return is_traced(jnp.zeros(()))

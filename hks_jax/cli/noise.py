@@ -33,7 +33,7 @@ _CLEAR = 2.0
 
 
 class Noisy(NamedTuple):
-    """Tensors, their noise, the map from tensors to a domain, and whether JAX can trace this map."""
+    """Tensors, their noise, a function from tensors to a domain, and whether JAX can trace the function."""
 
     tensors: np.ndarray
     noise: hj.TensorNoise
@@ -81,7 +81,7 @@ def with_error_bars(
     settings: Settings,
     progress: Progress,
 ) -> Result:
-    """Compute a signature and its error bars; `of_pairs` computes the signature without error bars."""
+    """Compute a signature by `of_pairs`, and its error bars."""
     bars, maps, interior, times = _error_bars(args, noisy, pairs, settings, progress)
     result = of_pairs(replace(settings, times=Times(times, settings.times.automatic)), progress)
     ratio = np.asarray(bars.signal_to_noise_at(interior))
@@ -105,7 +105,7 @@ def with_error_bars(
 def noise_of_volume(
     args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progress: Progress
 ) -> hj.TensorNoise:
-    """Return the noise of a volume's tensors, from the source that ``--noise`` names."""
+    """Return the noise of a volume's tensors according to ``--noise``."""
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: got residuals, which need a fit to diffusion-weighted images (--bval, --bvec)")

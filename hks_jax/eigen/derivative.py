@@ -1,4 +1,4 @@
-"""The lowest eigenpairs of a pencil, or those above an origin, and their derivatives by stiffness and mass."""
+"""Derivatives of eigenpairs, the lowest or the first above an origin, with respect to stiffness and mass."""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,10 +27,10 @@ from hks_jax.linear.products import inner_products, matmul
 from hks_jax.traced import is_traced
 
 Telling = Literal["nothing", "warning", "error"]
-"""The report, in addition to NaN, if the linear solves of a derivative do not converge."""
+"""The action if the linear solves of a derivative do not converge, in addition to the result NaN."""
 
 _ON_HOST = 1 << 23
-"""The largest number of entries of the eigenvectors for which NumPy differentiates; it needs no compilation."""
+"""The largest size of the eigenvectors for which NumPy differentiates, as fast as JAX and without compilation."""
 
 Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
 Followed = tuple[
@@ -48,12 +48,12 @@ def solved(
     throw: bool,
     report: Report = silent,
 ) -> Followed:
-    """Return k eigenvalues, the eigenvectors, the same vectors as the frame, the next eigenvalue, and a bound.
+    """Return k eigenvalues, their eigenvectors, the frame (the same vectors), the next eigenvalue, and a bound.
 
-    The pairs are the k lowest or, if ``interior``, the first k from the origin of a `LocatedPencil` upwards. The
-    derivative of the frame is dφᵢ without its components in the k eigenvectors. The next eigenvalue is infinite if
-    ``extra`` is 0; the bound is that of the solver. Both have the derivative zero. If the linear solves do not
-    converge, the derivative is NaN; with ``throw`` an error is raised, otherwise a warning for concrete values.
+    The pairs are the lowest or, if ``interior``, the first above the origin of a `LocatedPencil`. The derivative of the
+    frame is that of the eigenvectors without their rotation among the k. The next eigenvalue is infinite unless
+    ``extra`` = 1; the bound is the solver's certificate. Derivatives treat these two as constants. A derivative that
+    does not converge is NaN, with an error if ``throw``, and otherwise a warning if values are concrete.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)
@@ -64,22 +64,22 @@ def solved(
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #
-# The sum is over all j. Its terms for the computed pairs are evaluated directly; the remainder xᵢ is the solution of
+# The sum is over all j. Its part over the computed pairs is evaluated directly. The remainder xᵢ is the solution of
 #
 #     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
 #
-# on the M-orthogonal complement of the computed Φ, where K − λᵢM is positive definite. The map fᵢ ↦ xᵢ is symmetric,
-# so reverse mode uses the same solve. The solver computes some guard pairs beyond k, which separate λᵢ from the
-# remaining eigenvalues of the linear system. For pairs in the interior of the spectrum, there are guards on both sides:
-# lowering the origin adds at most half of the guards, and the other guards follow the k pairs.
+# on the M-orthogonal complement of the computed Φ, where K − λᵢM is positive definite. Reverse mode uses the symmetry
+# of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ has a distance from the eigenvalues on
+# the complement. In the interior of a spectrum, the complement has eigenvalues on both sides, and so there are guards
+# on both sides: at most half of them lie below the origin, and the others follow the k pairs.
 #
-# In a multiple eigenspace the coefficients with j ≠ i and λᵢ = λⱼ depend on the choice of a basis, the gauge. The rule
-# uses −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. It also uses this value if the gap is less than
-# √ε (λ − λ₀), where λ₀ is the lowest computed eigenvalue, because the quotient would have no correct digits. Therefore
-# dφᵢ is the derivative of an eigenvector only if λᵢ is simple. For a multiple eigenvalue, only the sum of the dλᵢ is
-# correct. Quantities that do not depend on the basis, such as spectral functions, must not use the gauge; `of_simple`
-# hides it from users. They use the frame, whose derivative contains only the terms with j > k. These terms do not
-# depend on the basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py).
+# Within a multiple eigenvalue, the coefficient of φⱼ in dφᵢ (j ≠ i, λᵢ = λⱼ) is a gauge, because every basis of the
+# eigenspace is valid. The rule sets it to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. If a gap is below
+# √ε (λ − λ₀), where λ₀ is the lowest computed eigenvalue, the rule does the same, because division by such a gap would
+# lose all digits. So dφᵢ is a derivative only if λᵢ is simple; of the dλᵢ of equal eigenvalues, only the sum has a
+# meaning. Quantities that are independent of the basis, such as spectral functions, must not use this gauge, and
+# `of_simple` hides the gauge from users. Such quantities use the frame instead: its derivative contains only the sum
+# over j > k, which is the same for every basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py).
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver,
@@ -106,9 +106,9 @@ def _solved_jvp(
     return (eigenvalues, functions, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
-# The transpose stores all its arguments, including arrays that it does not need.
+# Reverse mode stores all arrays of the arguments, even unused ones.
 def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
-    """Return a pencil without the metric, which only error estimates need."""
+    """Return the pencil without its metric, which only estimates need."""
     if not isinstance(pencil, Pencil) or pencil.metric is None:
         return pencil
     return eqx.tree_at(lambda p: p.metric, pencil, None)
@@ -117,7 +117,7 @@ def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
 def _computed(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
 ) -> RawPairs:
-    """Return k + spare computed eigenpairs, and the bound of the solver."""
+    """Return k + spare computed pairs, and the bound of the solver."""
     if interior:
         return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
     values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
@@ -127,18 +127,18 @@ def _computed(
 
 @numpy_where_known(static_argnums=2)
 def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    """Return the first k pairs, and the next eigenvalue, or infinity."""
+    """Return the first k pairs, and the next eigenvalue, or infinity if there is none."""
     return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
 
 
-# Separate from `tangents_of`, so that many products with one Jacobian share the preparation.
+# A separate function, so that many products with one Jacobian share its result.
 def prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Array, " p"]) -> Any:
-    """Prepare the adjoint for the first k of p computed pairs; return None if no linear system must be solved."""
+    """Call the adjoint's `prepare` for the first k of p computed pairs; return None if no linear solve is needed."""
     return one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
 
 
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
-    """Return whether derivatives of the first k pairs have components outside the p computed eigenvectors."""
+    """Return whether derivatives of the first k of p pairs have components along other eigenvectors."""
     return p < pencil.size and pencil.n_fixed < k
 
 
@@ -149,7 +149,7 @@ def _shapes(*args: Any) -> tuple[Any, Any, Any]:
 
 
 def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the tangents of the pairs, or the cotangents of the change of the pencil, by NumPy."""
+    """Return the tangents or, given cotangents y, the cotangents of the change, by NumPy."""
     adjoint, telling, prepared, pencil, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
     if vectors.size > _ON_HOST or x is None:
@@ -176,7 +176,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
         into, frame = force @ functions.T, onto(force)
         within = np.where(apart[:, :k], inverse[:, :k] * into, -(moved @ functions.T) / 2)
         return np.diagonal(into), within @ functions + frame, frame
-    # The transpose of the steps above.
+    # The transpose of the computation above.
     of_values, of_vectors, of_frame = y
     within = of_vectors @ functions.T
     into = np.where(apart[:, :k], inverse[:, :k] * within, 0) + np.diag(of_values)
@@ -188,7 +188,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
 def change_of(
     change: SymmetricPencil, x: Float[np.ndarray, "b n_dof"], *p: Float[np.ndarray, "b n_dof"]
 ) -> SymmetricPencil:
-    """Return a pencil of zeros, except Σ pxᵀ at the entries of stiffness and mass, for the given p of each."""
+    """Return the cotangent of the change: Σ pxᵀ for stiffness and mass, each with its own p, and zeros elsewhere."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     columns = np.ascontiguousarray(x.T)
     matrices = tuple(
@@ -199,14 +199,14 @@ def change_of(
 
 
 def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
-    """Return a mask (k, p) of distinct eigenvalues λᵢ, i < k, and λⱼ, and 1/(λᵢ − λⱼ) there, 0 elsewhere."""
+    """Return the mask (k, p) of distinct pairs λᵢ, λⱼ (i ≤ k), and 1/(λᵢ − λⱼ), or 0 if they count as equal."""
     gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
     least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
     apart = xp.abs(gap) > xp.maximum(least, rounding)
     return apart, xp.where(apart, 1 / xp.where(apart, gap, 1), 0)
 
 
-# Without the checkpoint, the transpose would store copies of the eigenvectors.
+# Without the checkpoint, reverse mode would store copies of the eigenvectors.
 @jit_quickly(static_argnames=("adjoint", "telling"), linear=("change",), shapes=_shapes, numpy_rule=_numpy_rule)
 @partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(
@@ -221,15 +221,15 @@ def tangents_of(
 ) -> Lowest:
     """Return dλ, dφ and the derivative of the frame for the first k of p computed pairs.
 
-    The pairs have the order for which the adjoint is prepared. The first k eigenvectors are passed twice, in `vectors`
-    and as `functions`, to avoid a copy.
+    ``prepared`` is the result of `prepare` for the pairs in this order. ``functions`` are the first k vectors again,
+    which saves a copy.
     """
     k = len(functions)
     eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     apart, inverse = _gaps(jnp, values, k, indistinct(pencil, values.dtype))
-    # The guards have a separate product, because reverse mode of the frame needs only that one.
+    # The guards have a separate product, because reverse mode of the frame needs only this one.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
     frame = _onto(guards, inverse[:, k:], force)
@@ -239,7 +239,7 @@ def tangents_of(
     return jnp.diagonal(into), d_vectors, frame
 
 
-# The map is symmetric, so it equals its transpose; the transpose that JAX derives is several times slower.
+# This symmetric map is its own transpose. The transpose derived by JAX would be several times slower.
 def _onto(
     guards: Float[Array, "g n_dof"], factors: Float[Array, "k g"], force: Float[Array, "k n_dof"]
 ) -> Float[Array, "k n_dof"]:
@@ -269,15 +269,15 @@ def _outside(
     def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return _told(telling, one_by_one(_solve, (adjoint,), prepared, pencil, values, vectors, b))
 
-    # The force on null vectors that every perturbation annihilates is zero. In reverse mode, the rows of these null
-    # vectors are cotangents, and their solutions are set to zero.
+    # The force is zero on null vectors that every perturbation annihilates. In reverse mode, these rows are cotangents;
+    # then their solutions are set to zero.
     def moved(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
         return jnp.where(np.arange(len(x))[:, None] < n_fixed, 0, x)
 
     return moved(jax.lax.custom_linear_solve(matvec, moved(rhs), solve, symmetric=True))
 
 
-# The arguments of `one_by_one` are module functions and not methods, so that each call passes the same object.
+# `one_by_one` needs the same function object in every call; so these are module functions, not methods.
 def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
     return solver.lowest(pencil, k, report)
 
@@ -291,7 +291,7 @@ def _solve(adjoint: Adjoint, *args: Any) -> Float[Array, "k n_dof"]:
 
 
 def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-    """Return x; if a row of x contains NaN, warn or raise an error as `telling` states."""
+    """Return x; if rows of x are NaN, warn or raise."""
     failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
     if telling == "error":
         return eqx.error_if(x, failed > 0, unsolved("some", len(x)))
@@ -309,9 +309,9 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
 def _exact_null_modes(
     pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    """Replace the solver's approximate null vectors by the null vectors of the stiffness, with the eigenvalue 0.
+    """Replace the solver's approximations of the null vectors by the known null vectors.
 
-    The other eigenvectors are projected onto the M-orthogonal complement of the null vectors, which removes rounding.
+    Their eigenvalue becomes exactly 0 instead of about ±1e-13. Other vectors become orthogonal to the null vectors.
     """
     if not known_and_few((pencil.mass, values, vectors)):
         return _exact_by_jax(pencil, values, vectors)
@@ -356,9 +356,9 @@ def _with_null_modes(
 def frame_of_chosen(
     vectors: Float[Array, "k n_dof"], mass: Operator, chosen: Bool[Array, " k"]
 ) -> Float[Array, "k n_dof"]:
-    """Return the vectors as a frame: the derivative of the result has no components in the chosen vectors.
+    """Return the vectors, whose derivative excludes rotations among the chosen ones (a frame of the chosen vectors).
 
-    The derivative of the frame of `solved`, in contrast, has no components in any of the k vectors.
+    A frame of all vectors would also exclude rotations towards vectors that are not chosen.
     """
     return vectors
 
@@ -371,9 +371,9 @@ def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]
     return vectors, change - matmul(inside, vectors)
 
 
-# The transpose that JAX derives multiplies by the transposed vectors, which takes twice as long.
+# The transpose derived by JAX would multiply by the transposed vectors, which takes twice as long.
 def products_with_constants(images: Float[Array, "b n_dof"], vectors: Float[Array, "k n_dof"]) -> Float[Array, "b k"]:
-    """Return the inner products, as a linear map of the images; derivatives treat the vectors as constants."""
+    """Return the inner products, for derivatives linear in the images; the vectors are constants."""
     return with_transpose(partial(inner_products, vectors), lambda mix: matmul(mix, vectors), images)
 
 
@@ -386,12 +386,13 @@ def of_simple(
     part: Int[Array, " k"] | None,
     pencil: AnyPencil,
 ) -> Float[Array, "k n_dof"]:
-    """Return the vectors; nonzero derivatives become NaN unless the eigenvalue is simple and kept."""
+    """Return the vectors. Their nonzero derivatives become NaN unless the eigenvalue is simple and kept."""
     return vectors
 
 
-# In the derivative of Σᵢ f(λᵢ) φᵢ(x)², a multiple eigenvalue λ has the terms Gᵢⱼ f'(λ) φᵢ φⱼ. The derivatives of f(λᵢ)
-# contribute only the terms with i = j, and rotations in dφᵢ cancel for equal f(λᵢ). No finite dφᵢ gives the right sum.
+# The derivative of Σᵢ f(λᵢ) φᵢ(x)² contains Gᵢⱼ f'(λ) φᵢ φⱼ for equal eigenvalues λᵢ = λⱼ = λ. The derivatives of the
+# f(λᵢ) give only the diagonal terms. Rotations among these φᵢ cancel, because the f(λᵢ) are equal. So no finite dφᵢ
+# makes the sum correct.
 @of_simple.defjvp
 def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, values, following, kept, part, pencil = primals
@@ -409,11 +410,11 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def _is_multiple(
     xp: Any, values: Any, following: Any, kept: Any, part: Any | None, rounding: list[Any], fixed: bool
 ) -> Any:
-    """Return a mask of pairs that are not kept, or whose eigenvalue is multiple in the kept or following pairs."""
+    """Return the mask (k) of pairs that are not kept, cut by k, or mixed with an equal eigenvalue by perturbations."""
     size = xp.maximum(xp.abs(values), values - values[:1])
     least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))
     near = xp.abs(values[:, None] - values[None]) <= least[:, None]
     if part is not None:
         near &= part[:, None] == part[None]
-    mixed = (xp.sum(near, axis=1) > 1) & ~((values == 0) & fixed)  # no perturbation changes fixed pairs
+    mixed = (xp.sum(near, axis=1) > 1) & ~((values == 0) & fixed)  # perturbations do not change fixed null vectors
     return mixed | (following - values <= least) | ~kept

@@ -21,9 +21,9 @@ from hks_jax.optional import optional
 from hks_jax.storage import existing, reading
 
 _LENGTH = 0.05
-"""The tolerance for the length of a direction; a smaller deviation from 1 is due to rounding."""
+"""The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
-"""The least ratio of a residual's variance to the variance of the noise for which the residual is used."""
+"""The least ratio 1 − h of a residual's variance to the variance of the noise for which the residual is used."""
 
 
 class ExampleBrain(NamedTuple):
@@ -65,31 +65,31 @@ def fit_dwi(
     """Fit diffusion tensors to diffusion-weighted images by weighted least squares on log signals (DIPY's TensorModel).
 
     Args:
-        path: NIfTI file (nx, ny, nz, n). Voxels with a NaN or infinite signal are excluded.
-        bval: text file of the n b-values, in s/mm² unless `unit` says otherwise.
-        bvec: text file of the n directions, 3 × n or n × 3, of length 1; directions at b = 0 are ignored.
-        mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors are fitted inside, and are zero outside.
-            None: DIPY's median_otsu computes the mask from the mean of the unweighted images, and a note reports it.
-        b_max: the largest b-value in s/mm² that is used; None uses all. The tensor model holds for b ≲ 1000–1500 s/mm².
-        bvec_frame: the axes of the directions. ``"fsl"``: the voxel axes, with the first axis reversed if the
-            determinant of the affine is positive, as in files of dcm2niix and FSL. ``"voxel"``: the voxel axes.
-            ``"world"``: the scanner axes, as in files of MRtrix.
-        unit: the unit of diffusivity, the reciprocal of the unit of the b-values: ``"m2/s"`` for b-values in s/m²,
-            ``"um2/ms"`` for ms/µm². None: mm²/s.
-        noise: the source of the covariance of the tensors. A number is the standard deviation of the noise of the
-            images, in their unit. ``"residuals"`` uses the root mean square of the residuals in each voxel, with n − 7
-            degrees of freedom for n images, and the correlation of residuals between voxels; it stores 24 bytes per
-            voxel and image. None: no covariance.
+        path: a NIfTI image (nx, ny, nz, n). Voxels with a NaN or infinite signal are left out.
+        bval: a text file of the n b-values, in s/mm² unless `unit` is given.
+        bvec: a text file of the n directions of length 1, 3 × n or n × 3. Directions at b = 0 are ignored.
+        mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If None, DIPY's
+            median_otsu finds the brain in the mean of the unweighted images, and a note reports this.
+        b_max: the largest b-value used, in s/mm²; None uses all images. A tensor is a model for b ≲ 1000–1500 s/mm².
+        bvec_frame: the axes of the directions. ``"fsl"`` is the convention of dcm2niix and FSL: the voxel axes, the
+            first reversed if the affine's determinant is positive. ``"voxel"`` means the voxel axes. ``"world"`` means
+            the scanner's axes, as in MRtrix.
+        unit: a unit of diffusivity whose reciprocal is the unit of the b-values: ``"m2/s"`` for b-values in s/m²,
+            ``"um2/ms"`` for ms/µm². None means mm²/s.
+        noise: the standard deviation of the images' noise, in the images' unit, from which the tensors' covariance is
+            computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit, which have
+            n − 7 degrees of freedom, and also keeps the noise of an image that voxels share (24 bytes for each voxel
+            and image). If None, no covariance is computed.
 
     Returns:
-        The tensors along the voxel axes, in mm²/s, and with `noise` their first-order noise (`TensorVolume.noise`).
-        DIPY replaces eigenvalues that are not positive by about 1e-9 mm²/s. A note reports the number of such voxels;
-        most are at the rim, and can be removed by eroding the mask.
+        Tensors along the voxel axes, in mm²/s, and with `noise` their noise to first order (`TensorVolume.noise`). DIPY
+        raises eigenvalues that are not positive to about 1e-9 mm²/s, and a note reports the number of such voxels. Most
+        of them are at the boundary of the mask, so eroding the mask removes them.
 
     Raises:
         ImportError: DIPY or nibabel is missing.
-        FileNotFoundError: A file does not exist.
-        ValueError: The numbers of images, b-values and directions differ; the b-values have another unit; a direction
+        FileNotFoundError: a file does not exist.
+        ValueError: the numbers of images, b-values and directions differ; the b-values have another unit; a direction
             of a weighted image does not have length 1; the mask has another shape; there are too few images for the
             fit, or for an estimate of the noise; all residuals of a voxel are zero; there is no signal.
     """
@@ -159,9 +159,9 @@ def _covariance(
     frame: str,
     affine: Float[np.ndarray, "4 4"],
 ) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
-    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, and the modes of the residuals.
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, which is zero outside the mask.
 
-    Both are zero outside the mask. The modes are None unless `noise` is ``"residuals"``.
+    From residuals, also return the contribution of each image to the noise of these components, or else None.
     """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
@@ -194,10 +194,10 @@ def _covariance(
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
         return covariance, None
-    # If one image alone determines an unknown, as a single unweighted image does, its residual is replaced by ±σ.
+    # The fit follows some images exactly, such as a single unweighted one; a random ±σ replaces their residual 0.
     unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
     modes = np.zeros((*inside.shape, len(design), 6), np.float32)
-    for i, x in enumerate(design):  # one image at a time to save memory
+    for i, x in enumerate(design):  # a loop saves memory
         change = inverse @ x * np.sqrt(weights[:, i, None])
         rest = 1 - np.sqrt(weights[:, i]) * (change @ x)
         size = np.where(rest > _SEEN, left[:, i] / np.sqrt(np.maximum(rest, _SEEN)), unseen[:, i])
@@ -255,14 +255,14 @@ def _inside(
         which = f"the used images {', '.join(whole)} (from 0) have" if whole else "in each voxel, some image has"
         raise ValueError(f"{name}: {which} no finite signal inside the mask; expected numbers. Leave such images out")
     if lost := int((inside & ~usable).sum()):
-        notes.append(f"{lost} of {int(inside.sum())} voxels inside are excluded, because a signal is NaN or infinite")
+        notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: a signal there is NaN or infinite")
     return usable, notes
 
 
 def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:
     file = existing(path)
     with reading(file, "a table of numbers"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # NumPy warns about an empty table
+        warnings.simplefilter("ignore", UserWarning)  # NumPy warns if a table is empty
         numbers = np.loadtxt(file, dtype=np.float64)
         if not numbers.size or not (may_be_nan or np.isfinite(numbers).all()):
             raise ValueError("got no numbers, or NaN or infinite ones; expected finite numbers")

@@ -1,4 +1,4 @@
-"""The derivative of spectral functions: divided differences, and its evaluation by NumPy."""
+"""The derivative of a spectral function: divided differences that mix eigenvectors, and a NumPy implementation."""
 
 from typing import Any
 
@@ -14,11 +14,11 @@ from hks_jax.signatures.contractions import Contraction, Diagonal
 from hks_jax.signatures.filters import Filter
 
 _ON_HOST = 1 << 23
-"""The largest number of entries of all eigenvectors, or of the matrices of all filters, for which NumPy is used."""
+"""The number of entries of the eigenvectors, and of all filters' matrices, up to which NumPy differentiates."""
 
 
 def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
-    """Return f(λᵢ) for the kept pairs, and zero for the other pairs."""
+    """Return f(λᵢ), or zero if the pair is not kept."""
     return jnp.where(kept, one(values), 0)
 
 
@@ -26,7 +26,7 @@ def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"])
 def mixing(
     filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
-    """Return the weights f(λᵢ), the matrices [f] and [λf], and the mask of pairs that matter, for each filter f."""
+    """Return f(λᵢ), the divided differences [f] and [λf], and which pairs matter, for each filter."""
 
     def of_one(one: Filter) -> tuple[Array, Array, Array, Array]:
         weights, (of_f, of_lambda_f) = weights_of(one, values, kept), _divided_differences(one, values, kept, fixed)
@@ -38,7 +38,7 @@ def mixing(
 def _divided_differences(
     one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
-    """Return the divided differences [f] and [λf], where f is zero for pairs that are not kept."""
+    """Return the matrices [f] and [λf], where f is zero on pairs that are not kept."""
     rows, columns = values[:, None], values[None]
     low, high = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
     f = weights_of(one, values, kept)
@@ -46,18 +46,18 @@ def _divided_differences(
     quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
     both = kept[:, None] & kept[None]
     of_f = jnp.where(both, one.divided_difference(low, high), quotient)
-    # G is zero between null vectors that every perturbation annihilates, and f may have no derivative at 0.
+    # G vanishes between null vectors that every perturbation annihilates, and f may have no derivative at 0.
     of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
-    # The value of f at the larger eigenvalue is used, where f is small. This avoids cancellation.
+    # Using f at the larger eigenvalue, where f is small, avoids cancellation.
     return of_f, jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
 
 
 def _matters(f: Float[Array, " k"], slope: Float[Array, " k"], values: Float[Array, " k"]) -> Bool[Array, " k"]:
-    """Return where |f| or |λf'| exceeds machine epsilon times their largest value at a nonzero eigenvalue."""
+    """Return where f or λf' is not negligible relative to its largest size at positive eigenvalues."""
     size = jnp.maximum(jnp.abs(f), jnp.abs(values * slope))
     largest = jnp.max(jnp.where(values > 0, size, 0))
-    # Between two negligible pairs, [f] is at most f' at one of them, or, if f is not monotone, ε over the relative gap.
-    return ~(size <= jnp.finfo(f.dtype).eps * largest)  # NaN matters
+    # Between two negligible pairs, [f] is at most f' at one of them or, if f is not monotone, ε over the relative gap.
+    return ~(size <= jnp.finfo(f.dtype).eps * largest)  # NaN counts as not negligible
 
 
 def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
@@ -100,7 +100,7 @@ def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
             result[one] += np.sum(vectors[:n] * (matrix @ vectors), axis=0)
         return result
-    # The transpose of the steps above.
+    # The transpose of the steps above follows.
     stiffness, mass = np.zeros((k, k), vectors.dtype), np.zeros((k, k), vectors.dtype)
     for one, (n, count) in enumerate(zip(last, times, strict=True)):
         outer = (vectors[:n] * y[0][one]) @ vectors.T * count

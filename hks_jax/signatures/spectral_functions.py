@@ -1,4 +1,4 @@
-"""Spectral functions Φ f(Λ) Φᵀ, from which all signatures are computed, and their derivative rule."""
+"""Spectral functions Φ f(Λ) Φᵀ, which all signatures use, and their derivative rule."""
 
 import operator
 from functools import partial, reduce
@@ -25,20 +25,20 @@ from hks_jax.signatures.mixing import by_numpy, mixing, shapes, weights_of
 from hks_jax.traced import is_traced
 
 _ROWS = 128
-"""The number of eigenvectors whose products with all others are computed together, which limits the memory."""
+"""The number of eigenvectors whose products with all others are computed at once, which limits the memory."""
 _SIZES = 8
-"""The number of different array sizes for the pairs of a part of a doubled domain; each size is compiled."""
+"""The number of allowed sizes for the pairs of one part of a doubled domain; each size is compiled separately."""
 _FILTERS = 8
-"""The number of filters that are processed together, each with its matrices (k, k)."""
+"""The number of filters whose matrices (k, k) are computed and applied to the eigenvectors at once."""
 
 
 def spectral_diagonal(
     pairs: Eigenpairs, filters: Filter, scale: Float[Array, " m"] | None = None
 ) -> Float[Array, "m *shape"]:
-    """Return Σᵢ f(λᵢ) φᵢ(x)² times the scale of f for each of m filters; NaN outside the mask."""
+    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters, multiplied by its scale; NaN outside the mask."""
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     diagonal = _kernel(Diagonal(), filters, everywhere)
-    # NaN is inserted last. Otherwise 0·NaN would appear in the derivative with respect to the scale.
+    # NaN is inserted last because the product 0·NaN would otherwise enter the derivatives of the scale.
     nodal = everywhere.space.extend(diagonal if scale is None else scale[:, None] * diagonal)
     return nan_outside(nodal, pairs.space.domain)
 
@@ -53,7 +53,7 @@ def spectral_columns(pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray
 def spectral_squared_distances(
     pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]
 ) -> Float[Array, "m s *shape"]:
-    """Return Σᵢ f(λᵢ) (φᵢ(x_s) − φᵢ(x))² for each filter and each source node; undefined outside the mask."""
+    """Return Σᵢ f(λᵢ) (φᵢ(x_s) − φᵢ(x))² for each filter and each source node; meaningless outside the mask."""
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     squared = _kernel(SquaredDistances(everywhere.space, StaticArray(sources)), filters, everywhere)
     return squared.reshape(*squared.shape[:-1], *pairs.space.node_shape)
@@ -64,9 +64,9 @@ def spectral_flow(
 ) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x) ∫φᵢu for each of m filters and s functions u; NaN outside the mask.
 
-    Under "mirror" and "mean", the functions are extended evenly to the doubled domain, as the metric is.
+    Under "mirror" and "mean" the functions are extended evenly, like the metric.
     """
-    # Each doubling doubles the integral of an even function; the inner product with an odd function is zero.
+    # Inner products over the doubled domain are twice those over the domain for each doubling, or 0 for odd functions.
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
     functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
@@ -75,7 +75,7 @@ def spectral_flow(
 
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
-    """Return Σᵢ f(λᵢ) for each of m filters. The derivative Σᵢ f'(λᵢ) dλᵢ needs no dφᵢ."""
+    """Return Σᵢ f(λᵢ) for each of m filters. The derivative f'(λᵢ) dλᵢ needs no eigenvector."""
     return sum_of(filters, pairs.eigenvalues, pairs.kept)
 
 
@@ -86,8 +86,8 @@ def sum_of(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"])
 
 @jax.custom_jvp
 def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
-    """Contract the kernels Φ f(Λ) Φᵀ of m filters, for example to their diagonals."""
-    # A second derivative would differentiate this body instead of the rule; this call raises an error.
+    """Return the contraction of the kernels Φ f(Λ) Φᵀ of m filters."""
+    # JAX differentiates this body, not the rule, in the outer of two derivatives, which is not supported.
     pairs = first_order_only(pairs)
     return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
 
@@ -97,22 +97,22 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
     return contraction.weighted(weights, vectors)
 
 
-# The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M, even if the eigenvectors are not. With all n eigenpairs, its
-# differential is Φ F Φᵀ (Daleckii and Krein 1965). Here G = Φᵀ dK Φ, H = Φᵀ dM Φ, and [f] are divided differences:
+# The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M even where the eigenvectors are not. For all n eigenpairs its
+# differential is Φ F Φᵀ. With G = Φᵀ dK Φ, H = Φᵀ dM Φ and divided differences of f (Daleckii and Krein 1965),
 #
 #     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
 #
-# The differential does not depend on the basis of a multiple eigenspace, and is not singular there. Truncation to the
-# kept pairs sets f to zero for all other pairs. The entries of F between kept pairs do not change. Between a kept pair
-# i and the other pairs j, the entries are f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ), and their contribution is
+# This does not depend on the basis chosen within a multiple eigenvalue, and is not singular there. Truncation sets f to
+# zero on all pairs that are not kept. Then F is unchanged among the kept pairs, and between a kept i and all other j
+# the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
 # where xᵢ is the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept have
-# f = 0. Under "mirror" and "mean", the result is a sum over the parts, because pairs of different parts do not mix.
+# f = 0. Under "mirror" and "mean" the differential is the sum over the parts, whose pairs do not mix.
 #
-# Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ at the nodes, where R is `Pencil.read`. Each φ and x is then multiplied by R,
-# and the sum has the additional terms f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ).
+# Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ at the nodes (`Pencil.read`). Then R multiplies each φ and x from the left, and
+# f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ) is added to the sum.
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
@@ -131,7 +131,7 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
             reader = None if part.row_sums is None else part
             matrices = change.parts[number], reader
             terms.append(_tangent(contraction, filters, known, d_frame, _rows_of(own, number), *static, *matrices))
-    elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # if the arrays themselves vary, JAX's rules apply
+    elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves change, so JAX's rules apply
         pairs = first_order_only(pairs)
         moved = jax.jvp(
             lambda values, vectors: _weighted(
@@ -145,9 +145,9 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
-    """Return the indices of the pairs of one part of a doubled domain, and a mask of the indices that belong to it.
+    """Return rows that include the pairs of one part of a doubled domain, and which rows are such pairs.
 
-    The number of indices is rounded up to one of `_SIZES` sizes. The result is None for domains that are not doubled.
+    The number of rows is rounded up to one of few sizes. The result is None if there are no parts.
     """
     if pairs.part is None:
         return None
@@ -162,7 +162,7 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
     return rows, own[rows]
 
 
-# The transpose recomputes its intermediate results, which have twice the size of the eigenvectors, to save memory.
+# The transpose recomputes intermediate results, because storing them would take twice the memory of the eigenvectors.
 @jit_quickly(static_argnames=("fixed", "copies"), linear=("d_frame", "change"), shapes=shapes, numpy_rule=by_numpy)
 @partial(jax.checkpoint, static_argnums=(5, 6))
 def _tangent(
@@ -177,17 +177,17 @@ def _tangent(
     change: Pencil,
     reader: Pencil | None,
 ) -> Array:
-    """Return the tangent of the kernel of one part, given the change of its pencil and the tangent of its frame."""
+    """Return the derivative by the change of one part, given the pairs and the derivative of their frame."""
     values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
-        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with this part
+        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these
     if not len(vectors):
         return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
-    d_frame = jnp.where(kept[:, None], d_frame, 0)  # tangents of other pairs may be NaN
+    d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where pairs are not kept
     size = even_size(len(vectors), _ROWS)
     starts, place = row_blocks(len(vectors), size)
 
-    @jax.checkpoint  # otherwise reverse mode stores a copy of the vectors
+    @jax.checkpoint  # reverse mode would otherwise store a copy of the vectors
     def products(start: Array) -> list[Float[Array, "size k"]]:
         own = space.transfer(jax.lax.dynamic_slice_in_dim(vectors, start, size), change.space)
         images = (change.space.transfer(matrix.apply(own), space) for matrix in (change.stiffness, change.mass))
@@ -218,7 +218,7 @@ def _all_weights(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, 
     plain = filters
     while isinstance(plain, Derivative):
         plain = plain.filter
-    # A custom filter may be a new function in every call, so compilation would be repeated.
+    # A user's function may be a new object at every call, which would be compiled each time.
     return (_each if isinstance(plain, Custom) else _each_at_once)(filters, values, kept)
 
 
@@ -248,7 +248,7 @@ def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
     """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ().
 
     Raises:
-        ValueError: The sources have a wrong shape or type, are out of range, or are outside the mask.
+        ValueError: if a source has a wrong shape or type, is out of range, or lies outside the mask.
     """
     shape = pairs.space.node_shape
     array = np.asarray(sources)
@@ -264,7 +264,7 @@ def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
     outside = ~pairs.space.domain.ravel()[flat]
     if outside.any():
         raise ValueError(
-            f"sources: {int(outside.sum())} of {flat.size} are outside the mask (the first is "
-            f"{tuple(indices[outside][0].tolist())}); expected nodes inside. Choose other sources"
+            f"sources: got {int(outside.sum())} of {flat.size} nodes outside the mask (the first is "
+            f"{tuple(indices[outside][0].tolist())}); expected nodes of the domain"
         )
     return flat

@@ -33,7 +33,7 @@ _BALANCED = len(_SIGNS)
 _LEAST = 8
 """The least number of noisy maps for an estimate of the bias and of the second-order variance."""
 _SCALE = 0.5
-"""The factor s of the added noise: less than 1, because the measured tensors already contain noise."""
+"""The factor s of the added noise. It is less than 1, because the measured tensors already contain noise."""
 _FLOOR = 0.01
 """The least eigenvalue of corrected indefinite tensors, relative to the mean eigenvalue without added noise."""
 _LOUD = 3.0
@@ -61,9 +61,9 @@ class _Moments(eqx.Module):
 
 # Let η₁, η₂, η₃ be independent noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 are the corners of a
 # tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
-# minus the value is of second order, and its expectation is s² times the bias. To second order, y₁ + y₂ − y₃ − y₄ =
-# 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples of the noise; two antithetic pairs give
-# two. The second-order variance is that of a quadratic form of one δ; the mean of four maps has a third of it.
+# minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
+# y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, and two antithetic
+# pairs give two. The second-order variance is that of a quadratic form of one δ; the mean of four has a third of it.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
@@ -102,8 +102,8 @@ def uncertainty(
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
     Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. The differences of
-    the maps are linear in the noise up to second order; their mean minus the value is a quarter of the bias. The noise
-    is halved, because the measured tensors already contain noise; full noise would exaggerate second-order effects.
+    the maps are linear in δ up to second order; the mean of the maps minus the value estimates a quarter of the bias.
+    The noise is halved, because the measured tensors already contain noise; δ would exaggerate second-order effects.
     Four maps give three samples. The relative error of a standard deviation is 29 % with 8 draws, and 8 % with 100.
 
     Args:

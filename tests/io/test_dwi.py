@@ -57,7 +57,7 @@ def test_voxels_without_a_finite_signal_are_left_out(scan):
     np.testing.assert_array_equal(fit.mask, head() & ~lost)
     np.testing.assert_allclose(fit.tensors[fit.mask], np.broadcast_to(D * FSL, (fit.mask.sum(), 3, 3)), atol=1e-8)
     assert not fit.tensors[~fit.mask].any()
-    assert f"3 of {head().sum()} voxels inside are excluded, because a signal is NaN or infinite" in fit.notes
+    assert f"3 of {head().sum()} voxels inside are left out: a signal there is NaN or infinite" in fit.notes
 
 
 def test_a_background_of_nan_is_outside(scan):
