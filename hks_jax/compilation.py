@@ -1,4 +1,4 @@
-"""Faster compilation for CPUs, and computations by NumPy without compilation."""
+"""Faster compilation for CPUs, and computation by NumPy without compilation."""
 
 import inspect
 import os
@@ -19,36 +19,35 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
-"""XLA's older code generator for fused loops compiles twice as fast. The measured speed of its code is the same."""
+"""XLA's older code generator for fused loops compiles in half the time; in measurements, its code was as fast."""
 
+NumPyRule = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
+"""A function of (primals, x, y) that evaluates a function or its derivative by NumPy, or returns None to compile.
 
-OnHost = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
-"""A function that computes by NumPy, given all arguments, changes x of some, and cotangents y of the result's leaves.
-
-If x and y are None, it returns the function's result. If only x is given, it returns the change of the result. If y is
-given, it returns the cotangents of x, where x has only shapes. If the function is linear in x, the arguments do not
-include x. None means that the function must be compiled.
+The primals are all arguments, x are tangents of some arguments, and y are cotangents of the leaves of the result. If x
+and y are None, it returns the result. If y is None, it returns the tangent of the result. Otherwise, it returns the
+cotangents of x, and x contains only shapes. For a linear function, None replaces the linear arguments in the primals.
 """
 
 
 def jit_quickly(
     jit: Callable = jax.jit,
     linear: tuple[str, ...] = (),
-    like: Callable[..., Any] = lambda *args: None,
-    on_host: OnHost | None = None,
+    shapes: Callable[..., Any] = lambda *args: None,
+    numpy_rule: NumPyRule | None = None,
     **settings: Any,
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Return a decorator like `jax.jit`, or `equinox.filter_jit`, for functions that take long to compile.
+    """Return a decorator like `jax.jit`, or `equinox.filter_jit`, that compiles faster on CPUs.
 
-    XLA compiles a computation as a whole, so these options have no effect within another computation. If the
-    environment variable XLA_FLAGS sets one of the options, none is changed.
+    The options apply only to calls outside `jax.jit`, because XLA compiles an enclosing function as a whole. If the
+    environment variable XLA_FLAGS sets one of the options, the decorator sets none.
 
     Args:
-        jit: the function that compiles.
-        linear: the names of arguments in which the function is jointly linear.
-        like: a function that returns the shapes of the result, given all arguments of a linear function.
-        on_host: a function that computes instead if values are concrete and few, on a CPU.
-        settings: the settings of ``jit``.
+        jit: the decorator that compiles.
+        linear: the names of the arguments in which the function is jointly linear.
+        shapes: maps all arguments to a pytree with the shapes of the result, for linear functions.
+        numpy_rule: evaluates the function and its derivatives by NumPy for concrete arguments on a CPU.
+        settings: the keyword arguments of ``jit``.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
@@ -67,7 +66,7 @@ def jit_quickly(
                 return usual(*args, **kwargs)
             bound = signature.bind(*args, **kwargs)
             if not linear and not is_traced((args, kwargs)):
-                found = _on_host(on_host, bound.args, None, None)
+                found = _apply(numpy_rule, bound.args, None, None)
                 return quick(*args, **kwargs) if found is None else found
             given = {name: None if name in static else x for name, x in bound.arguments.items()}
             moved = [jax.tree.map(partial(is_moved, name), x) for name, x in given.items()]
@@ -76,12 +75,12 @@ def jit_quickly(
             if whole or is_traced(known) or not all(map(_is_inexact, x)):
                 return usual(*args, **kwargs)
             fixed = tuple(bound.arguments[name] if name in static else None for name in given)
-            program = _Program(usual, fixed, jax.tree.structure(parts), on_host)
+            program = _Program(usual, fixed, jax.tree.structure(parts), numpy_rule)
             if not linear:
                 return _differentiable(program, known, x)
-            results, structure = jax.tree.flatten(like(*bound.args))
-            of = _Map(program, False, _shapes(x), _shapes(results))
-            return jax.tree.unflatten(structure, _linear.bind(*known, *x, of=of))
+            results, structure = jax.tree.flatten(shapes(*bound.args))
+            linear_map = _LinearMap(program, False, _shapes(x), _shapes(results))
+            return jax.tree.unflatten(structure, _linear.bind(*known, *x, linear_map=linear_map))
 
         return call
 
@@ -89,14 +88,14 @@ def jit_quickly(
 
 
 _FEW = 1 << 19
-"""The number of values up to which NumPy is faster than compiling a program, even for many calls."""
+"""The largest number of array entries for which NumPy is faster than compilation, even for many calls."""
 
 
 def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Return a decorator for functions whose first argument is the array module, NumPy's or JAX's.
+    """Return a decorator for functions whose first argument is the array module, `numpy` or `jax.numpy`.
 
-    NumPy computes with few concrete values on a CPU, so nothing is compiled. Otherwise `jax.jit` with the settings
-    compiles the function. The results are JAX arrays in both cases.
+    If the arguments are concrete, small and on a CPU, NumPy evaluates the function without compilation. Otherwise, the
+    function is compiled by `jax.jit` with the settings. The results are JAX arrays in both cases.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -112,23 +111,23 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
 
 def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
-    """Apply a function to NumPy arrays instead of JAX arrays; return its result as JAX arrays."""
+    """Evaluate a function with NumPy arrays in place of JAX arrays; return its result as JAX arrays."""
     known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
     with np.errstate(all="ignore"):
-        # `jnp.asarray` would return NumPy arrays while JAX differentiates.
+        # `device_put`, because `jnp.asarray` returns NumPy arrays during differentiation.
         return jax.device_put(jax.tree.map(np.asarray, function(*known)))
 
 
 def known_and_few(args: Any) -> bool:
-    """Return whether values are `known_here` and few, so that NumPy computes with them.
+    """Return whether values are `known_here` and have at most `_FEW` entries, so that NumPy computes.
 
-    The answer depends only on shapes and devices, so that repeated computations have the same rounding errors.
+    The decision depends only on shapes and devices, so repeated computations have the same rounding.
     """
     return known_here(args) and sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= _FEW
 
 
 def known_here(args: Any) -> bool:
-    """Return whether values are concrete and on a single CPU of the only process."""
+    """Return whether all values are concrete, and each is on one CPU device of a single process."""
     if is_staged() or is_traced(args) or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return False
     return all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(args) if isinstance(leaf, jax.Array))
@@ -136,7 +135,7 @@ def known_here(args: Any) -> bool:
 
 @cache
 def _understood() -> bool:
-    """Return whether the default device is a CPU whose compiler accepts the options, none of which XLA_FLAGS sets."""
+    """Return whether the backend is a CPU whose compiler accepts the options, and XLA_FLAGS sets none of them."""
     if jax.default_backend() != "cpu" or any(option in os.environ.get("XLA_FLAGS", "") for option in _OPTIONS):
         return False
     try:
@@ -147,71 +146,71 @@ def _understood() -> bool:
 
 
 class _Program(NamedTuple):
-    """A function of a flat list of arrays with its static arguments. Equal programs share their compilation."""
+    """A function of a flat list of arrays, with its static arguments. Equal instances share one compilation."""
 
     function: Callable[..., Any]
     fixed: tuple[Any, ...]
     structure: jax.tree_util.PyTreeDef
-    host: OnHost | None
+    numpy_rule: NumPyRule | None
 
     def __call__(self, *leaves: Any) -> Any:
-        """Return the result of the function."""
+        """Evaluate the function."""
         return self.function(*self.args(*leaves))
 
     def args(self, *leaves: Any) -> list[Any]:
-        """Return the arguments."""
+        """Return the arguments of the function."""
         return [known if x is None else eqx.combine(known, x) for known, x in zip(*self.split(*leaves), strict=True)]
 
     def split(self, *leaves: Any) -> tuple[list[Any], list[Any]]:
-        """Return the concrete arguments and the others."""
+        """Return the constant arguments, and the arguments for differentiation; None replaces all others in each."""
         known, x = jax.tree.unflatten(self.structure, leaves)
         return [own if fixed is None else fixed for own, fixed in zip(known, self.fixed, strict=True)], x
 
-    def on_host(self, *leaves: Any) -> Any:
-        """Return the result of the function by NumPy, or None."""
-        return _on_host(self.host, self.args(*leaves), None, None)
+    def by_numpy(self, *leaves: Any) -> Any:
+        """Evaluate the function by NumPy, or return None."""
+        return _apply(self.numpy_rule, self.args(*leaves), None, None)
 
 
-class _Map(NamedTuple):
-    """A linear map or its transpose. Its arguments are concrete arrays, followed by those in which it is linear.
+class _LinearMap(NamedTuple):
+    """A linear map, or its transpose, as a function of constant arrays followed by the linear inputs.
 
     Attributes:
-        program: a program that is linear in its last arguments.
-        at: whether to take the program's derivative by these arguments, whose values and changes are then given.
-        x: the shapes of the arguments in which the map is linear.
-        y: the shapes of the results.
-        transposed: whether to transpose the map.
+        program: the function, which must be linear in its last arguments if `tangent` is false.
+        tangent: whether the map is the tangent map by the last arguments, whose values are then the last constants.
+        x: the shapes of the inputs of the map without transposition.
+        y: the shapes of the results of the map without transposition.
+        transposed: whether to apply the transpose.
     """
 
     program: _Program
-    at: bool
+    tangent: bool
     x: tuple[jax.ShapeDtypeStruct, ...]
     y: tuple[jax.ShapeDtypeStruct, ...]
     transposed: bool = False
 
     def split(self, leaves: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-        """Return the concrete arguments and the rest."""
+        """Return the constants, and the linear inputs."""
         n = len(leaves) - len(self.y if self.transposed else self.x)
         return list(leaves[:n]), list(leaves[n:])
 
     def __call__(self, *leaves: Any) -> list[Any]:
-        """Apply the map to arrays."""
+        """Apply the map."""
         known, rest = self.split(leaves)
 
         def forward(*x: Any) -> list[Any]:
-            if not self.at:
+            if not self.tangent:
                 return jax.tree.leaves(self.program(*known, *x))
             n = len(known) - len(x)
             return jax.tree.leaves(jax.jvp(lambda *x: self.program(*known[:n], *x), known[n:], x)[1])
 
         return list(jax.linear_transpose(forward, *self.x)(rest)) if self.transposed else forward(*rest)
 
-    def on_host(self, *leaves: Any) -> Any:
-        """Apply the map to arrays by NumPy, or return None."""
+    def by_numpy(self, *leaves: Any) -> Any:
+        """Apply the map by NumPy, or return None."""
         known, rest = self.split(leaves)
         x, y = (self.x, [np.asarray(each) for each in rest]) if self.transposed else (rest, None)
-        args, change = self.program.split(*known[: len(known) - self.at * len(x)], *x)
-        return _on_host(self.program.host, self.program.args(*known) if self.at else args, change, y)
+        args, change = self.program.split(*known[: len(known) - self.tangent * len(x)], *x)
+        return _apply(self.program.numpy_rule, self.program.args(*known) if self.tangent else args, change, y)
 
 
 def _is_inexact(leaf: Any) -> bool:
@@ -223,16 +222,16 @@ def _quick(function: Callable[..., Any], *leaves: Any) -> Any:
     return function(*leaves)
 
 
-def _on_host(host: OnHost | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
-    if host is None or not known_here((known, others)):
+def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
+    if rule is None or not known_here((known, others)):
         return None
     with np.errstate(all="ignore"):
-        return jax.device_put(host(list(known), *others))
+        return jax.device_put(rule(list(known), *others))
 
 
-def _computed(function: _Program | _Map, *leaves: Any) -> Any:
+def _computed(function: _Program | _LinearMap, *leaves: Any) -> Any:
     with jax.core.eval_context():
-        found = function.on_host(*leaves)
+        found = function.by_numpy(*leaves)
         return _quick(function, *leaves) if found is None else found
 
 
@@ -240,11 +239,11 @@ def _shapes(leaves: Sequence[Any]) -> tuple[jax.ShapeDtypeStruct, ...]:
     return tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
 
 
-# JAX takes no compiler options for the programs that it generates for derivatives, and generates several for one
-# derivative. Here a derivative outside of `jax.jit`, where values are concrete, is one program, and its transpose is
-# another. Everywhere else a derivative consists of JAX's operations, as without this module.
+# JAX accepts no compiler options for the programs that it generates for derivatives, and splits a derivative into
+# several programs. If the values are concrete, as outside `jax.jit`, the tangent map is one program here, and its
+# transpose is another. Otherwise, the derivative consists of JAX's own operations.
 def _differentiable(program: _Program, known: list[Any], x: list[Any]) -> Any:
-    """Return the result of a program so that it is differentiable by x."""
+    """Evaluate a program with a custom derivative rule with respect to x."""
 
     @jax.custom_jvp
     def call(*x: Any) -> Any:
@@ -256,20 +255,21 @@ def _differentiable(program: _Program, known: list[Any], x: list[Any]) -> Any:
         leaves, structure = jax.tree.flatten(result)
         if not (leaves and all(map(_is_inexact, leaves))):
             return jax.jvp(lambda *x: program(*known, *x), x, change)
-        of = _Map(program, True, _shapes(x), _shapes(leaves))
-        return result, jax.tree.unflatten(structure, _linear.bind(*known, *x, *change, of=of))
+        linear_map = _LinearMap(program, True, _shapes(x), _shapes(leaves))
+        return result, jax.tree.unflatten(structure, _linear.bind(*known, *x, *change, linear_map=linear_map))
 
     return call(*x)
 
 
 _linear = Primitive("linear_program")
 _linear.multiple_results = True
-_linear.def_impl(lambda *leaves, of: jax.tree.leaves(_computed(of, *leaves)))
+_linear.def_impl(lambda *leaves, linear_map: jax.tree.leaves(_computed(linear_map, *leaves)))
 
 
 @_linear.def_abstract_eval
-def _abstract(*leaves: Any, of: Any) -> list[Any]:
-    return [jax.core.ShapedArray(shape.shape, shape.dtype) for shape in (of.x if of.transposed else of.y)]
+def _abstract(*leaves: Any, linear_map: Any) -> list[Any]:
+    results = linear_map.x if linear_map.transposed else linear_map.y
+    return [jax.core.ShapedArray(result.shape, result.dtype) for result in results]
 
 
 def _full(changes: Sequence[Any]) -> list[Any]:
@@ -280,31 +280,32 @@ def _full(changes: Sequence[Any]) -> list[Any]:
     return list(map(full, changes))
 
 
-def _transpose(cotangents: list[Any], *leaves: Any, of: _Map) -> list[Any]:
-    known, x = of.split(leaves)
-    results = _linear.bind(*known, *_full(cotangents), of=of._replace(transposed=not of.transposed))
+def _transpose(cotangents: list[Any], *leaves: Any, linear_map: _LinearMap) -> list[Any]:
+    known, x = linear_map.split(leaves)
+    transpose = linear_map._replace(transposed=not linear_map.transposed)
+    results = _linear.bind(*known, *_full(cotangents), linear_map=transpose)
     wanted = map(ad.is_undefined_primal, x)
     return [None] * len(known) + [result if each else None for result, each in zip(results, wanted, strict=True)]
 
 
-def _jvp(leaves: tuple[Any, ...], change: tuple[Any, ...], of: _Map) -> tuple[list[Any], list[Any]]:
-    (known, _), (d_known, d_rest) = of.split(leaves), of.split(change)
+def _jvp(leaves: tuple[Any, ...], change: tuple[Any, ...], linear_map: _LinearMap) -> tuple[list[Any], list[Any]]:
+    (known, _), (d_known, d_rest) = linear_map.split(leaves), linear_map.split(change)
     if all(isinstance(d, ad.Zero) for d in d_known):
-        return _linear.bind(*leaves, of=of), _linear.bind(*known, *_full(d_rest), of=of)
+        return _linear.bind(*leaves, linear_map=linear_map), _linear.bind(*known, *_full(d_rest), linear_map=linear_map)
     moved = {i: d for i, d in enumerate(change) if not isinstance(d, ad.Zero)}
 
-    def of_moved(*some: Any) -> list[Any]:
-        return of(*(dict(enumerate(leaves)) | dict(zip(moved, some, strict=True))).values())
+    def of_varied(*some: Any) -> list[Any]:
+        return linear_map(*(dict(enumerate(leaves)) | dict(zip(moved, some, strict=True))).values())
 
-    return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moved.values()))
+    return jax.jvp(of_varied, tuple(leaves[i] for i in moved), tuple(moved.values()))
 
 
-def _batch(leaves: tuple[Any, ...], axes: tuple[Any, ...], of: _Map) -> tuple[list[Any], list[int]]:
-    results = jax.vmap(lambda *leaves: of(*leaves), in_axes=tuple(axes))(*leaves)
+def _batch(leaves: tuple[Any, ...], axes: tuple[Any, ...], linear_map: _LinearMap) -> tuple[list[Any], list[int]]:
+    results = jax.vmap(lambda *leaves: linear_map(*leaves), in_axes=tuple(axes))(*leaves)
     return results, [0] * len(results)
 
 
 ad.primitive_transposes[_linear] = _transpose
 ad.primitive_jvps[_linear] = _jvp
 batching.primitive_batchers[_linear] = _batch
-mlir.register_lowering(_linear, mlir.lower_fun(lambda *leaves, of: of(*leaves), multiple_results=True))
+mlir.register_lowering(_linear, mlir.lower_fun(lambda *leaves, linear_map: linear_map(*leaves), multiple_results=True))

@@ -35,7 +35,7 @@ signal = 1000 * np.exp(-b * np.einsum("na,xyzab,nb->xyzn", u, truth, u)) * np.wh
 
 
 def scan(folder: Path, rng: np.random.Generator) -> hj.io.TensorVolume:
-    """Measure once, and fit."""
+    """Simulate one scan, and fit the tensors."""
     images = np.abs(signal + 30 * rng.standard_normal(signal.shape)).astype(np.float32)
     nib.save(nib.Nifti1Image(images, np.diag([*spacing, 1.0])), folder / "dwi.nii.gz")
     np.savetxt(folder / "b", b[None])
@@ -77,15 +77,15 @@ def signature(D):
 
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore", hj.AccuracyWarning)  # read below, in the summary
+    warnings.simplefilter("ignore", hj.AccuracyWarning)  # the summary contains them
     bars = hj.uncertainty(signature, plane.tensors, noise, draws=32)
 print(bars.summary())
 print("signal to noise:", np.round(bars.signal_to_noise, 1), " claimed:", bars.trusted)
 
 # %% [markdown]
 # The second scan checks the error bars: the difference of the two maps should have √2 times the standard deviation.
-# At large t a map has few independent places. The ratio from one pair of scans is then uncertain by a factor of two
-# or three.
+# At large t a map has few independent regions. The ratio from one pair of scans is then uncertain by a factor of
+# two or three.
 
 # %%
 difference = np.asarray(signature(again.tensors) - bars.value)

@@ -31,7 +31,7 @@ if brain is not None:
 else:
     tensors, mask, spacing = phantom((34, 40))
     centre, radius = (45.0, 105.0), 19.0
-D = 1e3 * tensors  # in mm²/s; a thousandth of a second is then the unit of t
+D = 1e3 * tensors  # in 10⁻³ mm²/s; the unit of t is then 1000 s
 grid = hj.Grid(mask.shape, spacing, mask=mask, components="largest")
 truth = hj.TensorField.from_diffusion(grid, D, metric="inverse")
 

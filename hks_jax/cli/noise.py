@@ -29,7 +29,7 @@ _RIM = 0.1
 _LEAST = 0.1
 """The least share of nodes in the interior; fewer nodes do not represent the variation of a map."""
 _CLEAR = 2.0
-"""The signal-to-noise ratio for which the report contains the first time above it."""
+"""The report contains the first time with a signal-to-noise ratio above this value."""
 
 
 class Noisy(NamedTuple):
@@ -139,7 +139,7 @@ def _error_bars(
         maps.append(np.asarray(one, np.float32))
 
     with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", hj.AccuracyWarning)  # also about unused times
+        warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern unused times
         tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
         more |= {"compiled": noisy.traceable, "progress": progress.update}
         bars = hj.uncertainty(signature, tensors, noisy.noise, method="resample", **more)
@@ -151,7 +151,7 @@ def _error_bars(
     chosen = np.arange(len(times))
     if not settings.times.explicit:
         ratio = np.asarray(bars.signal_to_noise_at(interior))
-        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # empty interior
+        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # for an empty interior
         clear = np.flatnonzero(ratio >= _SIGNAL)
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
         chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)

@@ -27,7 +27,7 @@ from hks_jax.linear.products import inner_products, matmul
 from hks_jax.traced import is_traced
 
 Telling = Literal["nothing", "warning", "error"]
-"""The action if a derivative does not converge, in addition to NaN."""
+"""The action if the linear solves of a derivative do not converge, in addition to the result NaN."""
 
 _ON_HOST = 1 << 23
 """The largest size of the eigenvectors for which NumPy differentiates, as fast as JAX and without compilation."""
@@ -117,7 +117,7 @@ def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
 def _computed(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
 ) -> RawPairs:
-    """Return k pairs and some spare pairs."""
+    """Return k + spare computed pairs, and the bound of the solver."""
     if interior:
         return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
     values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
@@ -127,7 +127,7 @@ def _computed(
 
 @numpy_where_known(static_argnums=2)
 def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    """Return the first k pairs, and the eigenvalue after them."""
+    """Return the first k pairs, and the next eigenvalue, or infinity if there is none."""
     return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
 
 
@@ -142,13 +142,13 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _like(*args: Any) -> tuple[Any, Any, Any]:
-    """Return arrays (or shapes) with the structure of the tangents."""
+def _shapes(*args: Any) -> tuple[Any, Any, Any]:
+    """Return the shapes and dtypes of the tangents."""
     functions = args[-1]
     return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions, functions
 
 
-def _on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
     """Return the tangents or, given cotangents y, the cotangents of the change, by NumPy."""
     adjoint, telling, prepared, pencil, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
@@ -207,7 +207,7 @@ def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
 
 
 # Without the checkpoint, reverse mode would store copies of the eigenvectors.
-@jit_quickly(static_argnames=("adjoint", "telling"), linear=("change",), like=_like, on_host=_on_host)
+@jit_quickly(static_argnames=("adjoint", "telling"), linear=("change",), shapes=_shapes, numpy_rule=_numpy_rule)
 @partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(
     adjoint: Adjoint,
@@ -229,7 +229,7 @@ def tangents_of(
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     apart, inverse = _gaps(jnp, values, k, indistinct(pencil, values.dtype))
-    # Products with the guards are separate, because reverse mode of the frame needs only these.
+    # The guards have a separate product, because reverse mode of the frame needs only this one.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
     frame = _onto(guards, inverse[:, k:], force)
@@ -386,7 +386,7 @@ def of_simple(
     part: Int[Array, " k"] | None,
     pencil: AnyPencil,
 ) -> Float[Array, "k n_dof"]:
-    """Return the vectors. A derivative that is used becomes NaN unless the eigenvalue is simple and kept."""
+    """Return the vectors. Their nonzero derivatives become NaN unless the eigenvalue is simple and kept."""
     return vectors
 
 

@@ -1,4 +1,4 @@
-"""Stiffness and mass on grids: the integrals over all elements, which are assembled into stencils."""
+"""Assembly of stiffness and mass on grids: the integrals over the elements are summed into stencils."""
 
 from dataclasses import replace
 from functools import partial
@@ -25,11 +25,11 @@ from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator
 
 _ON_HOST = 1 << 17
-"""The largest size of the tensors for which NumPy integrates; it takes milliseconds, without a compilation."""
+"""The largest number of tensor entries for which NumPy integrates, in milliseconds and without compilation."""
 
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
-    """Return the pencil of a field, or of one problem of a doubled domain."""
+    """Return the pencil of a field, or of one part of a doubled domain."""
     # Masks, element and spacing are passed as arrays, so that problems that differ only in them share one compilation.
     # The element is computed in double precision, since its rounding would scale the whole metric.
     tensors, spacing = field.tensors, field.grid.spacing
@@ -51,7 +51,7 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
-    """Return the positions of the quadrature points; elements outside the domain get those of one inside."""
+    """Return the positions of the quadrature points; for elements outside the domain, those of an element inside."""
     first = np.argwhere(space.elements)[0].astype(dtype)
     corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
     inner = tensor_product_element(space.dimension).values @ corners
@@ -72,8 +72,8 @@ def _points_from(
     return jnp.asarray(origin + spacing * (low[..., None, :] + inner))
 
 
-def _on_host(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return from NumPy the integrals of the Laplace–Beltrami operator, their tangents, or the tensors' cotangents."""
+def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return the Laplace–Beltrami integrals, their tangents, or the cotangents of the tensors, by NumPy."""
     tensors, domain, elements, couplings, gradients, weights, _, _, fields, periodic, interpolation, operator = args
     plain = operator == WeakForm(lumped=operator.lumped) and interpolation == "linear" and not fields
     if not plain or tensors.size > _ON_HOST or (x is not None and len(jax.tree.leaves(x)) > 1):
@@ -102,7 +102,7 @@ def _on_host(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         lumped = mass.sum(axis=0)
         return np.where(coupled, stiffness, 0), np.where(coupled, mass, 0), lumped, lumped.sum()
 
-    # The integrands are √|T| T⁻¹ and √|T|. Their changes are √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and ½√|T| tr(T⁻¹dT).
+    # The integrands have d(√|T| T⁻¹) = √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and d√|T| = ½√|T| tr(T⁻¹dT).
     metric = inside(nodes)
     root, inverse = np.sqrt(spd.determinant(metric)), spd.inverse(metric)
     flux, across = root[..., None, None] * inverse, np.swapaxes(inverse, -1, -2)
@@ -125,7 +125,7 @@ def _on_host(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
     return [(np.stack(sums, axis=-1).reshape(-1, d, d) * known).astype(dtype).reshape(tensors.shape)]
 
 
-@jit_quickly(static_argnames=("periodic", "interpolation", "operator"), on_host=_on_host)
+@jit_quickly(static_argnames=("periodic", "interpolation", "operator"), numpy_rule=_numpy_rule)
 def _grid_integrals(
     tensors: Float[Array, "*shape d d"],
     domain: Bool[np.ndarray | Array, "*shape"],
@@ -142,7 +142,7 @@ def _grid_integrals(
 ) -> tuple[Array, Array, Array, Array]:
     """Return stiffness and mass as stencils, the row sums of the mass at all nodes, and the volume.
 
-    If functions have several components, return the matrices of all elements in place of stencils.
+    For functions with several components, the element matrices replace the stencils.
     """
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
@@ -176,7 +176,7 @@ def _grid_integrals(
     if operator.components > 1:
         return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
     stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
-    # The sums include the couplings to eliminated nodes, because only all basis functions add up to one.
+    # The row sums include couplings to eliminated nodes, because only the sum of all basis functions is one.
     lumped = volumes = jnp.sum(mass, axis=0)
     if "density" in fields:
         volumes = kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None])
@@ -201,13 +201,13 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
     """
     d = len(periodic)
     couplings = jnp.moveaxis(matrices, (-2, -1), (0, 1)).reshape(2**d, *(2,) * d, *matrices.shape[:d])
-    # One pad for each a, with all corners b at once, compiles twice as fast in 3D as one for each pair.
+    # In 3D, one pad for each a and all corners b compiles twice as fast as one pad for each pair (a, b).
     total = jnp.zeros((), matrices.dtype)
     for a, node in enumerate(product((0, 1), repeat=d)):
         total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
     total = total.reshape(3**d, *total.shape[d:])
     for axis, wraps in enumerate(periodic, start=1):
-        if wraps:  # the last node is the first node
+        if wraps:  # the last node equals the first
             inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
             last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])

@@ -23,7 +23,7 @@ from hks_jax.storage import existing, reading
 _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
-"""The least share 1 − h of an image's noise variance in its residual for which the residual is used."""
+"""The least ratio 1 − h of a residual's variance to the variance of the noise for which the residual is used."""
 
 
 class ExampleBrain(NamedTuple):
@@ -103,7 +103,7 @@ def fit_dwi(
     if len(image.shape) != 4 or b.shape != (image.shape[-1],) or directions.shape != (b.size, 3):
         raise ValueError(
             f"path, bval, bvec: got an image of shape {image.shape}, {b.size} b-values and directions of shape "
-            f"{directions.shape}; expected (nx, ny, nz, n), n and (n, 3)"
+            f"{directions.shape}; expected an image (nx, ny, nz, n), n b-values and directions (n, 3)"
         )
     b = b / (1.0 if unit is None else UNITS[unit])
     if question := b_value_question(float(b.max())):
@@ -113,8 +113,8 @@ def fit_dwi(
     weighted = int((used & (b > threshold)).sum())
     if weighted < 6 or weighted == used.sum():
         raise ValueError(
-            f"b_max: {b_max} leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; expected "
-            "at least 6 and 1. Raise the limit"
+            f"b_max: got {b_max}, which leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; "
+            "expected at least 6 and 1. Raise the limit"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(name, image)[..., used]
@@ -235,10 +235,10 @@ def _inside(
     affine: Float[np.ndarray, "4 4"],
     segmentation: ModuleType,
 ) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
-    """Return the given or found mask, without voxels whose signal is not finite, and notes about it."""
+    """Return the given or computed mask without voxels whose signal is not finite, and notes about the mask."""
     notes, finite = [], np.isfinite(signal)
     if mask is None:
-        # Resampling may leave NaN outside the brain, which counts as no signal here.
+        # Resampling can produce NaN outside the brain; here NaN is replaced by zero signal.
         with np.errstate(invalid="ignore"):  # median_otsu divides by zero if its median filter returns zeros
             _, brain = segmentation.median_otsu(np.where(finite, signal, 0.0)[..., unweighted].mean(axis=-1))
         if not brain.any():

@@ -60,14 +60,14 @@ def _matters(f: Float[Array, " k"], slope: Float[Array, " k"], values: Float[Arr
     return ~(size <= jnp.finfo(f.dtype).eps * largest)  # NaN counts as not negligible
 
 
-def like(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
-    """Return the shape of the derivative."""
+def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
+    """Return the shape and dtype of the derivative."""
     vectors, m = pairs[1], len(jax.tree.leaves(filters)[0])
     return jax.eval_shape(contraction.weighted, jax.ShapeDtypeStruct((m, len(vectors)), vectors.dtype), vectors)
 
 
-def on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the derivative of a diagonal, or the cotangents of the moving frame and of the change, by NumPy."""
+def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return the derivative of a diagonal, or the cotangents of `d_frame` and of the change of the pencil, by NumPy."""
     contraction, filters, pairs, _, selection, fixed, copies, space, _, reader = known
     values, vectors, kept = map(np.asarray, pairs)
     k = len(values) if selection is None else len(selection[0])
@@ -83,8 +83,7 @@ def on_host(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), fixed)
     )
     change = x[8]
-    # A term of the sum over i and j matters only if i or j is among the first; terms with only i among them count
-    # twice.
+    # Only the first n pairs matter, so the symmetric sum over i and j needs only i < n. Terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
     times = [np.where(np.arange(k) < n, 1, 2) for n in last]
 

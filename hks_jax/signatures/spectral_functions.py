@@ -21,7 +21,7 @@ from hks_jax.linear.linear_map import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
 from hks_jax.signatures.filters import Custom, Derivative, Filter
-from hks_jax.signatures.mixing import like, mixing, on_host, weights_of
+from hks_jax.signatures.mixing import by_numpy, mixing, shapes, weights_of
 from hks_jax.traced import is_traced
 
 _ROWS = 128
@@ -163,7 +163,7 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
 
 
 # The transpose recomputes intermediate results, because storing them would take twice the memory of the eigenvectors.
-@jit_quickly(static_argnames=("fixed", "copies"), linear=("d_frame", "change"), like=like, on_host=on_host)
+@jit_quickly(static_argnames=("fixed", "copies"), linear=("d_frame", "change"), shapes=shapes, numpy_rule=by_numpy)
 @partial(jax.checkpoint, static_argnums=(5, 6))
 def _tangent(
     contraction: Contraction,

@@ -1,4 +1,4 @@
-"""Error bars: the noise of measured tensors, carried to results."""
+"""Error bars: propagate the noise of measured tensors to functions of the tensors."""
 
 from hks_jax.uncertainty.noise import TensorNoise as TensorNoise
 from hks_jax.uncertainty.propagate import uncertainty as uncertainty

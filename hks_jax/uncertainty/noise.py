@@ -1,4 +1,4 @@
-"""The noise of measured tensors: its covariance at every node, and how far neighbours share it."""
+"""The noise of measured tensors: its covariance at every node, and its correlation between nodes."""
 
 import math
 from typing import Any
@@ -15,29 +15,29 @@ from hks_jax.traced import is_traced
 from hks_jax.uncertainty.smoothing import along_axes, gaussians
 
 _ROUNDING = 1e-6
-"""What a covariance's least eigenvalue may be below zero, relative to the largest."""
+"""The tolerance for asymmetry and negative eigenvalues of a covariance, relative to its largest entry."""
 _NORMAL = 1.4826
-"""The standard deviation of a normal variable over the median of its modulus."""
+"""The ratio of the standard deviation of a normal variable with mean zero to the median of its absolute value."""
 
 
 class TensorNoise(eqx.Module):
-    """Normal noise of symmetric tensors at nodes, or at the cells of a mesh.
+    """Normally distributed noise of symmetric tensors at the nodes of a grid or the cells of a mesh.
 
-    The components of a tensor follow each other as in NIfTI and DIPY: xx xy yy (in 2D), xx xy yy xz yz zz (in 3D).
+    The components of a tensor have the order of NIfTI and DIPY: xx xy yy in 2D, xx xy yy xz yz zz in 3D.
 
     Attributes:
-        covariance: (*shape, m, m) of the m = d(d+1)/2 components, along the axes of the tensors and in their squared
-            unit; positive semidefinite.
-        grid: of the nodes; None where they lie on no grid, as on a mesh.
-        correlation: how far neighbours share their noise, in coordinate units: white noise blurred by a Gaussian of
-            this standard deviation, and scaled to the covariance. Nodes a distance r apart then have the correlation
-            exp(−r²/4w²). 0: independent.
-        modes: (*shape, n, m), the fields of which the noise is the sum (see `from_modes`), or None.
-        freedom: the degrees of freedom with which the covariance is known; infinite for a stated one.
+        covariance: (*shape, m, m), the covariance of the m = d(d+1)/2 components, along the axes of the tensors and in
+            their squared unit; positive semidefinite.
+        grid: the grid of the nodes; None if the tensors are not on a grid, as on a mesh.
+        correlation: the correlation length w of the noise in coordinate units. The noise is white noise, smoothed by a
+            Gaussian with the standard deviation w, and scaled to the covariance. The noise of two nodes at a distance r
+            has the correlation exp(−r²/4w²). If w is 0, the noise is independent between nodes.
+        modes: (*shape, n, m), the n fields whose random combination is the noise (see `from_modes`), or None.
+        freedom: the degrees of freedom of the covariance if it was estimated; infinite if it was given.
 
     Raises:
-        ValueError: a covariance that is not positive semidefinite (at how many nodes, where, and by how much), or of
-            another shape; a correlation without a grid.
+        ValueError: The covariance is not positive semidefinite, or has another shape; the correlation is positive and
+            there is no grid.
     """
 
     covariance: Float[Array, "*shape m m"]
@@ -63,45 +63,45 @@ class TensorNoise(eqx.Module):
         shape = self.covariance.shape
         if len(shape) < 3 or shape[-1] != shape[-2] or shape[-1] not in (3, 6):
             raise ValueError(
-                f"covariance: got shape {shape}; expected (*shape, m, m), m = 3 for tensors of the plane (xx xy yy) "
-                "and 6 for those of space (xx xy yy xz yz zz)"
+                f"covariance: got shape {shape}; expected (*shape, m, m), where m is 3 for tensors in 2D (xx xy yy) "
+                "and 6 for tensors in 3D (xx xy yy xz yz zz)"
             )
         if grid is not None and shape[:-2] != grid.shape:
-            raise ValueError(f"covariance: got shape {shape}; expected (*grid.shape, m, m), grid.shape = {grid.shape}")
+            raise ValueError(f"covariance: got shape {shape}; expected {(*grid.shape, *shape[-2:])}, as the grid")
         if correlation and grid is None:
-            raise ValueError("correlation: got a length but no grid; give the grid whose nodes share their noise")
+            raise ValueError("correlation: got a length but no grid; expected both. Pass the grid of the tensors")
         if not is_traced(self.covariance):
             _check_semidefinite(np.asarray(self.covariance))
 
     @classmethod
     def from_modes(cls, modes: Any, grid: Grid | None = None, unknowns: int = 0) -> "TensorNoise":
-        """Return noise that is the sum of n fields, each times a standard normal number of its own.
+        """Return noise Σᵢ zᵢ mᵢ, where mᵢ are n given fields and zᵢ are independent standard normal numbers.
 
-        The fields of a scan are what each of its images changes of the tensors by its residuals
-        (`hks_jax.io.TensorVolume.modes`): random signs of whole images, a wild bootstrap. Voxels share this noise just
-        as they share residuals: by the reconstruction, by drift of the scanner or motion between images, and by
-        diffusion that no tensor describes.
+        For a scan, the field mᵢ is the change of the tensors that the residuals of image i cause
+        (`hks_jax.io.TensorVolume.modes`). Random factors for whole images are a wild bootstrap. The noise is then
+        correlated between voxels as the residuals are. Such correlations are caused by the image reconstruction, by
+        drift of the scanner, by motion between images, and by diffusion that no tensor describes.
 
         Args:
-            modes: (*shape, n, m) of the m components, along the axes of the tensors and in their unit.
+            modes: (*shape, n, m), the m components of the n fields, along the axes of the tensors and in their unit.
             grid: see `TensorNoise`.
-            unknowns: of the fit: n less as many are the degrees of freedom that intervals take account of.
+            unknowns: the number of unknowns of the fit; intervals use n − unknowns degrees of freedom.
         """
         values = real_array("modes", modes)
         if values.ndim < 3 or values.shape[-2] <= unknowns:
-            raise ValueError(f"modes: got shape {values.shape}; expected (*shape, n, m), n > unknowns = {unknowns}")
+            raise ValueError(f"modes: got shape {values.shape}; expected (*shape, n, m) with n > unknowns = {unknowns}")
         covariance = jnp.einsum("...na,...nb->...ab", values, values, precision="highest")
         return cls(covariance, grid, modes=values, freedom=values.shape[-2] - unknowns)
 
     @classmethod
     def relative(cls, tensors: Any, level: float, grid: Grid | None = None, correlation: float = 0.0) -> "TensorNoise":
-        """Return noise of a stated level: the deviation of a diagonal component over the mean diffusivity tr D/d.
+        """Return noise with a given ratio of the standard deviation of Dᵢᵢ to the mean diffusivity tr D/d.
 
-        It is the same in all directions: what is off the diagonal has a deviation smaller by √2.
+        The noise is isotropic: the standard deviation of an off-diagonal component is smaller by the factor √2.
 
         Args:
-            tensors: (*shape, d, d) as measured.
-            level: such as 0.1 for 10 %.
+            tensors: (*shape, d, d), the measured tensors.
+            level: the ratio, for example 0.1 for 10 %.
             grid: see `TensorNoise`.
             correlation: see `TensorNoise`.
         """
@@ -111,38 +111,38 @@ class TensorNoise(eqx.Module):
 
     @classmethod
     def from_scans(cls, first: Any, second: Any, grid: Grid) -> "TensorNoise":
-        """Estimate the noise of each of two scans of the same subject: half of the square of their difference.
+        """Estimate the noise of one scan from two scans of the same subject: half of their mean squared difference.
 
-        One covariance, relative to the squared mean diffusivity, and one correlation length are estimated over all
-        nodes inside the mask: the size of the former by a median, the latter from neighbours along the axes. Assumed
-        are scans that lie exactly on each other, and equal and independent noise: whatever moved between them counts
-        as noise.
+        The function estimates one covariance, relative to the squared mean diffusivity, and one correlation length
+        from all nodes inside the mask. A median gives the size of the covariance; the correlation of neighbours along
+        the axes gives the length. The scans must be aligned, and their noise must be independent and have the same
+        covariance. The estimate of the noise includes the effect of motion between the scans.
 
         Args:
-            first: (*shape, d, d), tensors of one scan.
-            second: likewise, of the other.
-            grid: of both.
+            first: (*shape, d, d), the tensors of the first scan.
+            second: (*shape, d, d), the tensors of the second scan.
+            grid: the grid of both scans.
 
         Returns:
-            The noise of one scan; of the mean of both it is half, ``TensorNoise(noise.covariance / 2, …)``.
+            The noise of one scan. The mean of both scans has half the covariance.
 
         Raises:
-            ValueError: tensors of different shapes, or that are the same.
+            ValueError: The tensors do not have the shape of the grid, or both scans are equal.
         """
         a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
         expected = (*grid.shape, grid.dimension, grid.dimension)
         if not a.shape == b.shape == expected:
-            raise ValueError(f"first, second: got shapes {a.shape} and {b.shape}; expected {expected} of both")
+            raise ValueError(f"first, second: got shapes {a.shape} and {b.shape}; expected {expected} for both")
         inside = grid.inside
         scale = np.trace(a + b, axis1=-2, axis2=-1) / (2 * grid.dimension)
         parts = _components(a - b) / np.where(inside, scale, 1.0)[..., None]
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
-            raise ValueError("first, second: they are the same; expected two scans, whose noise differs")
-        # The typical node counts, not the few, as in fluid, that have much more noise: q would have χ²'s median.
+            raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
+        # The median of q is scaled to that of χ², because a few nodes, as in fluid, have much more noise than most.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * gammaincinv(len(relative) / 2, 0.5))
-        # Blurred white noise has the correlation exp(−h²/4w²) at the distance h.
+        # Smoothed white noise has the correlation exp(−h²/4w²) at the distance h.
         widths = []
         for axis, h in enumerate(grid.spacing):
             x, y = (np.moveaxis(inside, axis, 0)[part] for part in (slice(1, None), slice(None, -1)))
@@ -153,18 +153,19 @@ class TensorNoise(eqx.Module):
 
     @classmethod
     def from_roughness(cls, tensors: Any, grid: Grid) -> "TensorNoise":
-        """Estimate a level of noise from how much the tensors themselves vary from node to node.
+        """Estimate the level of noise from second differences of the tensors.
 
-        A node less the mean of its two neighbours along an axis is noise where the field is smooth, and √1.5 times
-        its deviation. The median over all nodes and axes ignores edges, as long as they are few. Assumed is noise that
-        neighbours do not share: after smoothing or interpolation the estimate is too small, in fine anatomy too large.
+        In a smooth field, the tensor at a node minus the mean of its two neighbours along an axis is noise, with √1.5
+        times the standard deviation of the noise of one node. A median over all nodes and axes is robust against few
+        edges. The noise must be independent between nodes. The estimate is too small after smoothing or
+        interpolation, and too large in fine anatomy.
 
         Args:
-            tensors: (*shape, d, d) as measured.
-            grid: of the nodes.
+            tensors: (*shape, d, d), the measured tensors.
+            grid: the grid of the nodes.
 
         Raises:
-            ValueError: tensors that do not fit the grid, or that do not vary.
+            ValueError: The tensors do not have the shape of the grid, or most of their second differences are zero.
         """
         values, d = np.asarray(tensors, np.float64), grid.dimension
         if values.shape != (*grid.shape, d, d):
@@ -179,12 +180,12 @@ class TensorNoise(eqx.Module):
             found.append(np.abs(middle[three]).ravel())
         level = _NORMAL * float(np.median(np.concatenate(found))) / math.sqrt(1.5) if np.concatenate(found).size else 0
         if not level > 0:
-            raise ValueError("tensors: they do not vary from node to node; state a level by `TensorNoise.relative`")
+            raise ValueError("tensors: got no noise at most nodes; give a level to `TensorNoise.relative`")
         return cls.relative(values, level, grid)
 
     def __repr__(self) -> str:
         """Return one line."""
-        shared = f", neighbours share it over {self.correlation:.3g}" if self.correlation else ""
+        shared = f", correlation length {self.correlation:.3g}" if self.correlation else ""
         return f"TensorNoise({self.covariance.shape[-1]} components at {self.covariance.shape[:-2]}{shared})"
 
     @property
@@ -194,11 +195,11 @@ class TensorNoise(eqx.Module):
 
     @property
     def white_shape(self) -> tuple[int, ...]:
-        """The shape of the numbers of which `tensors` makes noise: (*shape, m), or (n,) of modes."""
+        """The shape of the argument of `tensors`: (*shape, m), or (n,) if the noise has n modes."""
         return self.covariance.shape[:-1] if self.modes is None else self.modes.shape[-2:-1]
 
     def tensors(self, white: Float[Array, "..."]) -> Float[Array, "*shape d d"]:
-        """Return the noise that independent standard normal numbers make: linear in them, of this covariance."""
+        """Map independent standard normal numbers linearly to noise with this covariance."""
         if self.correlation:
             assert self.grid is not None
             kernels = [jnp.asarray(each, white.dtype) for each in gaussians(self.grid, self.correlation)]
@@ -228,7 +229,7 @@ def _squared_mean(tensors: Any) -> Float[Array, "*shape 1 1"]:
 
 
 def _root(covariance: Float[Array, "*shape m m"]) -> Float[Array, "*shape m m"]:
-    """Return the Cholesky factor; where a pivot is zero, as that of a singular covariance, so is its column."""
+    """Return the Cholesky factor. If a pivot is zero, as for a singular covariance, its column is zero."""
     factor = jnp.zeros_like(covariance)
     least = 1e-12 * jnp.max(jnp.diagonal(covariance, axis1=-2, axis2=-1), axis=-1)
     for j in range(covariance.shape[-1]):
@@ -243,8 +244,8 @@ def _check_semidefinite(covariance: Float[np.ndarray, "*shape m m"]) -> None:
     if not np.isfinite(covariance).all():
         bad = ~np.isfinite(covariance).all(axis=(-2, -1))
         raise ValueError(
-            f"covariance: NaN or infinite at {int(bad.sum())} of {bad.size} nodes, the first at "
-            f"{tuple(int(i) for i in np.argwhere(bad)[0])}; expected finite numbers, zeros where there is no noise"
+            f"covariance: got NaN or infinity at {int(bad.sum())} of {bad.size} nodes, the first at "
+            f"{tuple(int(i) for i in np.argwhere(bad)[0])}; expected finite numbers. Use 0 for nodes without noise"
         )
     size = np.abs(covariance).max(axis=(-2, -1))
     apart = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
@@ -253,7 +254,7 @@ def _check_semidefinite(covariance: Float[np.ndarray, "*shape m m"]) -> None:
     if bad.any():
         worst = tuple(int(i) for i in np.unravel_index(np.argmin(np.where(bad, least, np.inf)), bad.shape))
         raise ValueError(
-            f"covariance: not symmetric positive semidefinite at {int(bad.sum())} of {bad.size} nodes, the worst at "
-            f"{worst}, of eigenvalues from {least[worst]:.3g} and entries up to {size[worst]:.3g}; expected (m, m) "
-            "covariances of the components xx xy yy (xz yz zz), not standard deviations or correlations of pairs"
+            f"covariance: got matrices that are not symmetric positive semidefinite at {int(bad.sum())} of {bad.size} "
+            f"nodes, the worst at {worst} with least eigenvalue {least[worst]:.3g}, entries up to {size[worst]:.3g}; "
+            "expected (m, m) covariances of the components xx xy yy (xz yz zz). Do not pass standard deviations"
         )

@@ -1,4 +1,4 @@
-"""From noise of tensors to noise of results."""
+"""Propagation of the noise of tensors to functions of the tensors."""
 
 import math
 import os
@@ -27,21 +27,21 @@ from hks_jax.uncertainty.smoothing import smooth_tensors
 Method = Literal["auto", "resample", "linear", "exact"]
 
 _SIGNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-"""The corners of a tetrahedron: those of the cube that have an even number of minus signs."""
+"""The corners of a regular tetrahedron: the corners of the cube with an even number of minus signs."""
 _BALANCED = len(_SIGNS)
-"""How many noisy maps are one sample: as many as such corners."""
+"""The number of noisy maps in one balanced sample, one for each corner of the tetrahedron."""
 _LEAST = 8
-"""Noisy maps from which bias and departure from linearity can be estimated."""
+"""The least number of noisy maps for an estimate of the bias and of the second-order variance."""
 _SCALE = 0.5
-"""The size of the noise that is added to the measured tensors, which have some already, relative to the true one."""
+"""The factor s of the added noise. It is less than 1, because the measured tensors already contain noise."""
 _FLOOR = 0.01
-"""The floor of eigenvalues of indefinite noisy tensors, as a share of the mean eigenvalue."""
+"""The least eigenvalue of corrected indefinite tensors, relative to the mean eigenvalue without added noise."""
 _LOUD = 3.0
-"""The deviation of a component over the mean diffusivity, its median over the nodes, that no measurement has."""
+"""The upper limit for the median ratio of a component's standard deviation to the mean diffusivity."""
 
 
 class _Moments(eqx.Module):
-    """Sums over balanced maps: of their linear parts' squares, and mean and squared deviations of their even parts."""
+    """The sum of the squared linear parts over balanced samples, and the mean and squared deviations of even parts."""
 
     n: Array
     odd: Any
@@ -51,7 +51,7 @@ class _Moments(eqx.Module):
 
     @jax.jit
     def add(self, found: Any, even: Any, indefinite: Array) -> "_Moments":
-        """Return the moments with four maps more (Welford 1962)."""
+        """Return the moments after four more maps (Welford 1962)."""
         n = self.n + 1
         odd = jax.tree.map(lambda s, f: s + jnp.mean(f**2, axis=0), self.odd, found)
         mean = jax.tree.map(lambda mean, e: mean + (e - mean) / n, self.even, even)
@@ -59,14 +59,14 @@ class _Moments(eqx.Module):
         return _Moments(n, odd, mean, spread, self.indefinite + indefinite)
 
 
-# Four maps y at D + sδ, with noise δ = (±η₁ ± η₂ ± η₃)/√3 at the corners of a tetrahedron of independent η, each of
-# which δ has the covariance Σ of η. The δ add up to zero, so that the mean of y less the value is of second order,
-# s² times the bias, for any η. To second order y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3, and likewise for η₂ and η₃: four maps
-# are three samples of the noise, where two antithetic pairs are two. The mean of four has a third of the variance that
-# a quadratic form of one δ has, which is what is beyond linear.
+# Let η₁, η₂, η₃ be independent noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 are the corners of a
+# tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
+# minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
+# y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, and two antithetic
+# pairs give two. The second-order variance is that of a quadratic form of one δ; the mean of four has a third of it.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
-    """Return the noise Jη (3, …) that four maps are made of, and their even part: the bias, on average."""
+    """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
 
     def linear(*y: Array) -> Array:
         signs = jnp.asarray(_SIGNS.T * (math.sqrt(3) / (4 * _SCALE)), y[0].dtype)
@@ -92,7 +92,7 @@ def uncertainty(
     checkpoint: str | os.PathLike[str] | None = None,
     each: Callable[[Any], None] | None = None,
 ) -> Uncertainty:
-    """Compute what noise of measured tensors does to a function of them: its standard deviation, and its bias.
+    """Compute the standard deviation and the bias of a function of measured tensors due to their noise.
 
         def signature(D):
             field = hj.TensorField.from_diffusion(grid, D, metric="inverse")
@@ -101,42 +101,41 @@ def uncertainty(
         bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.1))
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
-    Noise δ is drawn four at a time, which add up to zero, and maps are computed of D + δ/2: their differences are
-    linear in the noise to second order, and their mean less the value, four times, is the bias. Half the noise, because
-    measured tensors have a whole one already: that of full size on top of it would exaggerate what is beyond linear.
-    Four maps are three samples: a deviation is sure to 29 % of itself by default, to 8 % with 100 draws.
+    Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. The differences of
+    the maps are linear in δ up to second order; the mean of the maps minus the value estimates a quarter of the bias.
+    The noise is halved, because the measured tensors already contain noise; δ would exaggerate second-order effects.
+    Four maps give three samples. The relative error of a standard deviation is 29 % with 8 draws, and 8 % with 100.
 
     Args:
-        function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays; JAX must be able to trace it,
-            unless `compiled` is false. Times and energies should be fixed, not chosen by its eigenpairs.
-        tensors: (*shape, d, d) as measured, at nodes or cells; positive definite where there is noise.
-        noise: theirs: see `TensorNoise`.
-        method: ``"resample"``: all by maps of noisy tensors. ``"exact"``: one reverse product for each number that the
-            function returns, gᵀΣg. ``"linear"``: as many products with one linearisation as there are draws. These two
-            take eight maps besides, for the bias and for what is beyond linear. ``"auto"``: exact if the function
-            returns no more numbers than there are draws, else resampling: a product with the Jacobian of a signature
-            takes as long as one or two signatures.
-        draws: how many maps of noisy tensors (or products, of ``"linear"``), 8 or more; the next multiple of four.
-        smoothing: of the tensors before the function sees them, log-Euclidean, the standard deviation of the Gaussian
-            in coordinate units (`smooth_tensors`); the noise must know its grid.
-        seed: of the draws.
-        compiled: whether to compile the function, once, for all draws. False for what cannot be traced: it is then
-            called as it is.
-        progress: called with a short text after every four maps.
-        checkpoint: a file to write after every four maps. If it is there already, resampling goes on from it.
-        each: called with every sample of the noise, three for four maps, of the structure of the value: what
-            covariances, or errors of means over regions, can be made of. Not again for those of a checkpoint.
+        function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace it,
+            unless `compiled` is false. Times and energies should be fixed, and not depend on the eigenpairs.
+        tensors: (*shape, d, d), the measured tensors at nodes or cells; positive definite at nodes with noise.
+        noise: the noise of the tensors (see `TensorNoise`).
+        method: ``"resample"`` computes maps of noisy tensors. ``"exact"`` computes the variance gᵀΣg of each number of
+            the result by one reverse-mode product. ``"linear"`` computes `draws` products with one linearisation. The
+            last two also compute eight maps, for the bias and the second-order variance. ``"auto"`` chooses
+            ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a product with the
+            Jacobian of a signature takes as long as one or two signatures.
+        draws: the number of noisy maps (products for ``"linear"``), at least 8; rounded up to a multiple of four.
+        smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
+            function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
+        seed: the seed of the random numbers.
+        compiled: whether to compile the function once for all draws. False calls it directly, without tracing.
+        progress: a function that is called with a short text after every four maps.
+        checkpoint: a file that is written after every four maps. If it exists, resampling continues from its state.
+        each: a function that is called with each sample of the noise of the value, three times for four maps, for
+            example to compute covariances or errors of means. It is not called for the samples of a checkpoint.
 
     Returns:
-        Value, deviation and bias, and how sure they are. Under `jit` it works with a method that is named. The
-        deviation of ``"exact"`` is differentiable with respect to the noise: which measurement would reduce it most.
+        The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be
+        ``"auto"``. With ``"exact"``, the standard deviation is differentiable with respect to the noise.
 
     Raises:
-        ValueError: tensors and noise that do not fit each other, in shape or in unit; a function that cannot be traced;
-            a checkpoint of another computation.
+        ValueError: The tensors and the noise differ in shape or unit; the function cannot be traced; or the checkpoint
+            belongs to another computation.
 
     Warns:
-        AccuracyWarning: noise that makes tensors indefinite, or is beyond linear: intervals are not claimed there.
+        AccuracyWarning: No intervals are claimed, because noise makes tensors indefinite or acts beyond linear.
     """
     measured = real_array("tensors", tensors)
     _check(measured, noise, method, draws, smoothing)
@@ -144,19 +143,19 @@ def uncertainty(
     def smoothed(D: Array) -> Array:
         return smooth_tensors(noise.grid, D, smoothing) if noise.grid is not None and smoothing else D
 
-    # The function itself where it can be: what is compiled of it then serves other calls, too.
+    # Without smoothing, the function itself is passed to `jit`, so that later calls reuse its compilation.
     whole = (lambda D: function(smoothed(D))) if smoothing else function
     run = jax.jit(whole) if compiled else whole
     try:
         value = run(measured)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
-            "function: it looks at values, and cannot be traced by JAX; pass compiled=False, or let it choose nothing "
-            'by them, as hks(…, method="auto") does'
+            "function: got one that JAX cannot trace, because it depends on concrete values; expected a traceable one. "
+            'Pass compiled=False, or avoid choices by values such as hks(…, method="auto")'
         ) from error
     if method == "auto":
         if is_traced((measured, noise.covariance)):
-            raise ValueError('method: "auto" is for known values; under jit name "resample", "linear" or "exact"')
+            raise ValueError('method: got "auto" for traced arrays; expected "resample", "linear" or "exact" under jit')
         size = sum(leaf.size for leaf in jax.tree.leaves(value))
         method = "exact" if compiled and size <= draws else "resample"
     samples = -(-draws // _BALANCED) if method == "resample" else _LEAST // _BALANCED
@@ -193,7 +192,7 @@ def uncertainty(
 
 
 def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothing: float) -> None:
-    """Raise ValueError for tensors and noise that do not belong together, and for bad settings."""
+    """Raise ValueError if the tensors and the noise differ in shape or unit, or if a setting is invalid."""
     if not isinstance(noise, TensorNoise):
         raise TypeError(f"noise: got {type(noise).__name__}; expected hks_jax.TensorNoise")
     if method not in get_args(Method):
@@ -201,12 +200,12 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
     require_count("draws", draws, _LEAST)
     require_number("smoothing", smoothing, inclusive=True)
     if smoothing and noise.grid is None:
-        raise ValueError("smoothing: got a length, but the noise has no grid; give TensorNoise the grid of the tensors")
+        raise ValueError("smoothing: got a length, but the noise has no grid. Pass the tensors' grid to TensorNoise")
     d = noise.dimension
     if measured.shape != (*noise.covariance.shape[:-2], d, d):
         raise ValueError(
             f"noise: got a covariance of shape {noise.covariance.shape} for tensors of shape {measured.shape}; "
-            "expected (*shape, m, m) for (*shape, d, d), m = d(d+1)/2"
+            "expected (*shape, m, m) for (*shape, d, d), where m = d(d+1)/2"
         )
     if is_traced((measured, noise.covariance)):
         return
@@ -214,19 +213,19 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
     variance = np.trace(np.asarray(noise.covariance), axis1=-2, axis2=-1) / noise.covariance.shape[-1]
     noisy = (variance > 0) & (mean > 0)
     if not noisy.any():
-        raise ValueError("noise: it is zero wherever the tensors are positive; nothing has an error bar")
+        raise ValueError("noise: got zero at all nodes with positive tensors; expected noise at one node or more")
     level = float(np.median(np.sqrt(variance[noisy]) / mean[noisy]))
     if not 1e-6 < level < _LOUD:
         raise ValueError(
-            f"noise: its deviation is {level:.3g} of the mean diffusivity (the median over the nodes), which no scan "
-            "has. Is the covariance in the squared unit of the tensors? Are the tensors diffusivities, not metrics?"
+            f"noise: got a standard deviation of {level:.3g} of the mean diffusivity (median over the nodes); expected "
+            f"1e-6 to {_LOUD:g}. Give the covariance in the squared unit of the tensors, and diffusivities, not metrics"
         )
 
 
 def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
-    """Return noisy tensors with the eigenvalues of indefinite ones raised, and their share of the nodes.
+    """Raise small eigenvalues of indefinite noisy tensors; return all tensors, and the share of indefinite ones.
 
-    Nodes whose tensor is not positive definite without noise, as outside a mask, do not count.
+    Nodes whose tensor is not positive definite without noise, as outside a mask, are ignored.
     """
     valid = jnp.isfinite(spd.positive_or_nan(measured)).all(axis=(-2, -1))
     bad = valid & ~jnp.isfinite(spd.positive_or_nan(noisy)).all(axis=(-2, -1))
@@ -242,14 +241,14 @@ def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
 
 
 def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
-    """Return one of the draws: the numbers that the noise is made of."""
+    """Return the standard normal numbers of one draw, the argument of `TensorNoise.tensors`."""
     key = jax.random.fold_in(jax.random.key(seed), index)
     return jax.random.normal(key, noise.white_shape, dtype)
 
 
 @jax.jit
 def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
-    """Return tensors with noise that adds up to zero, and the share that whole noise makes indefinite, in all four."""
+    """Return four noisy tensor fields with noise of sum zero, and the sum of the indefinite shares with full noise."""
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
     changes = jnp.tensordot(
         jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1, precision=jax.lax.Precision.HIGHEST
@@ -269,7 +268,7 @@ def _sampled(
     checkpoint: str | os.PathLike[str] | None,
     each: Callable[[Any], None] | None,
 ) -> _Moments:
-    """Return the moments of four maps each."""
+    """Return the moments over all balanced samples of four maps."""
     nothing = jax.tree.map(jnp.zeros_like, value)
     none = jnp.zeros((), measured.dtype)
     moments = _Moments(none, nothing, nothing, nothing, none)
@@ -286,7 +285,7 @@ def _sampled(
         return jax.lax.fori_loop(0, samples, step, moments)
     mark, first = "", 0
     if checkpoint is not None:
-        from hks_jax.inverse.checkpoint import fingerprint  # fits are slow to import
+        from hks_jax.inverse.checkpoint import fingerprint  # this import is slow
 
         mark = fingerprint(value, _four(measured, noise, seed, 0))
         if Path(checkpoint).exists():
@@ -302,12 +301,12 @@ def _sampled(
 
 
 def _load(path: str | os.PathLike[str], mark: str, like: _Moments) -> tuple[_Moments, int]:
-    """Read moments, and how many samples they are of."""
+    """Return the moments in a checkpoint, and the number of their samples."""
     data = load_npz(path)
     if str(data.get("mark")) != mark:
         raise ValueError(
-            f"checkpoint: {path} is of another computation (another function, tensors, noise or seed), or no "
-            "checkpoint; give another name, or remove it"
+            f"checkpoint: {path} belongs to another computation, or is not a checkpoint; expected one of the same "
+            "function, tensors, noise and seed. Pass another path, or remove the file"
         )
     leaves, structure = jax.tree.flatten(like)
     read = [jnp.asarray(data[f"arr_{i}"], leaf.dtype) for i, leaf in enumerate(leaves)]
@@ -316,7 +315,7 @@ def _load(path: str | os.PathLike[str], mark: str, like: _Moments) -> tuple[_Mom
 
 
 def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise, seed: int) -> Any:
-    """Return gᵀΣg for every number, by reverse products."""
+    """Return the variance gᵀΣg of every number of the result by a reverse-mode product for each."""
 
     @jax.jit
     def squares(D: Array, noise: TensorNoise) -> Any:
@@ -330,7 +329,7 @@ def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise, seed:
 
 
 def _linear(function: Callable[[Array], Any], D: Array, noise: TensorNoise, seed: int, draws: int) -> Any:
-    """Return the mean of (Jδ)² over draws."""
+    """Return the mean of (Jδ)² over draws of the noise δ, where J is the Jacobian."""
     value, push = jax.linearize(jax.jit(function), D)
 
     @jax.jit

@@ -1,4 +1,4 @@
-"""What is known of a number's or a map's error."""
+"""The estimated error of a number or a map."""
 
 from typing import Any
 
@@ -12,31 +12,31 @@ from scipy.special import fdtri, stdtrit
 from hks_jax.checks import require_number
 
 BEYOND = 0.02
-"""The share of the variance beyond linear, its median over the nodes, from which on intervals are not claimed."""
+"""The largest median ratio of the second-order to the first-order variance for which intervals are claimed."""
 INDEFINITE = 0.02
-"""The share of tensors made indefinite by noise from which on they are not."""
+"""The largest share of tensors made indefinite by noise for which intervals are claimed."""
 
 
 class Uncertainty(eqx.Module):
-    """The value of a function of measured tensors, and what noise does to it.
+    """The value of a function of measured tensors, with its standard deviation and bias due to noise.
 
-    All of ``value``, ``deviation``, ``bias``, ``bias_error`` and ``beyond_linear`` have the structure of what the
-    function returns: an array, or a pytree of them.
+    The attributes ``value``, ``deviation``, ``bias``, ``bias_error``, ``beyond_linear`` and ``smear`` have the
+    structure of the function's result: an array, or a pytree of arrays.
 
     Attributes:
-        value: of the tensors as measured.
-        deviation: the standard deviation that noise gives it.
-        bias: the mean over noise less the value without: what noise adds to it on average.
-        bias_error: the standard deviation of that estimate, from few draws.
-        beyond_linear: the variance of second order in the noise, over that of first order.
-        smear: with smoothing, the change by smoothing once more: an estimate of the blur of the map.
-            Else None.
-        indefinite: the share of tensors that noise of its full size makes indefinite.
-        sampling_error: the relative standard deviation of ``deviation``, from few draws; 0 if it is exact.
+        value: the value of the function for the measured tensors.
+        deviation: the standard deviation of the value due to noise.
+        bias: the mean of the function over the noise, minus the value without noise.
+        bias_error: the standard deviation of ``bias``, which is estimated from few draws.
+        beyond_linear: the ratio of the second-order variance to the first-order variance in the noise.
+        smear: the change of the map by smoothing the smoothed tensors again, an estimate of the change that smoothing
+            causes; None without smoothing.
+        indefinite: the share of tensors that noise of full size makes indefinite.
+        sampling_error: the relative standard deviation of ``deviation``; 0 if ``deviation`` is exact to first order.
         method: ``"resample"``, ``"linear"`` or ``"exact"``.
-        draws: how many maps of noisy tensors were computed.
-        freedom: the degrees of freedom of the deviation, those of the noise included; infinite if it is exact.
-        samples: the degrees of freedom of `beyond_linear`.
+        draws: the number of maps of noisy tensors that were computed.
+        freedom: the degrees of freedom of ``deviation``, which include those of the noise; infinite if it is exact.
+        samples: the degrees of freedom of ``beyond_linear``.
     """
 
     value: Any
@@ -59,14 +59,14 @@ class Uncertainty(eqx.Module):
 
     @property
     def corrected(self) -> Any:
-        """The value less its bias."""
+        """The value minus its bias."""
         return jax.tree.map(jnp.subtract, self.value, self.bias)
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
-        """Return the lower and the upper ends of intervals that hold the true value with a probability.
+        """Return the lower and the upper ends of intervals that contain the true value with probability `level`.
 
-        They lie around the corrected value, and are wider the fewer draws there were (Student's distribution).
-        Normal errors are assumed: see `trusted`.
+        The centre of an interval is the corrected value. Its width follows Student's distribution, which takes account
+        of the number of draws. The errors must be normally distributed (see `trusted`).
         """
         require_number("level", level, 1)
         quantile = float(stdtrit(min(self.freedom, 1e6), 0.5 + level / 2))
@@ -74,22 +74,22 @@ class Uncertainty(eqx.Module):
         return jax.tree.map(jnp.subtract, self.corrected, half), jax.tree.map(jnp.add, self.corrected, half)
 
     def z(self, reference: Any = 0.0) -> Any:
-        """Return how many standard deviations the value is from a reference, such as 1 for 4πt·HKS: of flat space."""
+        """Return (value − reference)/deviation. For 4πt·HKS, the reference 1 is the value of flat space."""
         return jax.tree.map(lambda v, s: (v - reference) / s, self.value, self.deviation)
 
     @property
     def trusted(self) -> Any:
-        """Where intervals are claimed: bool, for each number, or for each entry of the first axis of maps, as a time.
+        """Whether intervals are claimed: one bool for each number, or for each entry of the first axis of maps.
 
-        They are where `beyond_linear` is at most 2 % and the bias at most the deviation, in the median over the map,
-        and noise makes at most two tensors in a hundred indefinite.
+        Intervals are claimed if `beyond_linear` is at most 2 % in the median over the map, the bias is at most the
+        standard deviation in the median, and noise makes at most 2 % of the tensors indefinite.
         """
 
         def of(deviation: Array, bias: Array, beyond: Array) -> Array:
             maps = (len(deviation) if deviation.ndim > 1 else deviation.size, -1)
             share = jnp.abs(bias / jnp.where(deviation > 0, deviation, jnp.nan)).reshape(maps)
             second = jnp.where(deviation > 0, beyond, jnp.nan).reshape(maps)
-            # Estimates from few draws are below their mean more often than not: by the median of their distribution.
+            # The median of an estimate from few draws is below its mean. The limit is scaled by their ratio.
             limit = BEYOND * float(fdtri(self.samples, min(self.freedom, 1e6), 0.5))
             small = (jnp.nanmedian(second, axis=1) <= limit) & (jnp.nanmedian(share, axis=1) <= 1)
             return (small & (self.indefinite <= INDEFINITE)).reshape(deviation.shape[:1])
@@ -98,18 +98,17 @@ class Uncertainty(eqx.Module):
 
     @property
     def signal_to_noise(self) -> Any:
-        """How much a map varies in space over its noise, for each entry of the first axis: a time, say.
+        """The signal-to-noise ratio √((V − N)/N) of each entry of the first axis, for example of each time.
 
-        The measured map's own variance over the nodes, less the mean variance of the noise, which it contains, over
-        the latter; the root of that.
+        V is the variance of the measured map over the nodes, and N is the mean variance of the noise, which V includes.
         """
         return self.signal_to_noise_at(True)
 
     def signal_to_noise_at(self, nodes: Any) -> Any:
-        """Return the signal to noise over some nodes, such as those that no boundary reaches: NaN where there is none.
+        """Return `signal_to_noise` over the given nodes, for example nodes with little influence of the boundary.
 
         Args:
-            nodes: bool, of the shape of the value, or one that is broadcast to it.
+            nodes: bool array that broadcasts to the shape of the value. The ratio is NaN if it contains no node.
         """
 
         def of(value: Array, deviation: Array) -> Array:
@@ -121,28 +120,28 @@ class Uncertainty(eqx.Module):
         return jax.tree.map(of, self.value, self.deviation)
 
     def messages(self) -> list[str]:
-        """Return what to know before these numbers are used, in sentences."""
+        """Return warnings about the accuracy of these numbers, as sentences."""
         if (share := float(self.indefinite)) > INDEFINITE:
             return [
-                f"noise makes {share:.2%} of the tensors indefinite, so that no intervals are claimed. Smooth the "
+                f"no intervals are claimed, because noise makes {share:.2%} of the tensors indefinite. Smooth the "
                 "tensors (smoothing=), or leave the noisiest nodes out of the mask"
             ]
         claimed = np.concatenate([np.asarray(each).ravel() for each in jax.tree.leaves(self.trusted)])
         if claimed.all():
             return []
         return [
-            f"intervals are not claimed for {int((~claimed).sum())} of {claimed.size} numbers or maps: noise is beyond "
-            "linear there, or the bias exceeds the deviation (see `trusted`). Smooth the tensors (smoothing=)"
+            f"no intervals are claimed for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
+            "noise is beyond linear, or the bias exceeds the deviation (see `trusted`). Smooth the tensors (smoothing=)"
         ]
 
     def summary(self) -> str:
-        """Say in a few lines what was computed, and how far it can be trusted."""
+        """Return a few lines about the method, the accuracy of the standard deviations, the bias and the linearity."""
         how = {
-            "exact": "deviations exact to first order, by reverse products",
-            "linear": "deviations by random directions of one linearisation",
-            "resample": "deviations of maps of noisy tensors",
+            "exact": "standard deviations by reverse-mode products, exact to first order",
+            "linear": "standard deviations from products of one linearisation with random noise",
+            "resample": "standard deviations from maps of noisy tensors",
         }[self.method]
-        sure = f", each to {self.sampling_error:.0%}" if self.sampling_error else ""
+        sure = f", with a relative error of {self.sampling_error:.0%}" if self.sampling_error else ""
         lines = [f"{how}{sure}; {self.draws} noisy maps"]
         share = jax.tree.map(jnp.divide, self.bias, self.deviation)
         for name, each in (("bias over deviation", share), ("beyond linear", self.beyond_linear)):

@@ -1,4 +1,4 @@
-"""Gaussian smoothing on grids, as products with one small matrix along each axis."""
+"""Gaussian smoothing on grids, by a product with one small matrix along each axis."""
 
 from typing import Any
 
@@ -13,21 +13,21 @@ from hks_jax.domain.grid import Grid
 
 
 def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*shape d d"]:
-    """Smooth positive definite tensors by a Gaussian, log-Euclidean: the weighted mean of their logarithms.
+    """Return the log-Euclidean mean of positive definite tensors with Gaussian weights around each node.
 
-    The determinant's logarithm is smoothed likewise, so that smoothing makes no volume (Arsigny, Fillard, Pennec and
-    Ayache 2006). At sides and at the rim of the mask the mean is that of the nodes inside.
+    The logarithms of the tensors are averaged, so the logarithm of the determinant is averaged with the same weights
+    (Arsigny, Fillard, Pennec and Ayache 2006). At the boundary, the mean includes only nodes inside the mask.
 
     Args:
-        grid: the grid, whose mask is kept.
+        grid: the grid of the tensors; nodes outside its mask do not contribute.
         tensors: (*shape, d, d), positive definite inside the mask.
-        width: the standard deviation of the Gaussian, in coordinate units; 0 for none.
+        width: the standard deviation of the Gaussian, in coordinate units; 0 for no smoothing.
 
     Returns:
-        (*shape, d, d); the identity outside the mask. Differentiable.
+        (*shape, d, d), the smoothed tensors; the identity outside the mask. They are differentiable.
 
     Raises:
-        ValueError: tensors that do not fit the grid; a negative width.
+        ValueError: The tensors do not have the shape of the grid, or the width is negative.
     """
     d, values = grid.dimension, real_array("tensors", tensors)
     if values.shape != (*grid.shape, d, d):
@@ -35,7 +35,7 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
     require_number("width", width, inclusive=True)
     if width == 0:
         return values
-    with jax.ensure_compile_time_eval():  # XLA folds these constants slowly
+    with jax.ensure_compile_time_eval():  # XLA takes long to fold these constants
         weights = [jnp.asarray(each, values.dtype) for each in gaussians(grid, width)]
         inside = jnp.asarray(grid.inside, values.dtype)[..., None, None]
         total = jnp.where(inside > 0, along_axes(weights, inside), 1)
@@ -44,7 +44,7 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
 
 
 def gaussians(grid: Grid, width: float) -> list[Float[np.ndarray, "n n"]]:
-    """Return for each axis the matrix of a Gaussian's values between its nodes, its rows' squares adding up to one."""
+    """Return the matrix of Gaussian weights between the nodes of each axis, with rows of Euclidean norm one."""
     matrices = []
     for n, h in zip(grid.shape, grid.spacing, strict=True):
         apart = np.subtract.outer(np.arange(n), np.arange(n)) * h
@@ -54,7 +54,7 @@ def gaussians(grid: Grid, width: float) -> list[Float[np.ndarray, "n n"]]:
 
 
 def along_axes(matrices: list[Array], values: Float[Array, "*shape_and_more"]) -> Float[Array, "*shape_and_more"]:
-    """Multiply by a matrix along each of the first axes."""
+    """Multiply the values by the i-th matrix along axis i, for all i."""
     for axis, matrix in enumerate(matrices):
         product = jnp.tensordot(matrix, values, axes=(1, axis), precision=jax.lax.Precision.HIGHEST)
         values = jnp.moveaxis(product, 0, axis)
