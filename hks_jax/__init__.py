@@ -6,6 +6,15 @@ The steps from tensors to a signature are:
     field = TensorField(grid, tensors)
     pairs = eigenpairs(field, k=200)
     signature = hks(pairs, default_times(pairs, 8))
+
+The examples of the reference begin with:
+
+    >>> import pathlib, tempfile
+    >>> import jax, jax.numpy as jnp, numpy as np
+    >>> import hks_jax as hj
+    >>> field = hj.examples.figure4_fields(9)["circles"]  # a flat metric of area 2 on the unit square
+    >>> pairs = hj.eigenpairs(field, k=12)
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
 """
 
 import importlib

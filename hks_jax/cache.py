@@ -19,6 +19,11 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
     Returns:
         The folder, or None if it cannot be written, in which case no program is stored.
+
+    Examples:
+        >>> path = hj.keep_compiled(folder / "compiled")
+        >>> path == pathlib.Path(jax.config.jax_compilation_cache_dir)
+        True
     """
     given = jax.config.values["jax_compilation_cache_dir"]
     if given is not None:

@@ -35,6 +35,12 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
 
     Raises:
         ValueError: if arrays have different lengths, if there are none, or if the mesh has several axes.
+
+    Examples:
+        >>> area = lambda T: hj.assemble(hj.TensorField(field.grid, T)).volume
+        >>> fields = jnp.stack([field.tensors, 9 * field.tensors])
+        >>> print(hj.devices.map_fields(area, fields, jax.make_mesh((1,), ("devices",))).round(1))
+        [ 2. 18.]
     """
     mesh = checked_mesh(mesh)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
@@ -84,6 +90,13 @@ def heat_columns(
     Raises:
         ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if traced arrays lack a
             degree.
+
+    Examples:
+        >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
+        >>> pencil, one = hj.assemble(field, mass="lumped"), slabs.split(jnp.ones((9, 9, 1)))
+        >>> K, D = slabs.split(pencil.stiffness.coefficients, 1), slabs.split(pencil.mass.diagonal().reshape(9, 9))
+        >>> print(hj.devices.heat_columns(slabs, K, D, one, [0.5]).mean().round(3))  # a constant stays
+        1.0
     """
     slabs.check("stiffness", stiffness, 1)
     slabs.check("lumped", lumped, 0)
@@ -118,6 +131,13 @@ def chebyshev_series(
     """Return Σₙ seriesₘₙ Tₙ(2D⁻¹K/top − 1) columns for a bound ``top`` on the spectrum of D⁻¹K and a degree ≥ 1.
 
     The arrays have the layout of `heat_columns`. The result is linear in series and columns, and differentiable.
+
+    Examples:
+        >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
+        >>> pencil, one = hj.assemble(field, mass="lumped"), slabs.split(jnp.ones((9, 9, 1)))
+        >>> K, D = slabs.split(pencil.stiffness.coefficients, 1), slabs.split(pencil.mass.diagonal().reshape(9, 9))
+        >>> print(hj.devices.chebyshev_series(slabs, K, D, one, jnp.array(300.0), jnp.array([[1.0, 0.5]])).mean())
+        0.5
     """
 
     def share(stiffness: Array, lumped: Array, x: Array, top: Array, series: Array) -> Array:

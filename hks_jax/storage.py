@@ -27,6 +27,12 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary name beside `path`, and atomically move the file with this name to `path` at the end.
 
     If the body raises, the temporary file is removed and `path` does not change. Missing parent folders are created.
+
+    Examples:
+        >>> with hj.io.atomic_path(folder / "hks.txt") as temporary:
+        ...     _ = temporary.write_text("whole")
+        >>> (folder / "hks.txt").read_text()
+        'whole'
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -53,6 +59,12 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
     Raises:
         NotADirectoryError: if `path` is a file.
+
+    Examples:
+        >>> with hj.io.atomic_folder(folder / "results") as temporary:
+        ...     _ = (temporary / "hks.txt").write_text("whole")
+        >>> (folder / "results" / "hks.txt").read_text()
+        'whole'
     """
     target = Path(path)
     if target.exists() and not target.is_dir():

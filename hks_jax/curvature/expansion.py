@@ -70,6 +70,11 @@ def hks_expansion(
     Raises:
         ValueError: times that are not a vector of positive numbers; an order that is not implemented; fewer than 8
             nodes along an axis of a nodal field; a bad `periodic`.
+
+    Examples:
+        >>> expansion = hj.hks_expansion(hj.examples.sphere_field(9), [0.1], order=1)[0, 4, 4]
+        >>> print((4 * jnp.pi * 0.1 * expansion).round(3))  # 1 + t/3
+        1.033
     """
     dimension = field.grid.dimension
     highest = HIGHEST_ORDER[dimension]

@@ -41,6 +41,10 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
 
     Raises:
         ValueError: fewer than 8 nodes along an axis of a nodal field; a bad `periodic`.
+
+    Examples:
+        >>> print(hj.scalar_curvature(hj.examples.hyperbolic_field(9))[4, 4].round(3))  # 2K
+        -2.0
     """
     return _at_nodes(scalar, field, wraps_per_axis(periodic, field.grid.dimension))
 
@@ -63,6 +67,11 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
     Raises:
         ValueError: a field that is not two-dimensional; fewer than 8 nodes along an axis of a nodal field; a bad
             `periodic`.
+
+    Examples:
+        >>> K = hj.gaussian_curvature(hj.examples.sphere_field(9))
+        >>> print(K.min().round(3), K.max().round(3))
+        1.0 1.0
     """
     if field.grid.dimension != 2:
         raise ValueError(
@@ -161,6 +170,10 @@ def laplace_beltrami(
 
     Raises:
         ValueError: values of another shape; fewer than 8 nodes along an axis with differences; a bad `periodic`.
+
+    Examples:
+        >>> print(hj.laplace_beltrami(field, lambda x: (x + 0.3) @ (x + 0.3))[4, 4].round(3))  # of r²
+        4.0
     """
     if callable(f):
         f = f if isinstance(f, jtu.Partial) else jtu.Partial(f)

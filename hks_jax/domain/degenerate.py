@@ -44,6 +44,10 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 
     Raises:
         ValueError: a 3D field; merge less than 1.
+
+    Examples:
+        >>> hj.degenerate_points(hj.examples.degenerate_point_field(0.5, 9))
+        DegeneratePoints(positions=array([[0., 0.]]), indices=array([0.5]))
     """
     grid = field.grid
     if grid.dimension != 2:

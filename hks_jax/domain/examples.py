@@ -23,7 +23,13 @@ Metric = Callable[[Point], Float[Array, "d d"]]
 
 
 def pullback(parametrisation: Callable[[Point], Float[Array, " m"]]) -> Metric:
-    """Return the pullback metric x ↦ JᵀJ of a map from coordinates (d,) into space (m,) with the Jacobian J."""
+    """Return the pullback metric x ↦ JᵀJ of a map from coordinates (d,) into space (m,) with the Jacobian J.
+
+    Examples:
+        >>> metric = hj.examples.pullback(lambda x: x[0] * jnp.stack([jnp.cos(x[1]), jnp.sin(x[1])]))
+        >>> print(metric(jnp.array([2.0, 0.5])).diagonal().round(3))  # dr² + r² dθ²
+        [1. 4.]
+    """
 
     def metric(x: Point) -> Float[Array, "d d"]:
         jacobian = jax.jacfwd(parametrisation)(x)
@@ -33,13 +39,23 @@ def pullback(parametrisation: Callable[[Point], Float[Array, " m"]]) -> Metric:
 
 
 def torus(x: Float[Array, " 2"], major: float | Array, minor: float | Array) -> Float[Array, " 3"]:
-    """Return the point of a torus of revolution; x₁ is the angle about the axis, x₂ the angle about the tube."""
+    """Return the point of a torus of revolution; x₁ is the angle about the axis, x₂ the angle about the tube.
+
+    Examples:
+        >>> print(hj.examples.torus(jnp.zeros(2), 2.0, 1.0))
+        [3. 0. 0.]
+    """
     ring = major + minor * jnp.cos(x[1])
     return jnp.stack([ring * jnp.cos(x[0]), ring * jnp.sin(x[0]), minor * jnp.sin(x[1])])
 
 
 def bumpy_torus(x: Float[Array, " 2"]) -> Float[Array, " 3"]:
-    """Return the point of the paper's bumpy torus (Table 1) with the radii 3 + ½cos 10x₁ and 1 + ⅕cos 8x₂."""
+    """Return the point of the paper's bumpy torus (Table 1) with the radii 3 + ½cos 10x₁ and 1 + ⅕cos 8x₂.
+
+    Examples:
+        >>> np.allclose(hj.examples.bumpy_torus(jnp.zeros(2)), [3.5 + 1.2, 0.0, 0.0])
+        True
+    """
     return torus(x, 3 + jnp.cos(10 * x[0]) / 2, 1 + jnp.cos(8 * x[1]) / 5)
 
 
@@ -47,17 +63,32 @@ def torus_field(shape: Sequence[int], major: float = 2.0, minor: float = 1.0) ->
     """Return the metric of a torus of revolution on its periodic chart (0, 2π)²; both axes are ``"periodic"``.
 
     Its Gaussian curvature is cos x₂ / (minor (major + minor cos x₂)).
+
+    Examples:
+        >>> print(hj.examples.torus_field((9, 9)).tensors[0, 0].diagonal().round(3))  # of the outer equator
+        [9. 1.]
     """
     return TensorField.from_function(pullback(partial(torus, major=major, minor=minor)), _periodic_grid(shape))
 
 
 def bumpy_torus_field(n: int) -> TensorField:
-    """Return the metric of the bumpy torus on n × n nodes; both axes are ``"periodic"``."""
+    """Return the metric of the bumpy torus on n × n nodes; both axes are ``"periodic"``.
+
+    Examples:
+        >>> print(hj.examples.bumpy_torus_field(9).tensors[0, 0].diagonal().round(3))  # 4.7² and 1.2²
+        [22.09  1.44]
+    """
     return TensorField.from_function(pullback(bumpy_torus), _periodic_grid((n, n)))
 
 
 def bumpy_torus_mesh(n: int) -> SurfaceMesh:
-    """Return the bumpy torus as a surface of 2n² triangles; vertex i·n + j is node (i, j) of `bumpy_torus_field`."""
+    """Return the bumpy torus as a surface of 2n² triangles; vertex i·n + j is node (i, j) of `bumpy_torus_field`.
+
+    Examples:
+        >>> mesh = hj.examples.bumpy_torus_mesh(9)
+        >>> len(mesh.vertices) - len(mesh.triangulation.edges) + len(mesh.faces)  # Euler's characteristic
+        0
+    """
     nodes = jnp.asarray(_periodic_grid((n, n)).nodes).reshape(-1, 2)
     return SurfaceMesh(jax.vmap(bumpy_torus)(nodes), _periodic_triangles(n))
 
@@ -66,6 +97,11 @@ def sphere_mesh(n: int) -> SurfaceMesh:
     """Return the unit sphere as a subdivided icosahedron with 20n² triangles and 10n² + 2 vertices.
 
     For n = 71 it has 50 412 vertices. The eigenvalues of the sphere are l(l + 1) with the multiplicity 2l + 1.
+
+    Examples:
+        >>> mesh = hj.examples.sphere_mesh(3)
+        >>> len(mesh.vertices) - len(mesh.triangulation.edges) + len(mesh.faces)  # Euler's characteristic
+        2
     """
     require_count("n", n)
     return SurfaceMesh(*geodesic(n, 2))
@@ -79,6 +115,11 @@ def ball_mesh(n: int) -> TetMesh:
 
     Let jₗ be the spherical Bessel functions. With Dirichlet conditions the eigenvalues of the ball are the squares of
     the positive zeros of jₗ; with Neumann conditions they are 0 and those of jₗ'. Each has the multiplicity 2l + 1.
+
+    Examples:
+        >>> mesh = hj.examples.ball_mesh(2)
+        >>> print(mesh.cells.shape, jnp.linalg.norm(mesh.vertices, axis=1).max().round(3))
+        (160, 4) 1.0
     """
     require_count("n", n)
     return TetMesh(*geodesic(n, 3))
@@ -102,13 +143,22 @@ def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
     """Return the unit sphere (K = 1) in its stereographic chart, with n × n nodes on (−half_width, half_width)².
 
     The sides are at the distance 2 arctan(half_width) from the centre; a region around the other pole is missing.
+
+    Examples:
+        >>> print(hj.gaussian_curvature(hj.examples.sphere_field(9))[4, 4].round(3))
+        1.0
     """
     grid = Grid.from_bounds(-half_width, half_width, (n, n))
     return TensorField.from_function(partial(_stereographic, sign=1.0), grid)
 
 
 def hyperbolic_field(n: int, half_width: float = 0.6) -> TensorField:
-    """Return the hyperbolic plane (K = −1) in the Poincaré disk, with n × n nodes on (−half_width, half_width)²."""
+    """Return the hyperbolic plane (K = −1) in the Poincaré disk, with n × n nodes on (−half_width, half_width)².
+
+    Examples:
+        >>> print(hj.gaussian_curvature(hj.examples.hyperbolic_field(9))[4, 4].round(3))
+        -1.0
+    """
     if not 0 < half_width < 0.5**0.5:
         raise ValueError(f"half_width: got {half_width}; expected more than 0 and less than 1/√2, to fit into the disk")
     grid = Grid.from_bounds(-half_width, half_width, (n, n))
@@ -123,6 +173,10 @@ def figure3_fields(n: int) -> dict[str, TensorField]:
     """Return the metrics T¹ … T⁴ of the paper's Fig. 3 on n × n nodes of (−5, 5)².
 
     For f(x) = 1 + 10 exp(−x²): T¹ = diag(f(u₁), 1) (flat), T² = diag(f(u₂), 1), T³ = diag(f(u₂), f(u₁)), T⁴ = f(|u|)·I.
+
+    Examples:
+        >>> print(hj.examples.figure3_fields(9)["T¹"].tensors[4, 4].diagonal())  # f(0) = 11
+        [11.  1.]
     """
 
     def diagonal(entries: Callable[[Array, Array], Sequence[Array]]) -> Metric:
@@ -139,7 +193,13 @@ def figure3_fields(n: int) -> dict[str, TensorField]:
 
 
 def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metric:
-    """Return the metric with constant eigenvalues whose major eigenvector has the given angle to axis 0."""
+    """Return the metric with constant eigenvalues whose major eigenvector has the given angle to axis 0.
+
+    Examples:
+        >>> metric = hj.examples.rotated(lambda u: jnp.pi / 2 + 0 * u[0], major=4.0, minor=1.0)
+        >>> print(metric(jnp.zeros(2)).diagonal().round(3))
+        [1. 4.]
+    """
 
     def metric(u: Point) -> Float[Array, "2 2"]:
         c, s = jnp.cos(2 * angle(u)), jnp.sin(2 * angle(u))
@@ -154,6 +214,11 @@ def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, 
 
     All fields have the same constant trace, determinant and anisotropy; only the directions differ. The centre of the
     circles and spirals is (−0.3, −0.3), outside the square. These and the straight field are flat, the others are not.
+
+    Examples:
+        >>> waves = hj.examples.figure4_fields(9)["waves"]
+        >>> print(jnp.linalg.eigvalsh(waves.tensors[2, 3]).round(3))
+        [1. 4.]
     """
 
     def polar(u: Point) -> Array:
@@ -177,6 +242,10 @@ def degenerate_point_field(index: float, n: int) -> TensorField:
     ½ and θ is the polar angle: T = 10·I + 3|u| [[c, s], [s, −c]] with c = cos(2·index·θ) and s = sin(2·index·θ). For
     z = u₁ ± iu₂ with the sign of the index, and m = |2·index|, c + is = (z/|z|)ᵐ, which is computed without angles. For
     the indices ±½ the field is smooth at the centre. For others it has no derivative there, so its curvature is NaN.
+
+    Examples:
+        >>> hj.degenerate_points(hj.examples.degenerate_point_field(-0.5, 9)).indices
+        array([-0.5])
     """
     m = round(abs(2 * index))
     if m == 0 or abs(m - abs(2 * index)) > 1e-12:
@@ -217,6 +286,11 @@ def phantom(
 
     Returns:
         The tensors (*shape, d, d) in mm²/s, SPD everywhere; the mask (*shape); the spacing per axis in mm.
+
+    Examples:
+        >>> tensors, mask, spacing = hj.examples.phantom((24, 28))
+        >>> print(tensors.shape, np.linalg.eigvalsh(tensors).min() > 0)
+        (24, 28, 2, 2) True
     """
     d = len(shape)
     if d not in (2, 3):

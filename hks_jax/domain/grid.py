@@ -32,6 +32,11 @@ class Grid(ByKey):
 
     Raises:
         ValueError: a bad shape, spacing, origin or mask; an empty mask; a disconnected mask under ``"raise"``.
+
+    Examples:
+        >>> grid = hj.Grid((9, 9), spacing=1 / 8)
+        >>> grid.size, grid.extent
+        (81, (0.0, 1.0, 0.0, 1.0))
     """
 
     shape: tuple[int, ...]
@@ -65,7 +70,12 @@ class Grid(ByKey):
         shape: Sequence[int],
         **kwargs: Any,
     ) -> "Grid":
-        """Return the grid whose first node is at `lower` and whose last node is at `upper`."""
+        """Return the grid whose first node is at `lower` and whose last node is at `upper`.
+
+        Examples:
+            >>> hj.Grid.from_bounds(0, 1, (9, 9))
+            Grid(shape=(9, 9), spacing=(0.125, 0.125), origin=(0.0, 0.0))
+        """
         shape = _checked_shape(shape)
         low, high = _per_axis("lower", lower, len(shape)), _per_axis("upper", upper, len(shape))
         if any(b <= a for a, b in zip(low, high, strict=True)):

@@ -135,6 +135,11 @@ class SurfaceMesh(SimplicialMesh):
     Raises:
         ValueError: wrong shapes; a mask without triangles; indices out of range; vertices without a face; triangles
             without area; NaN; a metric that is not positive definite.
+
+    Examples:
+        >>> triangle = hj.SurfaceMesh(np.eye(3), [[0, 1, 2]])
+        >>> print(triangle.metric[0].tolist())  # the products of two edges of length √2
+        [[2.0, 1.0], [1.0, 2.0]]
     """
 
     _dimension = 2
@@ -169,6 +174,11 @@ class TetMesh(SimplicialMesh):
         ValueError: wrong shapes; a mask without tetrahedra; indices out of range; vertices without a cell; NaN; a
             metric that is not positive definite; tetrahedra that have no volume, are inverted, or overlap across a
             common triangle (with their number and the first one).
+
+    Examples:
+        >>> corner = hj.TetMesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 1, 2, 3]])
+        >>> print(jnp.linalg.det(corner.metric))  # (6 · volume)²
+        [1.]
     """
 
     _dimension = 3

@@ -45,6 +45,11 @@ class TensorField(eqx.Module):
     Raises:
         ValueError: a wrong shape; tensors that are NaN, infinite, unsymmetric or not positive definite inside the mask
             (with their number, the first node and the worst eigenvalue); an unknown interpolation.
+
+    Examples:
+        >>> rectangle = hj.TensorField(field.grid, np.tile(np.diag([4.0, 1.0]), (9, 9, 1, 1)))
+        >>> print(hj.assemble(rectangle).volume.round(3))  # the area, √(4 · 1)
+        2.0
     """
 
     grid: Grid = eqx.field(static=True)
@@ -67,6 +72,12 @@ class TensorField(eqx.Module):
         The field keeps the function, so that curvature and its derivatives are exact; `assemble` evaluates it at the
         nodes, and interpolates between them. Parameters that should be traced belong in a `jax.tree_util.Partial` or an
         Equinox module.
+
+        Examples:
+            >>> grid = hj.Grid.from_bounds(1, 2, (9, 9))
+            >>> half_plane = hj.TensorField.from_function(lambda x: jnp.eye(2) / x[1] ** 2, grid)
+            >>> print(hj.gaussian_curvature(half_plane)[4, 4].round(3))
+            -1.0
         """
         function: Any = fn if isinstance(fn, jtu.Partial | eqx.Module) else jtu.Partial(fn)
         field = cls.__new__(cls)
@@ -97,6 +108,11 @@ class TensorField(eqx.Module):
 
         The metric g is interpolated between the nodes. With ``"log-euclidean"`` the result is the same as if D were
         interpolated.
+
+        Examples:
+            >>> metric = hj.TensorField.from_diffusion(field.grid, field.tensors, metric="inverse")
+            >>> print(jnp.linalg.det(metric.tensors[4, 4]).round(3))  # 1/|D|
+            0.25
         """
         check_metric_choice(metric)
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
@@ -127,6 +143,11 @@ class TensorField(eqx.Module):
 
         Raises:
             ValueError: a wrong shape; NaN or infinite values; a determinant that is not positive; a rank below d.
+
+        Examples:
+            >>> shear = np.tile([[1.0, 1.0], [0.0, 1.0]], (9, 9, 1, 1))
+            >>> print(hj.TensorField.from_deformation(field.grid, shear).tensors[4, 4].tolist())
+            [[1.0, 1.0], [1.0, 2.0]]
         """
         _require_grid(grid)
         C = right_cauchy_green(name, grid, F)
@@ -167,6 +188,11 @@ class TensorField(eqx.Module):
         Raises:
             ValueError: a missing or unknown map; a missing number; a wrong shape; NaN, infinite or unsymmetric tensors;
                 a scale or shift so small that the metric is singular.
+
+        Examples:
+            >>> stress = np.tile(np.diag([1.0, -1.0]), (9, 9, 1, 1))
+            >>> print(hj.TensorField.from_indefinite(field.grid, stress, "shift", 2.0).tensors[4, 4].diagonal())
+            [3. 1.]
         """
         _require_grid(grid)
         chosen = checked_map(how)

@@ -18,7 +18,13 @@ from hks_jax.linear.pencil import SymmetricPencil
 
 
 class Dense(Eigensolver[SymmetricPencil]):
-    """Dense solver: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ. Takes O(n³) time and O(n²) memory; finds all multiplicities."""
+    """Dense solver: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ. Takes O(n³) time and O(n²) memory; finds all multiplicities.
+
+    Examples:
+        >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))
+        >>> print((hj.eigenpairs(flat, k=4, solver=hj.Dense()).eigenvalues / jnp.pi**2).round(1))
+        [0. 1. 1. 2.]
+    """
 
     name: ClassVar[str] = "dense"
     tolerance: float = eqx.field(default=1e-8, static=True)

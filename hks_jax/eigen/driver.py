@@ -79,6 +79,11 @@ def eigenpairs(
     Warns:
         AccuracyWarning: values are concrete, and pairs did not converge, the solver could not confirm that it missed no
             eigenvalue, or k cuts a multiple eigenvalue.
+
+    Examples:
+        >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))
+        >>> print((hj.eigenpairs(flat, k=4).eigenvalues / jnp.pi**2).round(1))  # m² + n² on the unit square
+        [0. 1. 1. 2.]
     """
     pencil = checked_pencil(domain, boundary, mass, quadrature)
     if multiplet not in get_args(MultipletChoice):
@@ -150,6 +155,11 @@ def eigsh(
 
     Warns:
         AccuracyWarning: see `eigenpairs`.
+
+    Examples:
+        >>> K = 2 * np.eye(5) - np.eye(5, k=1) - np.eye(5, k=-1)  # five masses between springs
+        >>> print(hj.eigsh(K, k=3).eigenvalues.round(3))  # 2 − 2 cos(jπ/6)
+        [0.268 1. 2. ]
     """
     return eigenpairs(
         K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress, interval=interval

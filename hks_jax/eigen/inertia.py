@@ -66,6 +66,10 @@ def count_eigenvalues(
     Raises:
         ValueError: σ is not finite, or too close to an eigenvalue (the message has the counts on both sides);
             `eigenpairs` refuses the domain.
+
+    Examples:
+        >>> print(hj.count_eigenvalues(field, 20.0), (pairs.eigenvalues < 20.0).sum())
+        5 5
     """
     require_number("below", below, above=-math.inf)
     return count_below(checked_pencil(domain, boundary, mass), below)

@@ -52,6 +52,10 @@ def weyl_count(
 
     Raises:
         ValueError: λ is negative; the problem has a potential, or no volume; the domain is not that of the problem.
+
+    Examples:
+        >>> print(hj.weyl_count(pairs, [20 * np.pi]).round(1))  # area · λ/4π
+        [10.]
     """
     pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
     d = pencil.space.dimension

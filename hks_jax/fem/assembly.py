@@ -93,6 +93,11 @@ def assemble(
 
     Warns:
         AccuracyWarning: a Dirichlet condition holds at no node of the domain.
+
+    Examples:
+        >>> pencil, one = hj.assemble(field), jnp.ones(81)
+        >>> print((pencil.mass @ one).sum().round(1), jnp.abs(pencil.stiffness @ one).max().round(3))  # area; K1 = 0
+        2.0 0.0
     """
     operator, given = _checked_operator(mass, stiffness, components, potential, density, fields)
     if quadrature not in get_args(Quadrature):

@@ -78,6 +78,10 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
 
     Args:
         inside: (*shape) the nodes of the domain, such as `Grid.inside`.
+
+    Examples:
+        >>> hj.default_boundary(field.grid.inside)
+        ('neumann', 'the domain has no mask')
     """
     if inside.all():
         return "neumann", "the domain has no mask"
@@ -133,6 +137,11 @@ def reflect(field: TensorField, width: int) -> TensorField:
 
     Returns:
         The field on the grid of shape (n₁ + 2·width, …); the mask, if any, is reflected too.
+
+    Examples:
+        >>> wide = hj.reflect(field, 2)
+        >>> np.allclose(wide.tensors[1, 6], field.tensors[1, 4] * jnp.array([[1.0, -1.0], [-1.0, 1.0]]))
+        True
     """
     grid, d = field.grid, field.grid.dimension
     if not 1 <= width <= min(grid.shape) - 1:
@@ -151,7 +160,13 @@ def reflect(field: TensorField, width: int) -> TensorField:
 def crop(
     values: Float[Array | np.ndarray, "*leading_and_enlarged"], grid: Grid
 ) -> Float[Array | np.ndarray, "*leading_and_shape"]:
-    """Return the centre of the trailing axes of ``values``, in the shape of ``grid``: the inverse of `reflect`."""
+    """Return the centre of the trailing axes of ``values``, in the shape of ``grid``: the inverse of `reflect`.
+
+    Examples:
+        >>> wide = hj.reflect(field, 2)
+        >>> np.allclose(hj.crop(wide.tensors[..., 0, 1], field.grid), field.tensors[..., 0, 1])
+        True
+    """
     d = grid.dimension
     excess = [big - n for big, n in zip(np.shape(values)[-d:], grid.shape, strict=True)]
     if min(excess) < 0 or any(e % 2 for e in excess):

@@ -48,6 +48,11 @@ def factorise(
     Raises:
         ValueError: a shift that is not a finite number; a singular matrix (with the number of its null vectors); a
             domain that `eigenpairs` refuses; a doubled domain.
+
+    Examples:
+        >>> A = hj.factorise(np.array([[2.0, 1.0], [1.0, 2.0]]))
+        >>> print(A.solve(jnp.array([3.0, 3.0])).round(), jnp.exp(A.logdet()).round())
+        [1. 1.] 3.0
     """
     return factorised(_shifted(domain, shift, boundary, mass), "domain: K − σM")
 
@@ -67,6 +72,11 @@ class SparseLinearOperator(lx.AbstractLinearOperator):
 
     Attributes:
         matrix: the sparse matrix.
+
+    Examples:
+        >>> A = hj.SparseLinearOperator(np.array([[2.0, 1.0], [1.0, 2.0]]), shift=1.0)
+        >>> print(A.mv(jnp.array([1.0, 2.0])))
+        [3. 3.]
     """
 
     matrix: PatternedOperator
@@ -156,6 +166,12 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
     A `SparseLinearOperator`, multiples and sums of these, and real tridiagonal operators are factorised as sparse
     matrices. All other operators are converted by ``as_matrix`` and take n³ operations; a complex operator takes as
     many as a real one of twice the size. Derivatives are those of lineax. The matrix must be nonsingular.
+
+    Examples:
+        >>> import lineax
+        >>> A = hj.SparseLinearOperator(np.array([[2.0, 1.0], [1.0, 2.0]]))
+        >>> print(lineax.linear_solve(A, jnp.array([3.0, 3.0]), hj.Multifrontal()).value.round(3))
+        [1. 1.]
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> _State:

@@ -79,6 +79,12 @@ class Slabs:
 
     Raises:
         ValueError: a mesh with several axes.
+
+    Examples:
+        >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
+        >>> K, one = slabs.split(hj.assemble(field).stiffness.coefficients, 1), slabs.split(jnp.ones((9, 9, 1)))
+        >>> print(jnp.abs(slabs.product(K, one)).max().round(3))
+        0.0
     """
 
     mesh: Mesh

@@ -69,6 +69,11 @@ def sparse_pencil(
         ValueError: matrices that are not square, differ in size, are complex, NaN, infinite or unsymmetric (the message
             has the entry); a diagonal M with an entry that is not positive; traced indices; null vectors that are
             linearly dependent, or that K does not annihilate (with the residual); another dimension, volume or shape.
+
+    Examples:
+        >>> K = np.array([[1.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])  # a path of three nodes
+        >>> print(hj.eigenpairs(hj.sparse_pencil(K, null_vectors=np.ones((1, 3))), k=3).eigenvalues.round())
+        [0. 1. 3.]
     """
     if isinstance(K, SymmetricPencil):
         if M is not None:

@@ -76,6 +76,12 @@ def fit_metric(
         TypeError: if `init` is neither a grid nor a field.
         ValueError: if the target is NaN, not positive or of the wrong shape, if the grid cannot resolve a time, if an
             option is unknown, or if the checkpoint belongs to another fit.
+
+    Examples:
+        >>> larger = hj.TensorField(field.grid, 1.1 * field.tensors)
+        >>> fit = hj.fit_metric(larger, hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], "conformal")
+        >>> np.allclose(fit.field.tensors, field.tensors, atol=0.01)
+        True
     """
     clock = time.perf_counter()
     if isinstance(init, Grid):

@@ -92,6 +92,12 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         inner_tolerance: the reduction of the linear residual in a step; 30 times smaller if it may be the last.
         inner_steps: the maximum number of products with JᵀJ in a step; three times larger if it may be the last.
         preconditioner: the preconditioner of the conjugate gradients; B by default.
+
+    Examples:
+        >>> import optimistix
+        >>> solution = optimistix.least_squares(lambda x, _: x**2 - 2, hj.inverse.GaussNewton(), jnp.ones(1))
+        >>> round(float(solution.value[0]), 3)
+        1.414
     """
 
     rtol: Float[Array, ""]  # type: ignore[assignment]

@@ -90,6 +90,13 @@ def identifiability(
 
     Raises:
         ValueError: if a problem is given without values, or if n is out of range.
+
+    Examples:
+        >>> larger = hj.TensorField(field.grid, 1.1 * field.tensors)
+        >>> fit = hj.fit_metric(larger, hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], "conformal")
+        >>> found = hj.identifiability(fit, n=4, n_weak=1, iterations=1)
+        >>> print(found.effective.round(1))  # of the four strongest directions
+        4.0
     """
     problem = fit.problem if isinstance(fit, MetricFit) else fit
     values = fit.values if isinstance(fit, MetricFit) and values is None else values

@@ -48,6 +48,12 @@ class Data:
     Raises:
         ValueError: if the signature or loss is unknown, if the noise is not positive, or if a function as loss has a
             deviation.
+
+    Examples:
+        >>> lengths = hj.inverse.Data(signature="eigenvalues")
+        >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.array(1.1))
+        >>> print(hj.fit_metric(field, pairs.eigenvalues, None, scaled, data=lengths).values.round(3))
+        [1.]
     """
 
     signature: str | Signature | Callable[[Eigenpairs], Array] = "hks"

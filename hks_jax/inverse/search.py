@@ -46,6 +46,12 @@ class Search:
 
     Raises:
         ValueError: if the optimiser is unknown or a number is out of range.
+
+    Examples:
+        >>> search = hj.inverse.Search(optimiser="bfgs", tolerance=1e-5)
+        >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.array(1.1))
+        >>> print(hj.fit_metric(field, hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], scaled, search=search).values.round(3))
+        [1.]
     """
 
     optimiser: str | Optimiser = "gauss-newton"

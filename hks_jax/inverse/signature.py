@@ -73,6 +73,11 @@ def wave_kernel(sigma: float | Float[Array, ""]) -> Signature:
 
     Raises:
         ValueError: if the width is not positive.
+
+    Examples:
+        >>> signature = hj.inverse.wave_kernel(0.5)
+        >>> np.allclose(signature.predict(pairs, jnp.array([1.0, 2.0])), hj.wks(pairs, [1.0, 2.0], 0.5))
+        True
     """
     require_number("sigma", sigma)
     return Signature(wks, "e", at_nodes=True, sigma=jnp.asarray(sigma))

@@ -190,6 +190,12 @@ class Free(Unknowns):
         function: maps the parameters to a `TensorField`, or to tensors on the grid of the initial field.
         parameters: the initial parameters, any pytree of floating point arrays.
         init: the initial field with grid and interpolation, which the fit sets.
+
+    Examples:
+        >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.array(1.1))
+        >>> fit = hj.fit_metric(field, hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], scaled)
+        >>> print(fit.values.round(3))
+        [1.]
     """
 
     function: Callable[[Any], Any] = eqx.field(static=True)

@@ -40,6 +40,11 @@ def find_example_brain() -> ExampleBrain | None:
 
     The function reads the wheel's metadata and does not import it. The wheel's version is 1.2.7, its licence
     LGPL-3.0-or-later; install it with ``--no-deps``. It has 13 images at b = 0, 30 at 1000 and 60 at 2000 s/mm².
+
+    Examples:
+        >>> brain = hj.io.find_example_brain()
+        >>> brain is None or brain.images.exists()
+        True
     """
     stem = "b1k_b2k_example_slices_24_38"
     names = (f"{stem}.nii.gz", "b1k_b2k.bval", "b1k_b2k.bvec", f"{stem}_mask.nii.gz")
@@ -92,6 +97,12 @@ def fit_dwi(
         ValueError: the numbers of images, b-values and directions differ; the b-values have another unit; a direction
             of a weighted image does not have length 1; the mask has another shape; there are too few images for the
             fit, or for an estimate of the noise; all residuals of a voxel are zero; there is no signal.
+
+    Examples:
+        >>> files = [folder / name for name in ("dwi.nii", "dwi.bval", "dwi.bvec")]
+        >>> volume = hj.io.fit_dwi(*files, mask=np.ones((2, 2, 2), bool))
+        >>> print(volume.tensors[0, 0, 0].diagonal().round(6))  # mm²/s
+        [0.001 0.001 0.001]
     """
     dti, gradients, segmentation = map(optional, ("dipy.reconst.dti", "dipy.core.gradients", "dipy.segment.mask"))
     name = os.fspath(path)

@@ -84,6 +84,12 @@ def read_tensors(
         ValueError: the file's kind is unknown or its content unreadable; the order or the frame is not declared; shapes
             disagree; `repair` cannot repair the tensors.
         ImportError: an optional library is missing; the message gives the command that installs it.
+
+    Examples:
+        >>> np.save(folder / "tensors.npy", field.tensors)
+        >>> volume = hj.io.read_tensors(folder / "tensors.npy", spacing=1 / 8)
+        >>> print(np.linalg.det(volume.tensors[4, 4]).round(3), volume.spacing)
+        4.0 (0.125, 0.125)
     """
     require_number("confidence", confidence, above=-math.inf)
     if not isinstance(path, str | os.PathLike):
@@ -156,6 +162,12 @@ def save(
     Raises:
         ValueError: the suffix is unknown, or the values have another shape.
         ImportError: an optional library is missing; the message gives the command that installs it.
+
+    Examples:
+        >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
+        >>> path = hj.io.save(folder / "hks.npz", np.array(hj.hks(pairs, [0.5])), volume, name="hks")
+        >>> np.array_equal(np.load(path)["hks"], hj.hks(pairs, [0.5]))
+        True
     """
     file, array = Path(path), np.asarray(values)
     shape = (len(volume.vertices),) if isinstance(volume, SimplicialMesh) else volume.shape
@@ -196,6 +208,12 @@ def save_tensors(
     Raises:
         ValueError: the suffix is unknown; the format is NIfTI for a slice, or NIfTI or NRRD for unsymmetric tensors.
         ImportError: an optional library is missing; the message gives the command that installs it.
+
+    Examples:
+        >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
+        >>> path = hj.io.save_tensors(folder / "tensors.npz", volume)
+        >>> np.array_equal(hj.io.read_tensors(path).tensors, volume.tensors)
+        True
     """
     file = Path(path)
     write = format_of(file, WRITTEN).write_tensors

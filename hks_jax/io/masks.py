@@ -27,6 +27,11 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         FileNotFoundError: the file does not exist.
         ValueError: the kind of file is unknown, a value is not 0 or 1, or the mask has another position.
         ImportError: nibabel (for NIfTI) or pynrrd (for NRRD) is missing.
+
+    Examples:
+        >>> np.save(folder / "mask.npy", field.grid.nodes[..., 0] < 0.5)
+        >>> print(hj.io.read_mask(folder / "mask.npy").sum())  # 4 × 9 nodes
+        36
     """
     name = os.fspath(path)
     values, place = _image(name, affine, IMAGES)
@@ -48,6 +53,10 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
 
     Raises:
         ValueError: the number of iterations is negative, or no voxel is left.
+
+    Examples:
+        >>> print(hj.io.erode(np.pad(np.ones((3, 3), bool), 1)).sum())
+        1
     """
     if iterations < 0:
         raise ValueError(f"iterations: got {iterations}; expected 0 or more")

@@ -59,6 +59,12 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
             touch at coincident vertices; `SurfaceMesh` or `TetMesh` rejects the mesh; with `in_space`, a FreeSurfer
             file does not state the position of its volume.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
+
+    Examples:
+        >>> sphere = hj.examples.sphere_mesh(2)
+        >>> path = hj.io.save(folder / "sphere.ply", np.array(sphere.vertices[:, 2]), sphere, name="height")
+        >>> np.allclose(hj.io.read_mesh(path).vertices, sphere.vertices, atol=1e-6)
+        True
     """
     loaded, said = _load(path, clean, in_space)
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
@@ -93,6 +99,12 @@ def read_mesh_arrays(
         FileNotFoundError: the file does not exist.
         ValueError: the file is not a mesh, or unreadable.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
+
+    Examples:
+        >>> sphere = hj.examples.sphere_mesh(2)
+        >>> path = hj.io.save(folder / "sphere.ply", np.array(sphere.vertices[:, 2]), sphere, name="height")
+        >>> np.allclose(hj.io.read_mesh_arrays(path)["height"], sphere.vertices[:, 2], atol=1e-6)
+        True
     """
     return _load(path, clean)[0].arrays
 

@@ -45,6 +45,11 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
 
     Raises:
         ValueError: the suffix is not ``.npz``.
+
+    Examples:
+        >>> path = hj.io.save_pairs(folder / "pairs.npz", pairs)
+        >>> np.array_equal(np.load(path)["eigenvalues"], pairs.eigenvalues)
+        True
     """
     if not os.fspath(path).endswith(".npz"):
         raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in .npz")
@@ -67,6 +72,11 @@ def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: `save_pairs` did not write the file, or the pairs have a wrong length or do not solve Kφ = λMφ.
+
+    Examples:
+        >>> path = hj.io.save_pairs(folder / "pairs.npz", pairs)
+        >>> np.array_equal(hj.io.load_pairs(path, pairs.pencil).vectors, pairs.vectors)
+        True
     """
     return pairs_of(os.fspath(path), load_npz(path), pencil)
 

@@ -194,6 +194,11 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
     Returns:
         The questions, each with a remedy; empty if no value looks wrong.
+
+    Examples:
+        >>> volume = hj.io.TensorVolume(np.array(field.tensors), (2.0, 2.0), (0.0, 0.0), length_unit="mm")
+        >>> hj.io.questions(volume)[0][:11]  # 2.5 mm²/s is not of tissue
+        'Wrong unit?'
     """
     return reviewed(volume)[1]
 

@@ -46,7 +46,13 @@ _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
-    """Return the voxels inside whose tensor is not finite, not positive definite, or has an eigenvalue < `floor`."""
+    """Return the voxels inside whose tensor is not finite, not positive definite, or has an eigenvalue < `floor`.
+
+    Examples:
+        >>> volume = hj.io.TensorVolume(np.array(field.tensors), (1.0, 1.0), (0.0, 0.0))
+        >>> print(hj.io.find_invalid(volume).sum(), hj.io.find_invalid(volume, floor=2.0).sum())  # eigenvalues 1 and 4
+        0 81
+    """
     if floor is not None:
         require_number("floor", floor, above=-math.inf)
     inside = volume.inside
@@ -101,6 +107,13 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     Raises:
         ValueError: the method is unknown, the floor is not positive, no tensor is valid, or ``"clip"`` meets NaN or
             infinite tensors.
+
+    Examples:
+        >>> tensors = np.array(field.tensors)
+        >>> tensors[4, 4] = np.diag([4.0, -1.0])
+        >>> repaired = hj.io.repair_tensors(hj.io.TensorVolume(tensors, (1.0, 1.0), (0.0, 0.0)), "clip", floor=0.5)
+        >>> print(repaired.tensors[4, 4].diagonal())
+        [4.  0.5]
     """
     if method not in REPAIRS:
         raise ValueError(f"repair: got {method!r}; expected {', '.join(map(repr, REPAIRS))}")
@@ -191,6 +204,13 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
 
     Measured tensors are never exactly equal and isotropic, nor a millionth of the others. Programs such as ANTs write
     such tensors where there is no signal. The result is None for a volume with a mask, and for a constant field.
+
+    Examples:
+        >>> tensors = np.array(field.tensors)
+        >>> tensors[:5] = np.eye(2)
+        >>> found, sentence = hj.io.find_background(hj.io.TensorVolume(tensors, (1.0, 1.0), (0.0, 0.0)))
+        >>> print(found.sum())
+        45
     """
     if volume.mask is not None:
         return None
@@ -236,6 +256,11 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
 
     Raises:
         ValueError: the map is unknown; a tensor is NaN, infinite or unsymmetric; the scale or shift is too small.
+
+    Examples:
+        >>> stress = hj.io.TensorVolume(np.tile(np.diag([1.0, -1.0]), (9, 9, 1, 1)), (1.0, 1.0), (0.0, 0.0))
+        >>> print(hj.io.positive_tensors(stress, "exp", 1.0).tensors[4, 4].diagonal().round(3))
+        [2.718 0.368]
     """
     how = checked_map(how)
     check_number("tensors", how, number)

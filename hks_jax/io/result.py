@@ -36,6 +36,12 @@ class Result:
             *shape) for error bars, the products ``scaled_times`` of λ₁ and t, and ``input_tensors`` if known.
         name: ``"hks"`` or ``"curvature"``.
         source: the file from which the result was read.
+
+    Examples:
+        >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
+        >>> path = hj.io.save(folder / "hks.npz", np.ones((1, 9, 9)), volume, name="hks", extra={"times": [0.5]})
+        >>> hj.io.Result.read(path).grid == field.grid
+        True
     """
 
     place: TensorVolume | SimplicialMesh

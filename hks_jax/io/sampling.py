@@ -24,6 +24,12 @@ def sample_tensors(volume: TensorVolume, points: Any) -> Float[np.ndarray, "n 3 
 
     Raises:
         ValueError: the volume is a slice or has no affine, or no voxel around a point is inside the mask.
+
+    Examples:
+        >>> tensors = np.eye(3) * np.indices((3, 3, 3))[0][..., None, None]
+        >>> volume = hj.io.TensorVolume(tensors, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), affine=np.eye(4))
+        >>> hj.io.sample_tensors(volume, [[0.5, 1.0, 1.0]])[0].diagonal()
+        array([0.5, 0.5, 0.5])
     """
     if volume.affine is None or volume.dimension != 3:
         raise ValueError("volume: got a slice, or a volume without an affine; expected a volume with an affine")

@@ -66,6 +66,12 @@ class TensorVolume:
 
     Raises:
         ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
+
+    Examples:
+        >>> tensors, mask, spacing = hj.examples.phantom((24, 28))
+        >>> volume = hj.io.TensorVolume(tensors, spacing, (0.0, 0.0), mask)
+        >>> volume.dimension, volume.shape
+        (2, (24, 28))
     """
 
     tensors: Float[np.ndarray, "*shape d d"]

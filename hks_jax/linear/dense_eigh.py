@@ -60,6 +60,11 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
         ValueError: entries are not finite, complex, or of another precision; a matrix is not square, or the shapes
             differ; a matrix is unsymmetric by more than √ε of its largest entry; B is not positive definite. Traced
             values are not checked: the result may be NaN, and the symmetric part is used.
+
+    Examples:
+        >>> values, vectors = hj.eigh(jnp.array([[2.0, 1.0], [1.0, 2.0]]))
+        >>> print(values.round())
+        [1. 3.]
     """
     if multiplet_tolerance is not None:
         require_number("multiplet_tolerance", multiplet_tolerance, 1, inclusive=True)

@@ -46,6 +46,12 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
     Raises:
         ValueError: f does not return a real scalar; `eigh` refuses A or B.
         NotImplementedError: a third derivative is requested.
+
+    Examples:
+        >>> root = hj.matrix_function(jnp.array([[2.0, 1.0], [1.0, 2.0]]), jnp.sqrt)
+        >>> print((root @ root).round(3))
+        [[2. 1.]
+         [1. 2.]]
     """
     a, factor = checked_standard_form(A, B)
     elementwise, parameters, others = _with_parameters(f, a)

@@ -44,6 +44,11 @@ def lic_texture(
 
     Raises:
         ValueError: if the field is 3D, `which` is unknown, there are fewer than 2 pixels, or the length is below 1.
+
+    Examples:
+        >>> texture = hj.plot.lic_texture(field, pixels=64)
+        >>> texture.shape, round(float(texture.mean()), 1)  # uniform in (0, 1)
+        ((64, 64), 0.5)
     """
     direction = DirectionField(field, which)
     if pixels < 2 or length < 1:
@@ -111,6 +116,12 @@ def line_integral_convolution(
 
     Raises:
         ValueError: if the field is 3D, or if an option is unknown or out of range.
+
+    Examples:
+        >>> ax = hj.plot.new_figure(3, 3).add_subplot()
+        >>> image = hj.plot.line_integral_convolution(ax, field, values=hj.hks(pairs, [0.5])[0], pixels=64)
+        >>> image.get_array().shape
+        (64, 64, 4)
     """
     require_plane("field", field.grid)
     if not 0 < contrast <= 1:

@@ -56,6 +56,12 @@ def hks_curves(
 
     Raises:
         ValueError: if shapes disagree, or if the nearest node of a point is outside the mask.
+
+    Examples:
+        >>> ax, signature = hj.plot.new_figure(3, 3).add_subplot(), hj.hks(pairs, [0.2, 0.5])
+        >>> (line,) = hj.plot.hks_curves(ax, signature, [0.2, 0.5], field.grid, [(0.5, 0.5)])
+        >>> np.allclose(line.get_ydata(), signature[:, 4, 4])
+        True
     """
     t = checked_times(times, grid.shape, values=values, expansion=expansion)
     curves = np.asarray(values, dtype=np.float64)
@@ -144,6 +150,11 @@ def spectrum(
 
     Raises:
         ValueError: if the pairs do not belong to the domain.
+
+    Examples:
+        >>> count, law = hj.plot.spectrum(hj.plot.new_figure(3, 3).add_subplot(), pairs)
+        >>> print(count.get_ydata().max())
+        12.0
     """
     values = np.asarray(pairs.eigenvalues, np.float64)[np.asarray(pairs.kept)]
     # Each step is drawn from its lower to its upper end.

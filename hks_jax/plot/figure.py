@@ -25,7 +25,12 @@ LABELS = 21
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure, with sizes in inches, that arranges its axes without overlaps."""
+    """Return an empty figure, with sizes in inches, that arranges its axes without overlaps.
+
+    Examples:
+        >>> hj.plot.new_figure(4, 3).get_size_inches()
+        array([4., 3.])
+    """
     return Figure(figsize=(width, height), layout="constrained")
 
 
@@ -36,6 +41,10 @@ def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) 
 
     Raises:
         ValueError: if matplotlib cannot write the format of the suffix.
+
+    Examples:
+        >>> hj.plot.save_figure(hj.plot.new_figure(1, 1), folder / "blank.png").read_bytes()[1:4]
+        b'PNG'
     """
     target = Path(path)
     formats = fig.canvas.get_supported_filetypes()
@@ -165,7 +174,12 @@ def _colour_ticks(bar: Colorbar) -> Locator:
 
 
 def number_text(value: float) -> str:
-    """Return a number as text with three significant digits, with a power of ten if necessary."""
+    """Return a number as text with three significant digits, with a power of ten if necessary.
+
+    Examples:
+        >>> hj.plot.number_text(2 / 3)
+        '0.667'
+    """
     if value == 0 or 1e-3 <= abs(value) < 1e5:
         return f"{float(f'{value:.3g}'):g}"
     mantissa, exponent = f"{value:.2e}".split("e")

@@ -49,6 +49,12 @@ def fit_panels(
 
     Raises:
         ValueError: if the grid is 3D, if target or signature is not one image per time, or if no times are given.
+
+    Examples:
+        >>> larger = hj.TensorField(field.grid, 1.1 * field.tensors)
+        >>> fit = hj.fit_metric(larger, hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], "conformal")
+        >>> len(hj.plot.fit_panels(fit, hj.hks(pairs, [0.2, 0.5])).axes)  # 2 times 3 images, ellipses and the loss
+        8
     """
     grid = fit.field.grid
     require_plane("fit", grid)

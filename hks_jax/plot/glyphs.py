@@ -51,6 +51,11 @@ def ellipses(
 
     Raises:
         ValueError: if the field is 3D, if an option is unknown, or if there is no node to draw.
+
+    Examples:
+        >>> marks = hj.plot.ellipses(hj.plot.new_figure(3, 3).add_subplot(), field, every=1)
+        >>> len(marks.get_offsets())  # one at each node
+        81
     """
     grid = field.grid
     require_plane("field", grid)
@@ -156,6 +161,12 @@ def sensitivity(
 
     Raises:
         ValueError: if the grid is 3D, or if the gradient has another shape or is NaN inside the mask.
+
+    Examples:
+        >>> gradient = jax.grad(lambda T: jnp.log(jnp.linalg.det(T)).sum())(field.tensors)
+        >>> bars = hj.plot.sensitivity(hj.plot.new_figure(3, 3).add_subplot(), field.grid, gradient, every=1)
+        >>> len(bars.get_segments())  # two at each node
+        162
     """
     require_plane("grid", grid)
     array = np.asarray(gradient, dtype=np.float64)
@@ -211,6 +222,12 @@ def degenerate_points(
 
     Raises:
         ValueError: if the field is 3D, merge is less than 1, or the size is not positive.
+
+    Examples:
+        >>> wedge = hj.examples.degenerate_point_field(0.5, 9)
+        >>> marks = hj.plot.degenerate_points(hj.plot.new_figure(3, 3).add_subplot(), wedge)
+        >>> len(marks.get_paths())
+        1
     """
     if not size > 0:
         raise ValueError(f"size: got {size}; expected a positive number, relative to the longer side")

@@ -60,6 +60,11 @@ def scalar_image(
 
     Raises:
         ValueError: if the grid is 3D, or if the values have another shape or none of them is finite inside the mask.
+
+    Examples:
+        >>> ax = hj.plot.new_figure(3, 3).add_subplot()
+        >>> hj.plot.scalar_image(ax, field.grid.nodes[..., 0], field.grid).get_clim()
+        (0.0, 1.0)
     """
     require_plane("grid", grid)
     array = masked("values", values, grid)
@@ -115,6 +120,11 @@ def influence_map(
 
     Raises:
         ValueError: if the grid is 3D, or if the values have another shape.
+
+    Examples:
+        >>> influence = np.exp(-(field.grid.nodes[..., 0] ** 2) / 0.2)
+        >>> hj.plot.influence_map(hj.plot.new_figure(3, 3).add_subplot(), influence, field.grid).get_clim()
+        (0.0, 1.0)
     """
     values = masked("influence", influence, grid)
     image = scalar_image(ax, values, grid, cmap=cmap, vmin=0.0, vmax=1.0, label=label, **kwargs)

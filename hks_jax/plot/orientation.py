@@ -31,6 +31,10 @@ class Orientation(NamedTuple):
         origin: the coordinate of the array's first node, for each axis of the image. These are space coordinates for
             voxels along the axes of space, and coordinates along the voxel axes for oblique voxels.
         view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right).
+
+    Examples:
+        >>> hj.plot.Orientation.of(np.diag([-2.0, 2.0, 2.0, 1.0])).turned  # the first axis runs to the left
+        (True, False, False)
     """
 
     axes: tuple[int, ...]

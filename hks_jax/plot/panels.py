@@ -50,6 +50,11 @@ def hks_panels(
 
     Raises:
         ValueError: if shapes disagree or there is no time.
+
+    Examples:
+        >>> fig = hj.plot.hks_panels(hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], field.grid)
+        >>> [ax.get_title() for ax in fig.axes]
+        ['$t$ = 0.2', '$t$ = 0.5']
     """
     require_plane("grid", grid)
     t = checked_times(times, grid.shape, values=values)
@@ -102,6 +107,11 @@ def time_rows(
 
     Raises:
         ValueError: if there are no rows or times, if values are not one image per time, or if `shared` is unknown.
+
+    Examples:
+        >>> fig = hj.plot.time_rows({"HKS": hj.hks(pairs, [0.2, 0.5])}, [0.2, 0.5], field.grid)
+        >>> len(fig.axes)
+        2
     """
     require_plane("grid", grid)
     if shared not in ("none", "row"):

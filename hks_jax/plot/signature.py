@@ -61,6 +61,13 @@ def signature_panels(
 
     Raises:
         ValueError: if the result is on a mesh.
+
+    Examples:
+        >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
+        >>> report = {"settings": {"boundary": "neumann", "normalisation": "raw"}}
+        >>> values, times = np.array(hj.hks(pairs, [0.2, 0.5])), np.array([0.2, 0.5])
+        >>> len(hj.plot.signature_panels(hj.io.Result(volume, values, times, np.zeros(0), report)).axes)
+        2
     """
     volume, inside, z = result.volume, np.isfinite(result.values[0]), result.z
     grid, box = cropped(volume, inside)

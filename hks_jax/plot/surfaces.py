@@ -55,6 +55,12 @@ def surface(
 
     Raises:
         ValueError: if the values do not have the shape (V,).
+
+    Examples:
+        >>> sphere = hj.examples.sphere_mesh(2)
+        >>> ax = hj.plot.new_figure(3, 3).add_subplot(projection="3d")
+        >>> hj.plot.surface(ax, sphere, sphere.vertices[:, 2]).get_clim()
+        (-1.0, 1.0)
     """
     scalars = np.asarray(values, dtype=np.float64)
     if scalars.shape != (len(mesh.vertices),):
@@ -128,6 +134,12 @@ def isosurfaces(
         ImportError: if PyVista is not installed.
         ValueError: if the grid is not 3D, if the values have another shape or none is finite, if there is no level, if
             the opacity is not in (0, 1], or if the view is zero or along z.
+
+    Examples:
+        >>> grid = hj.Grid.from_bounds(-1, 1, (9, 9, 9))
+        >>> ax, squared = hj.plot.new_figure(3, 3).add_subplot(), (grid.nodes**2).sum(axis=-1)
+        >>> hj.plot.isosurfaces(ax, squared, grid, levels=[0.5]).get_clim()  # a ball
+        (0.0, 3.0)
     """
     require_volume(grid)
     array = masked("values", values, grid)

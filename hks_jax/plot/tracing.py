@@ -81,6 +81,11 @@ def trace(
 
     Returns:
         An (m, 2) array of consecutive points for each seed, or (0, 2) for a seed without a direction.
+
+    Examples:
+        >>> (line,) = hj.plot.trace(field, np.array([[0.5, 0.5]]))
+        >>> print(np.ptp(np.hypot(*(line + 0.3).T)) < 0.01)  # an arc of a circle about (−0.3, −0.3)
+        True
     """
     points = np.asarray(seeds, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
@@ -111,6 +116,11 @@ def evenly_spaced_lines(
         step: the same as for `trace`.
         max_length: the same as for `trace`.
         least_length: the length below which lines are omitted, by default twice the separation.
+
+    Examples:
+        >>> lines = hj.plot.evenly_spaced_lines(field, separation=0.2)
+        >>> print(max(np.ptp(np.hypot(*(line + 0.3).T)) for line in lines) < 0.01)  # arcs of circles
+        True
     """
     if not separation > 0:
         raise ValueError(f"separation: got {separation}; expected a positive length in coordinates")
@@ -246,6 +256,12 @@ def integral_lines(
 
     Raises:
         ValueError: if the field is 3D, an option is unknown, or a size is not positive.
+
+    Examples:
+        >>> ax = hj.plot.new_figure(3, 3).add_subplot()
+        >>> lines = hj.plot.integral_lines(ax, field, seeds=np.array([[0.5, 0.5], [0.2, 0.2]]))
+        >>> len(lines.get_segments())
+        2
     """
     require_plane("field", field.grid)
     if seeds is None:

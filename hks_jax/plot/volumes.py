@@ -31,6 +31,10 @@ def middle_node(inside: Bool[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
 
     Raises:
         ValueError: if no node is inside.
+
+    Examples:
+        >>> hj.plot.middle_node(np.ones((5, 5, 5), bool))
+        (2, 2, 2)
     """
     nodes = np.argwhere(inside)
     if not len(nodes):
@@ -65,6 +69,11 @@ def orthogonal_slices(
     Raises:
         ValueError: if there are not three axes, if the grid is not 3D, if the values have another shape or none is
             finite, or if the node is out of range or has no value.
+
+    Examples:
+        >>> axes, grid = hj.plot.new_figure(6, 2).subplots(1, 3), hj.Grid((5, 5, 5))
+        >>> hj.plot.orthogonal_slices(axes, grid.nodes[..., 0], grid).get_clim()  # of all three
+        (0.0, 4.0)
     """
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
@@ -140,6 +149,12 @@ def volume_panels(
 
     Raises:
         ValueError: if shapes disagree or there is no time, or as in `orthogonal_slices`.
+
+    Examples:
+        >>> grid = hj.Grid((5, 5, 5))
+        >>> fig = hj.plot.volume_panels(np.stack([grid.nodes[..., 0]] * 2), [0.2, 0.5], grid)
+        >>> len(fig.axes)
+        8
     """
     require_volume(grid)
     t = checked_times(times, grid.shape, values=values)

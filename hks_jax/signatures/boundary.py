@@ -52,6 +52,11 @@ def boundary_influence(
 
     Warns:
         AccuracyWarning: as in `eigenpairs` and `hks`.
+
+    Examples:
+        >>> influence = hj.boundary_influence(field, [0.2], k=12)[0]
+        >>> print(influence[0, 0], influence[4, 4] < 1)
+        1.0 True
     """
     if isinstance(domain, Eigenpairs):
         if k is not None or boundary != "neumann":

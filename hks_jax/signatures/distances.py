@@ -33,6 +33,12 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
 
     Returns:
         (n_times, n_sources, *shape) in 1/(metric length)^(d/2); NaN outside the mask.
+
+    Examples:
+        >>> k = hj.heat_kernel(pairs, [0.4], [(0, 0), (8, 8)])[0]
+        >>> d = hj.diffusion_distance(pairs, [0.2], (0, 0))[0, 0, 8, 8]
+        >>> print(jnp.isclose(d**2, k[0, 0, 0] - 2 * k[0, 8, 8] + k[1, 8, 8]))
+        True
     """
     return _distance(pairs, Heat(resolved_times(pairs, 2 * times_of(pairs, times))), sources)
 
@@ -50,6 +56,11 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
 
     Raises:
         ValueError: if a source is outside the domain, if it has several components, or if no eigenvalue is positive.
+
+    Examples:
+        >>> d = hj.biharmonic_distance(pairs, [(0, 0), (8, 8)])
+        >>> print(d[0, 0, 0], jnp.isclose(d[0, 8, 8], d[1, 0, 0]))  # to itself; there and back
+        0.0 True
     """
     known = pairs.null_space_known or not is_traced(jax.lax.stop_gradient(pairs.eigenvalues))
     if known and pairs.n_null > 1:
@@ -69,7 +80,13 @@ def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, 
 
 
 def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
-    """Return the scale-invariant eigenvalues λᵢ·volume^(2/d) (Reuter et al. 2006), or NaN if a pair is not kept."""
+    """Return the scale-invariant eigenvalues λᵢ·volume^(2/d) (Reuter et al. 2006), or NaN if a pair is not kept.
+
+    Examples:
+        >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
+        >>> np.allclose(hj.shape_dna(nine), hj.shape_dna(pairs), atol=1e-2)
+        True
+    """
     values = pairs.eigenvalues
     if normalise:
         dimension = dimension_of(pairs, "ShapeDNA that is normalised")
@@ -82,6 +99,11 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
     """Return φᵢ(x)/√λᵢ for the positive λᵢ (Rustamov 2007), or NaN if a pair is not kept.
 
     The signs and the bases of multiple eigenvalues are arbitrary.
+
+    Examples:
+        >>> u = hj.global_point_signature(pairs)[0].ravel()
+        >>> print((u @ (pairs.pencil.stiffness @ u)).round(3))  # ∫ |∇φ|²/λ
+        1.0
     """
     positive_range(pairs)
     n = pairs.n_null  # raises an error if the null space is not known
@@ -129,6 +151,12 @@ def varadhan_distance(
 
     Warns:
         AccuracyWarning: if distances are NaN, with the cause, or if times are too small for k or for the grid.
+
+    Examples:
+        >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))
+        >>> mirrored = hj.eigenpairs(flat, k=25, boundary="mirror")
+        >>> print(hj.varadhan_distance(mirrored, [0.1], (4, 4))[0, 0, 6, 4:7].round(2))  # 1/4, √5/8, √2/4
+        [0.25 0.28 0.35]
     """
     times = resolved_times(pairs, times)
     nodes, space = source_indices(pairs, sources), pairs.space

@@ -98,6 +98,11 @@ def hks(
 
     Warns:
         AccuracyWarning: if times are too small for the number of pairs or for the grid (see `truncation`).
+
+    Examples:
+        >>> signature = hj.hks(pairs, [0.2, 10.0], normalisation="volume")
+        >>> print(signature[1].min().round(3), signature[1].max().round(3))  # heat has spread evenly
+        1.0 1.0
     """
     if method == "spectral":
         times = resolved_times(pairs, times)
@@ -138,6 +143,10 @@ def hks_auto(
 
     Warns:
         AccuracyWarning: if the methods differ by ten times the tolerance, or if times are too small for the grid.
+
+    Examples:
+        >>> print(hj.hks_auto(pairs, [0.05, 0.5]).spectral)  # the first takes more than 12 pairs
+        [False  True]
     """
     require_number("tolerance", tolerance, 1)
     times = times_of(pairs, times)

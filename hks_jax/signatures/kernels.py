@@ -26,6 +26,10 @@ def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:
 
     Warns:
         AccuracyWarning: if times are too small for the number of pairs or for the grid.
+
+    Examples:
+        >>> print(hj.heat_trace(pairs, [0.2, 10.0])[1].round(3))  # e^0 is left
+        1.0
     """
     return spectral_trace(pairs, Heat(resolved_times(pairs, times)))
 
@@ -43,6 +47,11 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
 
     Raises:
         ValueError: if times are invalid, or if a source is out of range or outside the mask.
+
+    Examples:
+        >>> heat = hj.heat_kernel(pairs, [0.2], (4, 4))[0, 0]
+        >>> print((pairs.pencil.mass @ heat.ravel()).sum().round(3))  # all of it
+        1.0
     """
     return spectral_columns(pairs, Heat(resolved_times(pairs, times)), source_indices(pairs, sources))
 
@@ -63,6 +72,11 @@ def scale_invariant_hks(
 
     Returns:
         (n_frequencies, *shape), dimensionless; NaN outside the mask and at Dirichlet nodes.
+
+    Examples:
+        >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
+        >>> np.allclose(hj.scale_invariant_hks(nine), hj.scale_invariant_hks(pairs), atol=1e-3)
+        True
     """
     if times is None:
         first, last = positive_range(pairs)
@@ -94,6 +108,11 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
 
     Raises:
         ValueError: if only one of energies and sigma is given or one is invalid, or if no eigenvalue is positive.
+
+    Examples:
+        >>> lowest = hj.wks(pairs)[0]
+        >>> print((pairs.pencil.mass @ lowest.ravel()).sum().round(1))  # a mean of φᵢ²
+        1.0
     """
     if (energies is None) != (sigma is None):
         raise ValueError("energies, sigma: got only one; expected both, as from `default_energies`, or neither")
@@ -144,6 +163,11 @@ def spectral_signature(
 
     Raises:
         ValueError: if the parameters have no common leading axis or a source is invalid.
+
+    Examples:
+        >>> signature = hj.spectral_signature(pairs, lambda t, x: jnp.exp(-t * x), jnp.array([0.2, 0.5]))
+        >>> np.allclose(signature, hj.hks(pairs, [0.2, 0.5]), atol=1e-4)
+        True
     """
     dtype = require_pairs(pairs).eigenvalues.dtype
     require_real("parameters", parameters)

@@ -62,6 +62,12 @@ def heat_coefficients(
 
     Raises:
         ValueError: if the domain is not a surface of known area, or if an angle is outside (0, 2π].
+
+    Examples:
+        >>> square = hj.eigenpairs(hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1))), k=4)
+        >>> found = hj.heat_coefficients(square, 1, boundary_length=4.0, corners=[np.pi / 2] * 4)
+        >>> np.allclose(found, [1 / (4 * np.pi), 4 / (8 * np.pi**0.5), 1 / 4])
+        True
     """
     if dimension_of(require_pairs(pairs), "the heat trace") != 2:
         raise ValueError("pairs: got a 3D domain; expected 2D. Pass your own a₀, a₁, a₂, a₃ to `log_determinant`")
@@ -111,6 +117,13 @@ def log_determinant(
 
     Warns:
         AccuracyWarning: if the estimated error exceeds 0.01.
+
+    Examples:
+        >>> m = 4 * np.pi**2 * np.arange(-4, 5) ** 2  # of a circle of length 1
+        >>> K = np.diag(np.add.outer(m, m).ravel())  # of the flat torus, all up to 4π² · 20
+        >>> torus = hj.eigenpairs(hj.sparse_pencil(K, dimension=2, volume=1.0), k=69)
+        >>> round(float(hj.log_determinant(torus, hj.heat_coefficients(torus, 0)).value), 3)  # 4 log η(i)
+        -1.055
     """
     d, dtype = dimension_of(require_pairs(pairs), "the determinant"), pairs.eigenvalues.dtype
     a = jnp.asarray(coefficients, dtype)

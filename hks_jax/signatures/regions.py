@@ -45,6 +45,11 @@ def region_statistics(values: Any, labels: Any, node_volume: float = 1.0) -> Reg
 
     Raises:
         ValueError: if shapes disagree, if labels are not integers or all 0, or if the nodes with values depend on time.
+
+    Examples:
+        >>> labels = np.where(field.grid.nodes[..., 0] < 0.5, 1, 2)
+        >>> hj.region_statistics(labels[None].astype(float), labels).mean
+        array([[1., 2.]])
     """
     require_real("values", values)
     require_real("labels", labels)

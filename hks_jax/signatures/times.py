@@ -86,6 +86,11 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
 
     At the first time the last mode has decayed by the factor 1e-4. At the last, which is not before the first, all
     modes except the constant have decayed by `decay`. The command line uses 1e-2, which pictures still show.
+
+    Examples:
+        >>> times = hj.default_times(pairs, 3)
+        >>> print((times[0] * pairs.eigenvalues[-1]).round(2), (times[-1] * pairs.eigenvalues[1]).round(2))  # 4 ln 10
+        9.21 9.21
     """
     if n < 1:
         raise ValueError(f"n: got {n}; expected at least 1")
@@ -100,6 +105,11 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
     """Return n energies and the width σ of the wave kernel signature (Aubry, Schlickewei and Cremers 2011).
 
     Here σ = 7 (log λ_last − log λ₁)/n. The energies run from log λ₁ + 2σ to log λ_last − 2σ.
+
+    Examples:
+        >>> energies, sigma = hj.default_energies(pairs)
+        >>> print(jnp.isclose(energies[0], jnp.log(pairs.eigenvalues[1]) + 2 * sigma))
+        True
     """
     if n < 29:
         raise ValueError(f"n: got {n}; expected at least 29, so that the range of energies exceeds 4σ")

@@ -103,6 +103,10 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
 
     Raises:
         ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.
+
+    Examples:
+        >>> print(hj.truncation(pairs, [0.02, 0.2]).tail < 0.01)  # whether 12 pairs are enough
+        [False  True]
     """
     pairs, at = _estimated(pairs, times)
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
@@ -289,6 +293,10 @@ def truncation_map(
 
     Raises:
         ValueError: if times are not positive and finite, or if pairs lie in an interval.
+
+    Examples:
+        >>> print(hj.truncation_map(pairs, [0.2]).max() < 1e-5)  # 12 pairs are enough
+        True
     """
     return _map(*_estimated(pairs, times))
 

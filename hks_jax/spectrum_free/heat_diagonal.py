@@ -63,6 +63,10 @@ def hks_spectrum_free(
             then uses selected inversion if memory suffices), if a time is so large that colouring takes about as many
             vectors as nodes, if ``"auto"`` takes more than 8 GB on a mesh, or if `jax.jit` lacks a `Colouring`.
         TypeError: if colouring is used on a mesh.
+
+    Examples:
+        >>> np.allclose(hj.hks_spectrum_free(field, [0.5]), hj.hks(pairs, [0.5]), atol=1e-4)
+        True
     """
     pencil, origin = from_lower_bound(_read_as_unknowns(pencil_of(domain, boundary, mass)))
     times = checked_times(times, pencil.parts[0].stiffness.dtype)
@@ -98,6 +102,11 @@ def colouring(
         ValueError: if arguments are invalid, if the tolerance is below the rounding error, if values are traced, or if
             about as many vectors as nodes are needed.
         TypeError: if the domain is a mesh.
+
+    Examples:
+        >>> colours = hj.colouring(field, [0.05], mass="lumped", tolerance=1e-4)
+        >>> colours.error[0] < 1e-4
+        True
     """
     pencil = _read_as_unknowns(pencil_of(domain, boundary, mass))
     require_grid(pencil)

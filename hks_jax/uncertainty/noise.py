@@ -38,6 +38,11 @@ class TensorNoise(eqx.Module):
     Raises:
         ValueError: The covariance is not positive semidefinite, or has another shape; the correlation is positive and
             there is no grid.
+
+    Examples:
+        >>> noise = hj.TensorNoise(np.tile(np.eye(3), (9, 9, 1, 1)))
+        >>> print(noise.tensors(jnp.ones((9, 9, 3)))[4, 4].tolist())  # one deviation of xx, xy and yy
+        [[1.0, 1.0], [1.0, 1.0]]
     """
 
     covariance: Float[Array, "*shape m m"]
@@ -104,6 +109,11 @@ class TensorNoise(eqx.Module):
             level: the ratio, for example 0.1 for 10 %.
             grid: see `TensorNoise`.
             correlation: see `TensorNoise`.
+
+        Examples:
+            >>> noise = hj.TensorNoise.relative(field.tensors, 0.1)  # of tensors with the trace 5
+            >>> print(jnp.sqrt(noise.covariance[4, 4].diagonal()).round(3))
+            [0.25  0.177 0.25 ]
         """
         require_number("level", level, inclusive=True)
         values = real_array("tensors", tensors)

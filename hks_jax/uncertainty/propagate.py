@@ -136,6 +136,12 @@ def uncertainty(
 
     Warns:
         AccuracyWarning: No intervals are claimed, because noise makes tensors indefinite or acts beyond linear.
+
+    Examples:
+        >>> noise = hj.TensorNoise.relative(field.tensors, 0.1)
+        >>> bars = hj.uncertainty(lambda D: D[4, 4, 0, 0], field.tensors, noise)
+        >>> print(bars.deviation.round(3))  # 0.1 · tr D/2
+        0.25
     """
     measured = real_array("tensors", tensors)
     _check(measured, noise, method, draws, smoothing)

@@ -28,6 +28,11 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
 
     Raises:
         ValueError: The tensors do not have the shape of the grid, or the width is negative.
+
+    Examples:
+        >>> smooth = hj.smooth_tensors(field.grid, field.tensors, width=0.2)
+        >>> np.allclose(np.linalg.det(smooth), 4.0, atol=1e-3)  # no volume is made
+        True
     """
     d, values = grid.dimension, real_array("tensors", tensors)
     if values.shape != (*grid.shape, d, d):

@@ -56,6 +56,12 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         single_precision: whether filters run in float32.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
             all vectors on a part of the grid (docs/devices.md). None is one device.
+
+    Examples:
+        >>> flat = hj.TensorField(hj.Grid((17, 17), 1 / 16), np.tile(np.eye(2), (17, 17, 1, 1)))
+        >>> pairs = hj.eigenpairs(flat, k=4, solver=hj.ChebyshevFilter(block=8))
+        >>> print((pairs.eigenvalues / jnp.pi**2).round(1))
+        [0. 1. 1. 2.]
     """
 
     name: ClassVar[str] = "chebyshev-filter"

@@ -35,6 +35,13 @@ class HostAdjoint(Adjoint[Pencil]):
 
     Attributes:
         tolerance: the error in the energy norm, relative to the largest row.
+
+    Examples:
+        >>> solver = hj.Dense(adjoint=hj.HostAdjoint(tolerance=1e-6))
+        >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
+        >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
+        >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike
+        True
     """
 
     warns: ClassVar[bool] = True

@@ -40,6 +40,11 @@ class ShiftInvert(Eigensolver[Pencil]):
         tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
         max_restarts: the maximal number of implicit restarts.
         basis: the size of the Lanczos basis, more than k (for derivatives, more than 9 + k + k/20). None is 2k + 20.
+
+    Examples:
+        >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
+        >>> np.allclose(sparse.eigenvalues, pairs.eigenvalues, atol=1e-3)
+        True
     """
 
     name: ClassVar[str] = "shift-invert"

@@ -41,6 +41,12 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         tolerance: the relative residual at which a pair counts as converged.
         block: the number of vectors per Lanczos block. Multiplicities may exceed this number.
         slice_size: the number of eigenvalues per slice; None is automatic.
+
+    Examples:
+        >>> K = 2 * np.eye(59) - np.eye(59, k=1) - np.eye(59, k=-1)  # a string of 59 beads
+        >>> values = hj.eigsh(K, k=3, solver=hj.BlockLanczos()).eigenvalues
+        >>> print((values / (jnp.pi / 60) ** 2).round(1))
+        [1. 4. 9.]
     """
 
     name: ClassVar[str] = "block-lanczos"

@@ -92,6 +92,11 @@ def explore(
     Raises:
         ValueError: if shapes disagree, if times do not increase, if no node is finite, if the normalisation is unknown,
             or if there are more numbers than a browser can open.
+
+    Examples:
+        >>> page = hj.plot.explore(hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], field.grid, folder / "page.html")
+        >>> page.read_text(encoding="utf-8")[:15]
+        '<!doctype html>'
     """
     shape, d = ((len(grid.vertices),), 2) if isinstance(grid, SurfaceMesh) else (grid.shape, grid.dimension)
     t = checked_times(times, shape, values=values, deviation=deviation)
