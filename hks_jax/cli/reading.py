@@ -124,8 +124,8 @@ def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str
     for question in asked:
         if getattr(args, "strict_unit", False) and not volume.unit and question == unit_question(volume):
             raise ValueError(
-                f"{args.file}: {as_options(question)}. The subjects of a study must have the same unit. If the numbers "
-                "are right, pass --unit mm2/s, or add a column unit to the table"
+                f"{args.file}: {as_options(question)}. The tensors of all subjects must have the same unit. If the "
+                "numbers are in mm²/s, pass --unit mm2/s, or add a column named unit to the table"
             )
         ask(as_options(question))
     return volume

@@ -176,7 +176,7 @@ def domain_nodes(grid: Grid, wraps: tuple[bool, ...]) -> Bool[np.ndarray, "*shap
 
 
 def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*shape"]) -> Any:
-    """Evaluate a function of position at every node; each array of the result is (*shape, …).
+    """Evaluate a function of position at every node; arrays in the result have the shape (*shape, …) of the grid.
 
     Nodes outside the domain get the value at a node inside. The function may be undefined outside, and a NaN there
     would spoil gradients even if it is masked afterwards.

@@ -25,7 +25,7 @@ class DegeneratePoints(NamedTuple):
 
 
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
-    """Find the points of a 2D field where the eigenvalues are equal, with their index.
+    """Find the points of a 2D field where the two eigenvalues are equal, and the topological index of each.
 
     At these points the vector (T₁₁ − T₂₂, 2T₁₂) vanishes. The vector turns twice as fast as the eigenvectors,
     and is interpolated bilinearly. A cell around which it turns has one zero of index ±½, a wedge or a trisector. Close

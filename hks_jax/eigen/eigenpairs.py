@@ -287,7 +287,7 @@ SPARE = 8
 
 
 def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpairs:
-    """Keep k pairs, or fewer or more so that no multiple eigenvalue is cut.
+    """Keep the lowest k pairs, or a different number if the cut would split a multiple eigenvalue.
 
     ``"report"`` keeps exactly k. If k cuts a multiple eigenvalue, ``"drop"`` excludes its pairs, unless no pair would
     remain; ``"complete"`` includes all its pairs if they were computed, and otherwise drops it.

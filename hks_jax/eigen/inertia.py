@@ -88,7 +88,7 @@ def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadratu
         if int(negative) or not sound:
             what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
             name = "M" if isinstance(part.space, MatrixSpace) else "mass"
-            raise ValueError(f"{name}: got a matrix with {what}, by its inertia; expected a positive definite matrix")
+            raise ValueError(f"{name}: got a matrix with {what} by its inertia; expected a positive definite one")
     return pencil
 
 
@@ -112,7 +112,7 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
                 return under
             raise ValueError(
                 f"below: got {float(shift):.15g}, which is too close to an eigenvalue; {int(under)} eigenvalues are "
-                f"below {low:.12g} and {int(over)} are below {high:.12g}. Count below one of these numbers"
+                f"below {low:.12g} and {int(over)} are below {high:.12g}. Use one of these two bounds"
             )
     raise ValueError(
         f"below: got {float(shift):.15g}, at which rounding in {shift.dtype} leaves the count uncertain. "

@@ -115,7 +115,7 @@ class Slabs:
         return (self.thickness * self.mesh.size, *self.shape[1:])
 
     def spec(self, axis: int) -> PartitionSpec:
-        """Return the partition of arrays whose ``axis`` is the first axis of the grid."""
+        """Return the `PartitionSpec` of arrays whose dimension number ``axis`` is the first axis of the grid."""
         return PartitionSpec(*[None] * axis, self.name)
 
     def split(self, x: Any, axis: int = 0) -> Array:

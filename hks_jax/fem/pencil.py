@@ -83,7 +83,10 @@ class Pencil(SymmetricPencil):
             ValueError: a matrix with another sparsity pattern.
         """
         if stiffness.pattern != self.pattern:
-            raise ValueError("stiffness: got a matrix with another pattern; use `sparse_pencil` for any two matrices")
+            raise ValueError(
+                "stiffness: got a matrix whose sparsity pattern is not that of the pencil; use `sparse_pencil` for "
+                "matrices of other patterns"
+            )
         return Pencil(stiffness, self.mass, self.metric, self.volume, self.space, row_sums=self.row_sums)
 
     def counted_from(self, origin: Float[Array, ""]) -> "Pencil":

@@ -125,7 +125,8 @@ def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[A
         sizes = np.linalg.svd(np.asarray(vectors) / np.where(lengths > 0, lengths, 1), compute_uv=False)
         if sizes[-1] < np.finfo(vectors.dtype).eps ** 0.25:
             raise ValueError(
-                f"null_vectors: got dependent vectors, whose least singular value is {sizes[-1]:.2g} at length 1; "
+                "null_vectors: got linearly dependent vectors (the least singular value of their matrix, after "
+                f"normalisation, is {sizes[-1]:.2g}); "
                 "expected a basis. Orthogonalise the vectors, and leave out zero vectors"
             )
     require_null_space(SymmetricPencil(pencil.stiffness, pencil.mass, null_space=NullSpace(vectors)))

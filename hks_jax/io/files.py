@@ -72,9 +72,9 @@ def read_tensors(
         spacing: the spacing for NumPy's files that do not contain it.
         confidence: in NRRD's masked kinds, a voxel with a larger confidence than this is inside the mask.
         repair: the repair of tensors inside the mask that are not positive definite; see `repair_tensors`. If None, the
-            tensors stay unchanged, and making a metric of them raises an error.
-        unit: the unit of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``,
-            from which they are converted to mm²/s. None leaves the numbers unchanged.
+            tensors stay unchanged, but no metric can be made from them.
+        unit: the unit of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``.
+            They are converted from this unit to mm²/s; None leaves the numbers unchanged.
 
     Returns:
         The tensors along the voxel axes; `questions` reports a frame or a unit that looks wrong.

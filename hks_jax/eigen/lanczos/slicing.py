@@ -1,10 +1,10 @@
 """Spectrum slicing: the lowest eigenpairs of a pencil, slice by slice, with a certificate that none is missed.
 
 Each slice factorises K − σM at a shift σ slightly above the known eigenvalues. The inertia gives the number of
-eigenvalues below σ. Block Lanczos, kept orthogonal to the known eigenvectors close to σ, finds the missing ones and
-about as many above σ. Converged pairs become known. The certificate is a last factorisation at a shift above the wanted
-eigenvalues: its inertia equals the number of known eigenvalues below. Small slices keep orthogonalisation cheap for any
-number of wanted pairs.
+eigenvalues below σ. Block Lanczos finds the eigenvectors below σ that are not known yet, and about as many above σ.
+Its basis is kept orthogonal to the known eigenvectors close to σ. Converged pairs become known. The certificate is a
+last factorisation at a shift above the wanted eigenvalues: its inertia equals the number of known eigenvalues below.
+Small slices keep orthogonalisation cheap for any number of wanted pairs.
 """
 
 from functools import partial
