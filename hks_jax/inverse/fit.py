@@ -123,7 +123,7 @@ def fit_metric(
         )
     elif noise is not None and result in ("converged", "stalled") and misfit > noise**2:
         warn_of_accuracy(
-            f"noise: the fit {result} with residuals of {(2 * misfit) ** 0.5:.2g}, larger than {noise:.2g}, the given noise. "
+            f"noise: the fit {result} with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise {noise:.2g}. "
             "The fitted metric does not explain the target, and its differences from init may be artefacts. Use "
             'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise='
         )
