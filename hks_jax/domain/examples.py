@@ -217,7 +217,7 @@ def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, 
 
     Examples:
         >>> waves = hj.examples.figure4_fields(9)["waves"]
-        >>> print(jnp.linalg.eigvalsh(waves.tensors[2, 3]).round(3))
+        >>> print(np.linalg.eigvalsh(waves.tensors[2, 3]).round(3))
         [1. 4.]
     """
 

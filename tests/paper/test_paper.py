@@ -128,7 +128,7 @@ def test_counts_of_triangles_on_known_lengths():
 
 
 def test_unknown_items_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"only: got 'figure7', 'table'; expected some of table1, figure1"):
+    with pytest.raises(ValueError, match=r"only: got 'figure7', 'table'; expected names from table1, figure1"):
         run(tmp_path, only=["figure7", "table1", "table"])
 
 
