@@ -77,6 +77,7 @@ def orders(errors):
     return np.log2(errors[0] / errors[1])
 
 
+@pytest.mark.slow
 def test_sphere_and_its_order():
     """l(l + 1): fourth order with curved sides, second with straight ones; nodes in the middles of edges are nodes."""
     curved, straight = [], []

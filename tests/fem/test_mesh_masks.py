@@ -11,7 +11,7 @@ import hks_jax as hj
 pytestmark = pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 
 
-@pytest.fixture(params=["surface", "solid"])
+@pytest.fixture(params=["surface", pytest.param("solid", marks=pytest.mark.slow)])
 def whole(request):
     """A mesh's class, vertices and cells, and a mask of its vertices that cuts a corner off."""
     if request.param == "solid":

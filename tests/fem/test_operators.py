@@ -157,7 +157,8 @@ def test_derivatives_of_signatures_by_potential_and_density(rng):
     np.testing.assert_allclose(jnp.einsum("t...ij,...ij->t", by_tensors, turn), slope, rtol=1e-5)
 
 
-@pytest.mark.parametrize("sign", [-1, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("sign", [-1, 1])
 def test_doubled_domain_with_a_potential(rng, sign):
     """The four problems of "mirror", each with an origin of its own, make up the torus with the potential reflected."""
     n = 9

@@ -26,7 +26,7 @@ def quietly(*args, **settings):
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("rank", [1, None])
+@pytest.mark.parametrize("rank", [pytest.param(1, marks=pytest.mark.slow), None])
 def test_noise_has_the_covariance_asked_for(rng, d, rank):
     m = d * (d + 1) // 2
     covariance = random_covariance(rng, (4,), m, rank)
@@ -143,6 +143,7 @@ def test_noise_of_modes_is_shared_as_they_are(rng):
         hj.TensorNoise.from_modes(modes, grid, unknowns=31)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")  # of a few of the measurements, by chance
 def test_intervals_contain_the_truth_as_often_as_they_say(rng):
     grid = hj.Grid((7, 7), mask=np.add.outer((np.arange(7) - 3) ** 2, (np.arange(7) - 3) ** 2) < 12)
