@@ -102,7 +102,8 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
             saved_pairs.write_pairs(args.output / PAIRS, solved, image, progress.warnings)
     result = signature_of(args, solved, progress)
     drawing = partial(signature_panels, result, view=args.view, through=args.through)
-    return write_outputs(args.output, result, progress, drawing, image)
+    done = write_outputs(args.output, result, progress, drawing, image)
+    return done._replace(files=[*done.files, *[args.output / PAIRS] * args.save_pairs])
 
 
 def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:

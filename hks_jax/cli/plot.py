@@ -34,7 +34,7 @@ result RESULT  the result, as an .npz or the folder of a signature
     numbers LOW,HIGH (write --range=LOW,HIGH if LOW is negative)
 --quantiles Q,Q = 0,1  quantiles of the values at the ends of own and shared ranges
 --cmap NAME = viridis  colour map of matplotlib
---scaled  draw curves of (4πt)^(d/2)·HKS, which is 1 for flat space
+--scaled  draw (4πt)^(d/2)·HKS, which is 1 for flat space (with --normalisation flat, this is always drawn)
 --unit TEXT  unit of t
 --title TEXT  title of the picture
 --dpi DPI = 150  pixels per inch
@@ -59,6 +59,16 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     result = Result.read(args.result, args.array)
     chosen = _choose_times(result, args)
     result = replace(result, values=result.values[chosen], times=result.times[chosen[: result.times.size]])
+    normalisation = result.settings.get("normalisation", "raw")
+    if args.scaled:
+        if not result.times.size or normalisation not in ("raw", "flat"):
+            raise ValueError(
+                f"--scaled: got {args.result} with the normalisation {normalisation}; expected raw or flat, and "
+                "times. Leave this option out"
+            )
+        if normalisation == "raw":
+            result = replace(result, values=result.values * result.flat_scale)
+    args.scaled = args.scaled or normalisation == "flat"
     figure = _panels(result, args) if args.points is None else _curves(result, args)
     save_figure(figure, args.output, dpi=args.dpi)
     values = {"least": float(np.nanmin(result.values)), "greatest": float(np.nanmax(result.values))}
@@ -126,7 +136,7 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_curves, new_figure
     from hks_jax.plot.signature import placed
 
-    values, volume = result.values, result.volume
+    values, volume = result.values / (result.flat_scale if args.scaled else 1), result.volume
     grid, d = result.grid, volume.dimension
     orientation = placed(volume, None, "neurological")
     if orientation is not None:  # points are in the coordinates of the images' axes

@@ -118,7 +118,7 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
         },
         "lambda1_t": {"Description": "t times the first positive eigenvalue, equal for all subjects"},
         "t": {"Description": "time in (metric length)²; in s for the metric D⁻¹ with D in mm²/s", **unit},
-        "mean": {"Description": f"mean of {values} over the region's voxels in the domain"},
+        "mean": {"Description": f"mean over the region's voxels in the domain: {values}"},
         "std": {"Description": "standard deviation over these voxels (the root of the mean square deviation)"},
         "median": {"Description": "median over these voxels"},
         "error": {"Description": "standard deviation of the mean due to the noise of the tensors"},

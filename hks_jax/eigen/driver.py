@@ -96,7 +96,7 @@ def eigenpairs(
         if not isinstance(k, int | float | np.number) or k != k // 1 or not 1 <= k <= total:
             raise ValueError(
                 f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
-                "Use a smaller k or a finer grid, or give an interval"
+                "Use a smaller k or a finer grid"
             )
         pairs = _lowest(pencil, int(k), solver, multiplet, throw, report)
     gauge = pairs.eigenvalues, pairs.next_eigenvalue, pairs.kept, pairs.part, pairs.pencil

@@ -181,7 +181,9 @@ def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra:
         raise ValueError(f"extra: got {', '.join(others)}, but NIfTI allows only times. Write an .npz as well")
     if "times" in extra:
         sources = [Path(volume.source).name] if volume.source else []
-        write_json(sidecar_of(path), {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources})
+        about = {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources}
+        settings = json.loads(record).get("settings")
+        write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)

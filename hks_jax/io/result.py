@@ -152,12 +152,16 @@ class Result:
         """The difference from flat space or, for other normalisations, from the median, in standard deviations."""
         if "deviation" not in self.arrays:
             return None
-        ones, normalisation = (-1, *[1] * (self.values.ndim - 1)), self.settings["normalisation"]
-        if normalisation in ("raw", "flat"):
-            reference = (4 * np.pi * self.times) ** (0 if normalisation == "flat" else -(self.values.ndim - 1) / 2)
-        else:
-            reference = np.nanmedian(self.values.reshape(len(self.values), -1), axis=1)
-        return (self.values - reference.reshape(ones)) / self.arrays["deviation"]
+        normalisation = self.settings["normalisation"]
+        flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
+        median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
+        return (self.values - flat.get(normalisation, median)) / self.arrays["deviation"]
+
+    @property
+    def flat_scale(self) -> Float[np.ndarray, "n_times ..."]:
+        """(n_times, 1, …), the factor (4πt)^(d/2) of the normalisation ``"flat"`` of a grid of d dimensions."""
+        d = self.values.ndim - 1
+        return (4 * np.pi * self.times.reshape(-1, *[1] * d)) ** (d / 2)
 
     @property
     def unit(self) -> str:

@@ -2,15 +2,17 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import nibabel as nib
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.cli import outputs as outputs_module
-from hks_jax.io import TensorVolume, save, save_tensors
+from hks_jax.io import Result, TensorVolume, save, save_tensors
 
 SHAPE = (14, 12)
 
@@ -156,6 +158,24 @@ def test_plot_draws_what_is_asked_for(result, tmp_path, capsys, arguments, times
     assert summary["files"] == [str(picture)]
     assert min(png_size(picture)) > 100
     assert [p.name for p in picture.parent.iterdir()] == ["p.png"]
+
+
+@pytest.mark.parametrize("points", [[], ["--points", "1.5,4", "3,7"]])
+def test_a_raw_signature_is_scaled_once_and_a_flat_one_never(result, tmp_path, capsys, points):
+    raw = Result.read(result)
+    drawn = {}
+    for normalisation, values in (("raw", raw.values), ("flat", raw.values * raw.flat_scale), ("volume", raw.values)):
+        folder, report = tmp_path / normalisation, {"settings": {"normalisation": normalisation}}
+        folder.mkdir()
+        replace(raw, values=values, report=report).save(folder / "hks", "")
+        for scaled in ([], ["--scaled"]):
+            code = main(["plot", str(folder), "-o", str(tmp_path / "p.png"), "--dpi", "60", "-q", *points, *scaled])
+            drawn[normalisation, bool(scaled)] = code or imread(tmp_path / "p.png")
+    np.testing.assert_allclose(drawn["raw", True], drawn["flat", True], atol=0.02)
+    np.testing.assert_array_equal(drawn["flat", False], drawn["flat", True])
+    assert not np.array_equal(drawn["raw", False], drawn["raw", True])
+    assert drawn["volume", True] == 2
+    assert "--scaled: got " in capsys.readouterr().err
 
 
 def test_plot_of_a_volume(tmp_path, capsys):

@@ -335,7 +335,10 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
     assert "1 of 4 subjects failed (sub-04)" in printed
     assert "sub-04 failed: " in printed
     mean = np.median(np.trace(tensors(), axis1=-2, axis2=-1)) / 3
-    assert f"If the numbers are in um2/s, the median is {mean:.3g}: try --unit um2/s. The subjects" in printed
+    assert (
+        f"If the numbers are in um2/s, the median is {mean:.3g}: try --unit um2/s. The tensors of all subjects"
+        in printed
+    )
     # The determinant of the last is positive, and so few voxels do not tell.
     assert [line for line in printed.splitlines() if line.startswith("warning: sub-06: The NIfTI file does not")]
     assert "sub-01: The NIfTI file does not declare" not in printed
@@ -376,7 +379,7 @@ def test_a_subject_is_done_again_when_its_sidecar_changes(study):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("id\tfile\n1\tt.nii\n", "no participant_id in row 2"),
+        ("id\tfile\n1\tt.nii\n", "got the columns id, file; expected a column participant_id"),
         ("participant_id\tfile\nsub-1\ta\n1\tb\n", "two rows for sub-1"),
         ("participant_id\tfile\nsub-a_b\ta\n", "only letters and digits"),
         ("participant_id,file\n", "separated by tabs"),

@@ -169,13 +169,16 @@ def _suitable(
     if args.metric == "adjugate":
         raise ValueError("--times: automatic times in a study need the metric inverse or tensor. Choose the times")
     ranges: dict[str, Range] = {}
+    first = ""
     silent = StudyProgress(1, True, io.StringIO())  # warnings are shown when the subject is computed
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
-        with suppress(Exception):  # errors are reported when the subject is computed
+        try:
             ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
+        except Exception as error:  # reported when the subject is computed
+            first = first or f"{subject.name}: {error}"
     if not ranges:
-        raise ValueError("--times: no subject can be read, so no times can be chosen. Pass --times to see all errors")
+        raise ValueError(f"--times: no subject can be read, so no times can be chosen. The first error: {first}")
     times = common_times(ranges, count, args.time_unit)
     progress.end(f"times that suit all subjects ({len(ranges)}): {', '.join(f'{t:g}' for t in times)}")
     return times

@@ -182,7 +182,7 @@ class Study:
             columns = list(dict.fromkeys(name for _, rows in tables for row in rows for name in row))
             joined = [(*who, *map(row.get, columns)) for who, rows in tables for row in rows]
             about = read_json(self.path(done[0], f"{REGIONS}.json"))
-            described = {name: about[name] for name in columns if name in about}
+            described = {name: about[name] for name in (*columns, "Settings") if name in about}
             files += write_table(self.folder / "group_regions.tsv", (*head, *columns), joined, described)
         return files
 

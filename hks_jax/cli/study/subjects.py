@@ -63,6 +63,9 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     rows, parser = read_table(path), _RowParser(add_help=False)
     add_options(parser, f"@file {READING} @noise @atlas @names")
     subjects: dict[str, Subject] = {}
+    if not any("participant_id" in row for row in rows):
+        names = ", ".join(dict.fromkeys(name for row in rows for name in row))
+        raise ValueError(f"{path}: got the columns {names or 'none'}; expected a column participant_id")
     for number, row in enumerate(rows, 2):
         if "participant_id" not in row:
             raise ValueError(f"{path}: got no participant_id in row {number}; expected one in every row")
