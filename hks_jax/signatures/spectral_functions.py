@@ -206,7 +206,7 @@ def _tangent(
 
     def inner(some: Filter) -> Array:
         _, of_f, of_lambda_f, matters = mixing(some, values, kept, fixed)
-        return contraction.mixed(of_f * stiffness - of_lambda_f * mass, read, matters)
+        return contraction.mixed(of_f * stiffness[None] - of_lambda_f * mass[None], read, matters)
 
     together = min(_FILTERS, len(weights))
     starts, place = row_blocks(len(weights), together)

@@ -222,7 +222,9 @@ def test_counts_are_right_at_eigenvalues_of_parts_of_the_domain(rng):
     assert np.mean(counts == true) > 0.95
     np.testing.assert_array_equal(counts[counts != true], -1)
     assert int(hj.count_eigenvalues(pencil, float(shifts[3]))) == true[3]
-    with pytest.raises(ValueError, match=r"below: got .* is too close to an eigenvalue; \d+ .* below one of these"):
+    with pytest.raises(
+        ValueError, match=r"below: got .* is too close to an eigenvalue; \d+ .* Use one of these two bounds"
+    ):
         hj.count_eigenvalues(pencil, 0.0)
     # On which side of an eigenvalue a number is that agrees with it to rounding, factorisations may see differently.
     at_one = jax.jit(partial(hj.count_eigenvalues, pencil))

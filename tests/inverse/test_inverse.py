@@ -439,7 +439,9 @@ def test_error_bars_of_a_fit_are_those_of_its_posterior():
     np.testing.assert_allclose(
         found.tensors[..., 0, 0].ravel(), np.exp(fit.values[:, 0]) * found.values[:, 0], rtol=1e-10
     )
-    with pytest.raises(ValueError, match=r"deviation: 14 of 84 .* not positive numbers \(the first at \(0, 0, 1\)"):
+    with pytest.raises(
+        ValueError, match=r"deviation: got 14 of 84 .* not positive numbers \(the first is 0 at \(0, 0, 1\)"
+    ):
         hj.fit_metric(
             init, target, [0.15, 0.4], data=Data(deviation=np.where(np.arange(6) % 7 == 1, 0, 0.1)[: target.shape[-1]])
         )
