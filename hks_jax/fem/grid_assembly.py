@@ -95,7 +95,7 @@ def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> An
         at_corners = (nodal * known)[cells].reshape(-1, n, d * d)
         return np.matmul(h, at_corners).reshape(-1, n, d, d)
 
-    def integrals(flux: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, ...]:
+    def integrals(flux: np.ndarray, root: np.ndarray) -> tuple[Any, ...]:
         of_elements = flux.reshape(len(cells), -1) @ of_stiffness, root @ of_mass
         sums = (np.bincount(places.ravel(), each.ravel(), 3**d * domain.size) for each in of_elements)
         stiffness, mass = (each.astype(dtype).reshape(3**d, *shape) for each in sums)
