@@ -201,7 +201,7 @@ class _LinearMap(NamedTuple):
             if not self.tangent:
                 return jax.tree.leaves(self.program(*known, *x))
             n = len(known) - len(x)
-            return jax.tree.leaves(jax.jvp(lambda *x: self.program(*known[:n], *x), known[n:], x)[1])
+            return jax.tree.leaves(jax.jvp(lambda *x: self.program(*known[:n], *x), tuple(known[n:]), x)[1])
 
         return list(jax.linear_transpose(forward, *self.x)(rest)) if self.transposed else forward(*rest)
 

@@ -89,10 +89,11 @@ def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> An
     of_stiffness = np.einsum("q,qia,qjb->qabij", weights, gradients, gradients).reshape(-1, n * n)
     of_mass = np.einsum("q,qi,qj->qij", weights, h, h).reshape(-1, n * n)
     coupled = np.ones((), bool) if couplings is None else couplings
-    known = np.where(spd.is_spd(nodes), 1, np.nan).astype(dtype)[:, None, None]
+    # Nodes outside the domain have no influence, whatever their tensors are.
+    known = np.where(domain.ravel(), np.where(spd.is_spd(nodes), 1, np.nan), 0).astype(dtype)[:, None, None]
 
     def inside(nodal: np.ndarray) -> np.ndarray:
-        at_corners = (nodal * known)[cells].reshape(-1, n, d * d)
+        at_corners = (np.where(known == 0, 0, nodal) * known)[cells].reshape(-1, n, d * d)
         return np.matmul(h, at_corners).reshape(-1, n, d, d)
 
     def integrals(flux: np.ndarray, root: np.ndarray) -> tuple[Any, ...]:
