@@ -94,7 +94,7 @@ def result_of(
 
 
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times, at the last of which the non-constant modes have decayed to the factor `SHOWN`."""
+    """Return n default times; at the last, the non-constant modes have decayed to the factor `SHOWN`."""
     return tuple(np.asarray(hj.default_times(pairs, n, SHOWN), np.float64).tolist())
 
 

@@ -93,7 +93,7 @@ def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> An
     known = np.where(domain.ravel(), np.where(spd.is_spd(nodes), 1, np.nan), 0).astype(dtype)[:, None, None]
 
     def inside(nodal: np.ndarray) -> np.ndarray:
-        at_corners = (np.where(known == 0, 0, nodal) * known)[cells].reshape(-1, n, d * d)
+        at_corners = (nodal * known)[cells].reshape(-1, n, d * d)
         return np.matmul(h, at_corners).reshape(-1, n, d, d)
 
     def integrals(flux: np.ndarray, root: np.ndarray) -> tuple[Any, ...]:

@@ -201,7 +201,7 @@ def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
 def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
     """Return n log-spaced times in the intersection of all subjects' ranges, rounded to three digits.
 
-    For the unit ``"lambda1"``, the function returns products λ₁t, the largest of which is `LAST`.
+    For the unit ``"lambda1"``, the function returns products λ₁t; the largest product is `LAST`.
     """
     if unit == "lambda1":
         ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}

@@ -93,7 +93,7 @@ def definite_product(
 
 
 def first_beyond(values: Values) -> Scalar:
-    """Estimate Λ, the first eigenvalue on the complement, given computed eigenvalues of which the last is positive."""
+    """Estimate Λ, the first eigenvalue on the complement, given computed eigenvalues; the last must be positive."""
     return values[-1] * (1 + 1 / values.size)
 
 

@@ -78,7 +78,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         return max((n_dof - 16 * self.block) // 4, 0)
 
     def plan(self, k: int, nulls: int = 0) -> Plan:
-        """Return the sizes of a computation of k eigenvalues, of which the first ``nulls`` are zero."""
+        """Return the sizes of a computation of k eigenvalues; the first ``nulls`` eigenvalues are zero."""
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
         return Plan(k, self.block, size, 3 * slices + 12, self.tolerance, nulls)
