@@ -40,7 +40,7 @@ def jit_quickly(
     """Return a decorator like `jax.jit`, or `equinox.filter_jit`, that compiles faster on CPUs.
 
     The options apply only to calls outside `jax.jit`, because XLA compiles an enclosing function as a whole. If the
-    environment variable XLA_FLAGS sets one of the options, the decorator sets none.
+    environment variable XLA_FLAGS sets one of them, the function is compiled without options.
 
     Args:
         jit: the decorator that compiles.
@@ -62,12 +62,12 @@ def jit_quickly(
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
-            if is_staged() or not _understood():
+            if is_staged() or jax.default_backend() != "cpu":
                 return usual(*args, **kwargs)
             bound = signature.bind(*args, **kwargs)
             if not linear and not is_traced((args, kwargs)):
                 found = _apply(numpy_rule, bound.args, None, None)
-                return quick(*args, **kwargs) if found is None else found
+                return found if found is not None else (quick if _understood() else usual)(*args, **kwargs)
             given = {name: None if name in static else x for name, x in bound.arguments.items()}
             moved = [jax.tree.map(partial(is_moved, name), x) for name, x in given.items()]
             parts = eqx.partition(list(given.values()), moved)[::-1]
@@ -135,8 +135,8 @@ def known_here(args: Any) -> bool:
 
 @cache
 def _understood() -> bool:
-    """Return whether the backend is a CPU whose compiler accepts the options, and XLA_FLAGS sets none of them."""
-    if jax.default_backend() != "cpu" or any(option in os.environ.get("XLA_FLAGS", "") for option in _OPTIONS):
+    """Return whether the compiler accepts the options, and XLA_FLAGS sets none of them."""
+    if any(option in os.environ.get("XLA_FLAGS", "") for option in _OPTIONS):
         return False
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options=_OPTIONS).lower().compile()
@@ -214,12 +214,15 @@ class _LinearMap(NamedTuple):
 
 
 def _is_inexact(leaf: Any) -> bool:
-    return jax.dtypes.issubdtype(leaf.dtype, np.inexact)
+    return jax.dtypes.issubdtype(jax.typeof(leaf).dtype, np.inexact)
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=_OPTIONS)
-def _quick(function: Callable[..., Any], *leaves: Any) -> Any:
+def _call(function: Callable[..., Any], *leaves: Any) -> Any:
     return function(*leaves)
+
+
+_usual = jax.jit(_call, static_argnums=0)
+_quick = jax.jit(_call, static_argnums=0, compiler_options=_OPTIONS)
 
 
 def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
@@ -232,11 +235,11 @@ def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | No
 def _computed(function: _Program | _LinearMap, *leaves: Any) -> Any:
     with jax.core.eval_context():
         found = function.by_numpy(*leaves)
-        return _quick(function, *leaves) if found is None else found
+        return found if found is not None else (_quick if _understood() else _usual)(function, *leaves)
 
 
 def _shapes(leaves: Sequence[Any]) -> tuple[jax.ShapeDtypeStruct, ...]:
-    return tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+    return tuple(jax.ShapeDtypeStruct(each.shape, each.dtype) for each in map(jax.typeof, leaves))
 
 
 # JAX accepts no compiler options for the programs that it generates for derivatives, and splits a derivative into
