@@ -9,14 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.compilation import numpy_where_known
 from hks_jax.linear.dense_eigh import differentiable_eigh
 from hks_jax.linear.products import matmul
 
 
-@jax.jit
 def symmetrise(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the symmetric part, ``(T + Tᵀ)/2``."""
-    return 0.5 * (tensors + jnp.swapaxes(tensors, -1, -2))
+    return _symmetrised(tensors)
+
+
+@numpy_where_known()
+def _symmetrised(xp: Any, tensors: Any) -> Any:
+    return 0.5 * (tensors + xp.swapaxes(tensors, -1, -2))
 
 
 def identity_outside(

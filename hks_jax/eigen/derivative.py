@@ -190,11 +190,7 @@ def change_of(
 ) -> SymmetricPencil:
     """Return the cotangent of the change: Σ pxᵀ for stiffness and mass, each with its own p, and zeros elsewhere."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
-    columns = np.ascontiguousarray(x.T)
-    matrices = tuple(
-        matrix.outer(np.ascontiguousarray(each.T), columns)
-        for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True)
-    )
+    matrices = tuple(matrix.outer(each, x) for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True))
     return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
 
 

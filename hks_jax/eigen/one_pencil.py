@@ -181,7 +181,7 @@ def _pairs(
         frame,
         residuals,
         converged,
-        kept=jnp.ones(values.size, bool),
+        kept=jnp.asarray(np.ones(values.size, bool)),
         part=None,
         next_eigenvalue=following,
         complete_below=bound,

@@ -21,6 +21,8 @@ OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 
 _PLACES = 1 << 12
 """The number of entries of an outer product that are computed together: their operands fit into the cache."""
+_RUN = 8
+"""The mean number of consecutive entries that share a distance to the diagonal, above which slices beat indices."""
 ROUNDING = 1000
 """The largest accepted asymmetry of a matrix, in units of ε times its largest entry."""
 
@@ -46,8 +48,8 @@ class Operator(eqx.Module):
         """Return the entries and their static (rows, columns)."""
 
     @abstractmethod
-    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "Operator":
-        """Return pxᵀ on the sparsity pattern, by NumPy: the derivative of Σ p·Ax with respect to A."""
+    def outer(self, p: Float[np.ndarray, "b n_dof"], x: Float[np.ndarray, "b n_dof"]) -> "Operator":
+        """Return Σ pxᵀ on the sparsity pattern, by NumPy: the derivative of Σ p·Ax with respect to A."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -103,14 +105,23 @@ class PatternedOperator(Operator):
     def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
         """Return the matrix with other entries at the same places."""
 
-    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "PatternedOperator":
-        """Return pxᵀ on the sparsity pattern, by NumPy."""
+    def outer(self, p: Float[np.ndarray, "b n_dof"], x: Float[np.ndarray, "b n_dof"]) -> "PatternedOperator":
+        """Return Σ pxᵀ on the sparsity pattern, by NumPy."""
         where, rows, cols = self.pattern.places()
-        entries = np.zeros(self.pattern.n_entries, x.dtype)
-        for start in range(0, where.size, _PLACES):
-            some = slice(start, start + _PLACES)
-            entries[where[some]] = np.einsum("ib,ib->i", p[rows[some]], x[cols[some]])
-        return self.with_flat(jax.device_put(entries))
+        entries = np.zeros(where.size, x.dtype)
+        starts = np.flatnonzero((np.diff(rows, prepend=-2) != 1) | (np.diff(cols, prepend=-2) != 1))
+        if where.size > _RUN * starts.size:  # along an axis of a grid, rows and columns advance together
+            runs = zip(rows[starts], cols[starts], starts, np.diff(starts, append=where.size), strict=True)
+            for i, j, start, n in sorted(runs):  # in the order of rows, whose vectors stay in the cache
+                np.einsum("bi,bi->i", p[:, i : i + n], x[:, j : j + n], out=entries[start : start + n])
+        else:
+            p, x = np.ascontiguousarray(p.T), np.ascontiguousarray(x.T)
+            for first in range(0, where.size, _PLACES):
+                some = slice(first, first + _PLACES)
+                entries[some] = np.einsum("ib,ib->i", p[rows[some]], x[cols[some]])
+        flat = np.zeros(self.pattern.n_entries, x.dtype)
+        flat[where] = entries
+        return self.with_flat(jax.device_put(flat))
 
     def plus(self, diagonal: Float[Array | np.ndarray, " n"]) -> "PatternedOperator":
         """Return the sum with a diagonal matrix, given as an array (n_dof,)."""
@@ -200,9 +211,9 @@ class DiagonalOperator(Operator):
         """The number of rows, n_dof."""
         return self.entries.shape[0]
 
-    def outer(self, p: Float[np.ndarray, "n_dof b"], x: Float[np.ndarray, "n_dof b"]) -> "DiagonalOperator":
-        """Return the diagonal of pxᵀ, by NumPy."""
-        return DiagonalOperator(jax.device_put(np.einsum("ib,ib->i", p, x)))
+    def outer(self, p: Float[np.ndarray, "b n_dof"], x: Float[np.ndarray, "b n_dof"]) -> "DiagonalOperator":
+        """Return the diagonal of Σ pxᵀ, by NumPy."""
+        return DiagonalOperator(jax.device_put(np.einsum("bi,bi->i", p, x)))
 
     def apply(self, x: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Apply the operator along the last axis."""

@@ -92,7 +92,7 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
     return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
 
 
-@jax.jit
+@jit_quickly()
 def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Array:
     return contraction.weighted(weights, vectors)
 
@@ -226,7 +226,7 @@ def _each(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) 
     return jax.vmap(lambda one: weights_of(one, values, kept))(filters)
 
 
-_each_at_once = jax.jit(_each)
+_each_at_once = jit_quickly()(_each)
 
 
 def _is_zero(leaf: Any) -> bool:
