@@ -56,7 +56,7 @@ def hks_spectrum_free(
 
     Returns:
         (n_times, *shape) in 1/(metric length)^d; NaN outside the mask, 0 at Dirichlet nodes. All values are NaN if a
-        given `Colouring` was made for a smaller spectrum or shorter times.
+        given `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
 
     Raises:
         ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error (``"auto"``
