@@ -24,7 +24,6 @@ HEAD = """\
 # Gallery
 
 This page shows every picture of `hks_jax.plot`, with a link to the function of [gallery.py](gallery.py) that draws it.
-`python docs/gallery.py` draws the pictures and writes this page.
 """
 
 IMPORTS = """\
