@@ -61,8 +61,8 @@ def require_spd(
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
         if bad.sum() > MANY * inside.sum():
             of_grids = (
-                "So many cannot be noise. If the tensors are indefinite by nature, such as stress, make a metric by "
-                f"hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
+                "Noise does not explain this number. If the tensors are indefinite by nature, such as stress, make "
+                f"a metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
 
@@ -169,7 +169,7 @@ def check_shift(name: str, tensors: Float[np.ndarray, "n d d"], how: PositiveMap
     least = least_eigenvalue(tensors)
     if how == "shift" and not float(number) + least > 0:
         raise ValueError(
-            f"number: got the shift {float(number):g} of {name} whose least eigenvalue is {least:g}; expected more "
+            f"number: got the shift {float(number):g} for {name}, whose least eigenvalue is {least:g}; expected more "
             f"than {-least:g}, so that S + c·I is positive definite"
         )
 

@@ -89,7 +89,7 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     elements = active_elements(inside, every_axis)
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
     if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet problem eliminates the grid's sides, too
-        return "neumann", "the mask is so thin that all of its voxels are on the rim, and the mean needs voxels off it"
+        return "neumann", "the mask is so thin that all voxels are on the rim, but the mean needs inner voxels"
     return "mean", 'the domain has a mask; pass boundary="neumann" for a natural rim'
 
 

@@ -169,7 +169,7 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
     for name, matrix in (("K", K), ("M", M)):
         if isinstance(matrix, LinearOperator):
             raise TypeError(
-                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full, as it is factorised"
+                f"{name}: got a LinearOperator; expected a matrix with entries to factorise, sparse or dense"
             )
     if np.ndim(M) == 0 and isinstance(M, numbers.Number):
         raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If it is k, pass k={M}")

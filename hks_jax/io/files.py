@@ -99,9 +99,9 @@ def read_tensors(
     else:
         name, reader = os.fspath(path), format_of(path)
         if array is not None and "array" not in reader.options:
-            raise ValueError(f"array: got {array!r}, but only npz and VTK files have arrays by name. Leave it out")
+            raise ValueError(f"array: got {array!r}, but only npz and VTK files have named arrays. Leave it out")
         if spacing is not None and "spacing" not in reader.options:
-            raise ValueError(f"spacing: {name} has its own, and only NumPy's files may need one. Leave it out")
+            raise ValueError(f"spacing: {name} declares its own; only NumPy's files may lack one. Leave it out")
         if reader is nifti.FORMAT and components.is_one_of_six(path):
             volume = components.read_tensors(components.siblings(path), order, frame)
         else:

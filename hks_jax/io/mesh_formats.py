@@ -250,7 +250,7 @@ def load_off(file: Path) -> Loaded:
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
             # A colour may follow the corners, as an index or as three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
-                raise ValueError(f"got the face {' '.join(row)[:60]}; expected a count of corners, corners, a colour")
+                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, optional colour")
     return _triangulated(file, vertices, polygons)
 
 

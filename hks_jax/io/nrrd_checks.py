@@ -96,4 +96,4 @@ def _check_length(source: BufferedReader, header: Mapping[str, Any]) -> None:
     start, count = source.tell(), math.prod(int(size) for size in header["sizes"])
     held = source.seek(0, os.SEEK_END) - start
     if count <= 0 or held % count:
-        raise ValueError(f"got {held} bytes of data; expected a multiple of the {count} values")
+        raise ValueError(f"got {held} bytes of data; expected a multiple of {count}, the number of values")

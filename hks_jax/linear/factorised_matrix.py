@@ -198,13 +198,13 @@ def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
     null = sizes <= _NULL * np.finfo(entries.dtype).eps
     if not null.any():
         return (
-            f"{name}: got a matrix that is singular within rounding of {entries.dtype} (‖Av‖ ≤ {sizes.min():.1e} "
-            "‖A‖ ‖v‖ for some v), or needs pivoting. Shift it, scale rows and columns, or use float64"
+            f"{name}: got a matrix that is singular within rounding of {entries.dtype} (‖Av‖ ≤ {sizes.min():.1e} ‖A‖ "
+            "‖v‖ for some v), or needs pivoting. Shift the matrix, scale rows and columns, or use float64"
         )
     many = f"{'at least ' if null.all() and size < pencil.size else ''}{null.sum()}"
     return (
-        f"{name}: got a singular matrix with {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. "
-        "Shift it, fix as many unknowns, or add a term that is definite on the null space"
+        f"{name}: got a singular matrix with {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. Shift "
+        "the matrix, fix the same number of unknowns, or add a term that is definite on the null space"
     )
 
 

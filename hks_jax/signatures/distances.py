@@ -232,6 +232,6 @@ def _warn_of_distance(
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
             f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
-            f"{float(times[worst]):.4g}, too far from a source for the heat kernel to be resolved. Use larger times "
-            f"or {remedy}"
+            f"{float(times[worst]):.4g}, because the heat kernel is not resolved so far from a source. Use larger "
+            f"times or {remedy}"
         )

@@ -373,7 +373,9 @@ def test_what_cannot_be_looked_at_becomes_nan():
     field = flat((5, 5), (1.0, 1.0))
     unsymmetric = jax.jit(lambda s: hj.assemble(field, stiffness=first_order, fields={"s": s}).stiffness.coefficients)
     assert np.isnan(unsymmetric(1.0)).any()
-    with pytest.raises(ValueError, match="stiffness: the form closes over traced values; pass them as fields="):
+    with pytest.raises(
+        ValueError, match="stiffness: the form closes over traced values; pass these, also numbers, as fields="
+    ):
         jax.grad(lambda c: hj.assemble(field, stiffness=lambda u, v, w: c * u.value * v.value).stiffness.flat()[0])(1.0)
     negative = jax.jit(lambda rho: hj.eigenpairs(hj.assemble(field, density=rho), 3).result)
     assert negative(-1.0) == hj.RESULTS.not_finite
