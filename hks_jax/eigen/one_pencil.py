@@ -150,8 +150,8 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > available:
         raise ValueError(
-            f"interval: got one with {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine has "
-            f"{available / 1e9:.3g} GB. Divide the interval"
+            f"interval: got an interval of {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine "
+            f"has {available / 1e9:.3g} GB. Divide the interval"
         )
     return Interval(low, high, below, held, count)
 

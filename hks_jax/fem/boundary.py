@@ -96,7 +96,7 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
 def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
     """Return a warning for each condition on a side of the grid that the mask does not reach."""
     *axes, (rim, _) = normalise_boundary(boundary, inside.ndim)
-    own = 'is natural (Neumann); "dirichlet-rim" and "mean" act on it' if rim == "neumann" else f'has "{rim}"'
+    own = 'is natural, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
     return [
         f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
         f"the rim of the mask {own}"

@@ -161,7 +161,7 @@ def varadhan_distance(
     times = resolved_times(pairs, times)
     nodes, space = source_indices(pairs, sources), pairs.space
     if not space.free.ravel()[nodes].all():
-        raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is 0; expected others")
+        raise ValueError("sources: got a node on a Dirichlet boundary, where the kernel is 0; expected inner nodes")
 
     # Values outside the mask are 0, because NaN would enter the derivatives as the product 0·NaN.
     kernel = jnp.where(space.domain, spectral_columns(pairs, Heat(times), nodes), 0)
