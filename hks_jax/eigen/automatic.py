@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from hks_jax.compilation import known_here
+from hks_jax.compilation import is_concrete_on_cpu
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
 from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
@@ -78,7 +78,7 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
-    known = known_here(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
+    known = is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
     if not (pencil.measured and pencil.bounded):
         ours = BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
         return ShiftInvert() if known and n * k < _LARGE else ours

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import cholesky, eigh, solve_triangular
 
-from hks_jax.compilation import known_here
+from hks_jax.compilation import is_concrete_on_cpu
 from hks_jax.eigen.host.matrices import host_matrices
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
 from hks_jax.linear.dense_eigh import pencil_eigh
@@ -31,7 +31,7 @@ class Dense(Eigensolver[SymmetricPencil]):
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs. Concrete values are handed to SciPy, which needs no compilation."""
-        if not known_here(pencil):
+        if not is_concrete_on_cpu(pencil):
             return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
         data, matrices = host_matrices(pencil)
         dtype = pencil.stiffness.dtype

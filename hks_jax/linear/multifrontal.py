@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
-from hks_jax.linear.dissection import Dissection
-from hks_jax.linear.elimination_tree import Level, Merged
+from hks_jax.linear.dissection import Dissection, Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import batched_with_columns, gram, matmul, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import require_count, require_number
+from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.filter.coarsening import coarsen
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint
@@ -31,6 +31,8 @@ _FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
 """The numbers of rounds on the coarsest grid, which starts from random functions, and on each intermediate grid."""
 _ROOM = 12
 """The least number of degrees of freedom per vector on a coarse grid."""
+_SPARE = 0.35
+"""The number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds."""
 _LEAST_NODES = 6
 """The least number of nodes along each axis at which a grid is coarsened."""
 _LARGE = 1 << 21
@@ -51,9 +53,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
         block: the number of vectors filtered together. The workspace is proportional to this number.
-        spare: the number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds.
         max_rounds: the maximal number of rounds on the finest grid.
-        single_precision: whether filters run in float32.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
             all vectors on a part of the grid (docs/devices.md). None is one device.
 
@@ -68,15 +68,12 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     indefinite: ClassVar[bool] = False
     tolerance: float = eqx.field(default=1e-8, static=True)
     block: int = eqx.field(default=32, static=True)
-    spare: float = eqx.field(default=0.35, static=True)
     max_rounds: int = eqx.field(default=60, static=True)
-    single_precision: bool = eqx.field(default=True, static=True)
     adjoint: Adjoint = eqx.field(default=FilteredAdjoint(), static=True, kw_only=True)
     mesh: Mesh | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
         require_count("block", self.block)
-        require_number("spare", self.spare)
         require_count("max_rounds", self.max_rounds)
         if self.mesh is not None:
             checked_mesh(self.mesh)
@@ -93,7 +90,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return half of the number of spare vectors: as guards, they keep linear solves well conditioned."""
-        return max(8, int(self.spare * k) // 2)
+        return max(8, int(_SPARE * k) // 2)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k for which the filter still damps most of the spectrum."""
@@ -103,8 +100,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         """Return the sizes of the computation."""
         mesh = None if self.mesh is None else checked_mesh(self.mesh)
         together = self.block if mesh is None else self.block * mesh.size
-        size = math.ceil((k + max(8, self.spare * k)) / together) * together
-        return Plan(k, size, self.block, space.n_null, self.tolerance, self.single_precision, mesh)
+        size = math.ceil((k + max(8, _SPARE * k)) / together) * together
+        return Plan(k, size, self.block, space.n_null, self.tolerance, mesh)
 
 
 def _lowest(pencil: Pencil, plan: Plan, max_rounds: int, report: Report) -> Pairs:

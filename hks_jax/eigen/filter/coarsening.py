@@ -60,13 +60,9 @@ def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array,
 
 def _interpolate(x: Float[Array, "*coarse b"], shape: tuple[int, ...], periodic: tuple[bool, ...]) -> Array:
     for axis, (n, wraps) in enumerate(zip(shape, periodic, strict=True)):
-        following = jnp.concatenate(
-            [
-                jax.lax.slice_in_dim(x, 1, None, axis=axis),
-                jax.lax.slice_in_dim(x, 0, 1, axis=axis) if wraps else jax.lax.slice_in_dim(x, -1, None, axis=axis),
-            ],
-            axis,
-        )
+        first, rest = jnp.split(x, [1], axis)
+        end = first if wraps else jax.lax.slice_in_dim(x, -1, None, axis=axis)
+        following = jnp.concatenate([rest, end], axis)
         both = jnp.stack([x, (x + following) / 2], axis + 1)
         merged = both.reshape(*x.shape[:axis], -1, *x.shape[axis + 1 :])
         x = jax.lax.slice_in_dim(merged, 0, n, axis=axis)
