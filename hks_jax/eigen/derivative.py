@@ -131,7 +131,8 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
         if not _solves(pencil, k, len(values)):
             return np.zeros_like(rhs)
         free = np.arange(k)[:, None] >= pencil.n_fixed
-        solution = np.asarray(_solve(adjoint, prepared, pencil, *pairs[:2], jax.device_put(np.where(free, rhs, 0))))
+        given = prepared, pencil, *pairs[:2], jax.device_put(np.where(free, rhs, 0))
+        solution = np.asarray(adjoint.solve(*given))
         if np.isnan(solution).any():
             _checked(on_failure, jax.device_put(solution))
         return np.where(free, solution, 0)
@@ -200,7 +201,7 @@ def tangents_of(
         return matmul(inverse[:, k:] * inner_products(guards, force), guards)
 
     def solve(_: object, rhs: Rows) -> Rows:
-        return _checked(on_failure, one_by_one(_solve, (adjoint,), prepared, pencil, values, vectors, rhs))
+        return _checked(on_failure, one_by_one(type(adjoint).solve, (adjoint,), prepared, pencil, values, vectors, rhs))
 
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
@@ -220,10 +221,6 @@ def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil
 
 def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) -> Any:
     return adjoint.prepare(pencil, values, k)
-
-
-def _solve(adjoint: Adjoint, *args: Any) -> Rows:
-    return adjoint.solve(*args)
 
 
 def _checked(on_failure: OnFailure, x: Rows) -> Rows:

@@ -13,14 +13,13 @@ from jaxtyping import Array, Int
 from hks_jax.checks import require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Scalar, Values
-from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.host.shift_invert import ShiftInvert, lower_bound
 from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest_of, measure_pairs, measured_on_host
-from hks_jax.eigen.solver import Eigensolver, Report
+from hks_jax.eigen.solver import Dense, Eigensolver, Report
 from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear.pencil import SymmetricPencil, tabulated

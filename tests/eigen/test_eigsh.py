@@ -1,5 +1,7 @@
 """Eigenpairs of sparse matrices that are none of ours."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,6 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import hks_jax as hj
 from hks_jax.eigen.quality import measure_pairs, measured_on_host
-from hks_jax.linear.pencil import SymmetricPencil
 
 SOLVER = hj.BlockLanczos(block=4)
 
@@ -296,7 +297,7 @@ def test_a_vector_found_twice_has_not_converged(rng):
     vectors = pairs.vectors.at[9].set(pairs.vectors[8])
     twice = measure_pairs(pencil, vectors, pairs.eigenvalues)[2]
     np.testing.assert_array_equal(twice, np.arange(k) == 9)
-    matrices = SymmetricPencil(pencil.stiffness.to_scipy(), pencil.mass.to_scipy())
+    matrices = SimpleNamespace(stiffness=pencil.stiffness.to_scipy(), mass=pencil.mass.to_scipy())
     on_host = measured_on_host(matrices, np.asarray(vectors), np.asarray(pairs.eigenvalues))
     np.testing.assert_array_equal(on_host[2], twice)
 
