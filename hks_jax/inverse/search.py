@@ -13,7 +13,7 @@ import optimistix as optx
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.inverse.checkpoint import Checkpoint, save
-from hks_jax.inverse.conformal import InnerProduct, Preconditioner, conformal_information, smoothing
+from hks_jax.inverse.conformal import ConformalInformation, InnerProduct, conformal_information, smoothing
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.inverse.optimise import Optimiser, Reached, optimise
@@ -138,7 +138,7 @@ class Run:
         traced = jnp.asarray(tolerance)  # a static value would cause a compilation for every stage
         return OPTIMISERS[given](traced, traced, optx.rms_norm)
 
-    def _preconditioner(self, problem: Problem) -> Preconditioner:
+    def _preconditioner(self, problem: Problem) -> InnerProduct | ConformalInformation:
         """Return an approximation of JᵀJ if one is known, otherwise the inner product."""
         unknowns, observation = problem.unknowns, problem.observation
         if isinstance(unknowns, Nodal) and unknowns.parametrisation == PARAMETRISATIONS["conformal"]:
