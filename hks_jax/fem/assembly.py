@@ -15,8 +15,7 @@ from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_bound
 from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.fields import Field, checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
-from hks_jax.fem.grid_assembly import assemble_grid, grid_points
-from hks_jax.fem.mesh_assembly import assemble_mesh, mesh_nodes, mesh_points
+from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
 from hks_jax.linear.operators import PatternedOperator, require_symmetric

@@ -48,18 +48,14 @@ class GridPattern(ByKey, Pattern):
 
 @lru_cache(maxsize=16)
 def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    own = space.degrees_of_freedom.reshape(space.node_shape).astype(np.int32)
-    rimmed = own
-    for axis, wraps in enumerate(space.periodic):
-        widths = [(1, 1) if a == axis else (0, 0) for a in range(own.ndim)]
-        rimmed = np.pad(rimmed, widths, mode="wrap") if wraps else np.pad(rimmed, widths, constant_values=-1)
+    # Degrees of freedom are counted from 1, so that 0 is none.
+    own = (space.degrees_of_freedom + 1).reshape(space.node_shape).astype(np.int32)
     where, rows, cols = [], [], []
-    for o, start in enumerate(product((0, 1, 2), repeat=own.ndim)):
-        other = rimmed[tuple(slice(s, s + n) for s, n in zip(start, own.shape, strict=True))]
-        both = np.flatnonzero((own >= 0) & (other >= 0))
+    for o, other in enumerate(neighbours(with_rim(own, space.periodic), own.ndim)):
+        both = np.flatnonzero((own > 0) & (other > 0))
         where.append(o * own.size + both)
-        rows.append(own.ravel()[both])
-        cols.append(other.ravel()[both])
+        rows.append(own.ravel()[both] - 1)
+        cols.append(other.ravel()[both] - 1)
     return np.concatenate(where), np.concatenate(rows), np.concatenate(cols)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import StaticArray
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.products import quadratic_forms
+from hks_jax.linear.products import matmul, quadratic_forms
 
 
 class Contraction(eqx.Module):
@@ -32,7 +32,7 @@ class Diagonal(Contraction):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m n"]:
         """Return Σᵢ cᵢ φᵢ(x)²."""
-        return _matmul(weights, jnp.square(vectors))
+        return matmul(weights, jnp.square(vectors))
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
@@ -50,13 +50,13 @@ class _Bilinear(Contraction):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
         """Return Σᵢ cᵢ aᵢ φᵢ(x)."""
-        return _matmul(weights[:, None, :] * self.coefficients(vectors), vectors)
+        return matmul(weights[:, None, :] * self.coefficients(vectors), vectors)
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
     ) -> Float[Array, "m s n"]:
         """Return Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x)."""
-        return _matmul(_matmul(self.coefficients(vectors), matrices), vectors)
+        return matmul(matmul(self.coefficients(vectors), matrices), vectors)
 
 
 class Applied(_Bilinear):
@@ -70,7 +70,7 @@ class Applied(_Bilinear):
 
     def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
         """Return the inner products φᵢ·w."""
-        return _matmul(self.functionals, vectors.T)
+        return matmul(self.functionals, vectors.T)
 
 
 class _FromSources(Contraction):
@@ -95,7 +95,7 @@ class SquaredDistances(_FromSources):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s nodes"]:
         """Return Σᵢ cᵢ (φᵢ(x) − φᵢ(x_s))²."""
-        return self._map(vectors, lambda apart: _matmul(weights, jnp.square(apart)))
+        return self._map(vectors, lambda apart: matmul(weights, jnp.square(apart)))
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
@@ -103,7 +103,7 @@ class SquaredDistances(_FromSources):
         """Return Σᵢⱼ Cᵢⱼ (φᵢ(x) − φᵢ(x_s)) (φⱼ(x) − φⱼ(x_s))."""
 
         def reading(apart: Float[Array, "k nodes"]) -> Float[Array, "m nodes"]:
-            return jax.lax.map(lambda matrix: jnp.sum(apart * _matmul(matrix, apart), axis=0), matrices)
+            return jax.lax.map(lambda matrix: jnp.sum(apart * matmul(matrix, apart), axis=0), matrices)
 
         return self._map(vectors, reading)
 
@@ -111,7 +111,3 @@ class SquaredDistances(_FromSources):
         nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], self.space.free.size)
         readings = jax.lax.map(lambda source: reading(nodal - source[:, None]), self.coefficients(vectors))
         return jnp.moveaxis(readings, 0, 1)
-
-
-def _matmul(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision="highest")
