@@ -129,14 +129,11 @@ def reflect(field: TensorField, width: int) -> TensorField:
     """Extend a field by a strip of its mirror image on every side, as in the paper; `crop` removes the strip.
 
     A reflection is an isometry only if the off-diagonal components across the mirror change sign. So in the strip
-    beyond a side of axis a, Tₐᵦ is negated for b ≠ a.
+    beyond a side of axis a, Tₐᵦ is negated for b ≠ a. The mask, if any, is reflected too.
 
     Args:
         field: the field on a grid of shape (n₁, …).
         width: the strip's width in nodes, 1 … n − 1.
-
-    Returns:
-        The field on the grid of shape (n₁ + 2·width, …); the mask, if any, is reflected too.
 
     Examples:
         >>> wide = hj.reflect(field, 2)

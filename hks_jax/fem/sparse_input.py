@@ -64,9 +64,6 @@ def sparse_pencil(
         volume: the volume in the units of the metric, for ``normalisation="volume"``.
         shape: the shape of nodal arrays, with n nodes; None is (n,).
 
-    Returns:
-        The pencil. ``.stiffness`` is a `SparseOperator`, and ``.mass`` has the same pattern or is diagonal.
-
     Raises:
         ValueError: matrices that are not square, differ in size, are complex, NaN, infinite or unsymmetric (the message
             has the entry); a diagonal M with an entry that is not positive; traced indices; null vectors that are

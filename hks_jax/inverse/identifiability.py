@@ -85,9 +85,6 @@ def identifiability(
         iterations: the number of subspace iterations, each with n + 8 products with J and with Jᵀ.
         seed: the seed of the random initial subspace.
 
-    Returns:
-        The spectrum, directions, resolution and uncertainty.
-
     Raises:
         ValueError: if a problem is given without values, or if n is out of range.
 
