@@ -1,4 +1,4 @@
-"""Curvature of a metric, and the Laplace–Beltrami operator of a function, at the nodes of a grid."""
+"""Curvature of a metric, and the Laplace–Beltrami operator applied to a function, at the nodes of a grid."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

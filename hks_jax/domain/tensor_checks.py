@@ -117,8 +117,8 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
     if shape != grid.shape or n != d or m < d:
         expected = (*grid.shape, d, d)
         raise ValueError(
-            f"{name}: got shape {gradients.shape}; expected (*grid.shape, d, d) = {expected}, one gradient per node, "
-            "or more rows than columns for a map into a space of more dimensions"
+            f"{name}: got shape {gradients.shape}; expected one gradient per node, (*grid.shape, d, d) = {expected}. "
+            "For a map into a space of more dimensions, gradients have more rows than columns"
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)

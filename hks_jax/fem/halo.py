@@ -37,7 +37,7 @@ def neighbours(x: Any, dimension: int) -> Iterator[Any]:
 def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:
     """Return the coefficients with those of each node adjacent in memory, which halves the time of a product.
 
-    The result is flat, since XLA would otherwise choose the order of its axes.
+    The result has one axis, because XLA would otherwise choose the memory layout of its axes.
     """
     return jnp.moveaxis(coefficients, 0, -1).reshape(-1)
 
@@ -59,7 +59,7 @@ def product_with_rim(
 
 
 def checked_mesh(mesh: Any) -> Mesh:
-    """Return a mesh of devices with one axis, on which XLA chooses the layout of arrays that have none."""
+    """Return a mesh of devices with one axis. XLA chooses the sharding of arrays for which none is given."""
     if not isinstance(mesh, Mesh) or len(mesh.axis_names) != 1:
         got = f"the axes {mesh.axis_names}" if isinstance(mesh, Mesh) else type(mesh).__name__
         raise ValueError(

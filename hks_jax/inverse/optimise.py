@@ -103,7 +103,7 @@ def optimise(
     explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # rounded as in `_advance`
     try:
         state = _begin(optimiser, fn, values, problem)
-        # Take one step more than `max_steps`, because many solvers report their unknowns one step later.
+        # Take one step more than `max_steps`, because many solvers return the result of a step only in the next one.
         for count in range(max_steps + 2):
             before = values
             sufficient = jnp.asarray(jnp.inf if count >= max_steps else explained, values.dtype)

@@ -206,7 +206,8 @@ def save_tensors(
     neither `order` nor `frame`. Units are written except to VTK's files.
 
     Raises:
-        ValueError: the suffix is unknown; the format is NIfTI for a slice, or NIfTI or NRRD for unsymmetric tensors.
+        ValueError: the suffix is unknown, or the format cannot hold the field: NIfTI holds no slices, and neither NIfTI
+            nor NRRD holds unsymmetric tensors.
         ImportError: an optional library is missing; the message gives the command that installs it.
 
     Examples:

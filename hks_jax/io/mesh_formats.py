@@ -88,7 +88,7 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
     lists = re.search(rb"\bCELLS\s+(\d+)\s+(\d+)", content) if suffix == ".vtk" else None
     if lists is not None:  # before version 5, the declared number also counts one entry per cell
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
-        if listed != corners:  # meshio omits corners of cells whose type is damaged
+        if listed != corners:  # if a cell's type is wrong, meshio omits corners
             raise ValueError(f"the file declares {listed} corners of cells; expected {corners} from the cells' types")
     if suffix == ".ply":
         _compare_ply(content, mesh)

@@ -202,8 +202,9 @@ def without_background(volume: TensorVolume) -> TensorVolume:
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
     """Return the voxels that a program seems to have filled as background, and a sentence; None if there are few.
 
-    Measured tensors are never exactly equal and isotropic, nor a millionth of the others. Programs such as ANTs write
-    such tensors where there is no signal. The result is None for a volume with a mask, and for a constant field.
+    Measured tensors are never exactly isotropic and equal to one another, and never a million times smaller than the
+    others. Programs such as ANTs write such tensors where there is no signal. The result is None for a volume with a
+    mask, and for a constant field.
 
     Examples:
         >>> tensors = np.array(field.tensors)

@@ -74,8 +74,8 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
     if left > TAIL_LIMIT:
         enough = np.log(share / TAIL_LIMIT) / rate
         warn_of_accuracy(
-            f"times: the heat flow at t = {float(jnp.min(times)):.4g} lacks up to {left:.1%} of a function's norm, "
-            f"which lies beyond the computed eigenpairs. Use times of at least {enough:.4g}, or more eigenpairs",
+            f"times: in the heat flow at t = {float(jnp.min(times)):.4g}, up to {left:.1%} of a function's norm "
+            f"belongs to eigenpairs that were not computed. Use times of at least {enough:.4g}, or more eigenpairs",
         )
 
 

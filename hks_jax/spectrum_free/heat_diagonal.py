@@ -40,7 +40,7 @@ def hks_spectrum_free(
     The result is that of all eigenpairs of the discretisation, at any t. The cost of colouring grows with t/h², whereas
     the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md derives the bounds.
     The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at Dirichlet nodes, and all NaN if a given
-    `Colouring` was made for a smaller spectrum or shorter times.
+    `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
