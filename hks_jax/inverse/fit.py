@@ -125,15 +125,5 @@ def fit_metric(
             "The fitted metric does not explain the target, and its differences from init may be artefacts. Use "
             'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise='
         )
-    return MetricFit(
-        unknowns.field(values),
-        float(outcome.loss),
-        misfit,
-        left,
-        tuple(now.history),
-        result,
-        values,
-        problem,
-        tuple(now.losses),
-        noise,
-    )
+    field, history, losses = unknowns.field(values), tuple(now.history), tuple(now.losses)
+    return MetricFit(field, float(outcome.loss), misfit, left, history, result, values, problem, losses, noise)

@@ -207,15 +207,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         return self._done(state), optx.RESULTS.where(state.finite, successful, not_finite)
 
     def postprocess(
-        self,
-        fn: Callable,
-        y: Values,
-        aux: Any,
-        args: Any,
-        options: _Options,
-        state: _State,
-        tags: _Tags,
-        result: Any,
+        self, fn: Callable, y: Values, aux: Any, *args: Any, **settings: Any
     ) -> tuple[Values, Any, dict[str, Any]]:
         """Return the unknowns and the auxiliary output unchanged."""
         return y, aux, {}

@@ -10,7 +10,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import require_real
+from hks_jax.checks import checked_times, require_real
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
@@ -134,11 +134,8 @@ def gaussian_scale_space(
         1.0 1.0
     """
     grid, d = field.grid, field.grid.dimension
-    require_real("times", times)
     require_real("functions", functions)
-    t, u = np.asarray(times, np.float64), np.asarray(functions, np.float64)
-    if t.ndim != 1 or not (np.isfinite(t) & (t > 0)).all():
-        raise ValueError(f"times: got {times}; expected a vector of positive numbers")
+    t, u = np.asarray(checked_times(times, float)), np.asarray(functions, np.float64)
     if u.shape[u.ndim - d :] != grid.shape:
         raise ValueError(f"functions: got shape {u.shape}; expected {grid.shape}, with optional leading axes")
     inside = grid.inside

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import checked_times
+from hks_jax.checks import checked_times, require_count, require_number
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import label_nodes
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -97,10 +97,8 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
         >>> print((times[0] * pairs.eigenvalues[-1]).round(2), (times[-1] * pairs.eigenvalues[1]).round(2))  # 4 ln 10
         9.21 9.21
     """
-    if n < 1:
-        raise ValueError(f"n: got {n}; expected at least 1")
-    if not 0 < decay < 1:
-        raise ValueError(f"decay: got {decay}; expected a number between 0 and 1")
+    require_count("n", n)
+    require_number("decay", decay, 1)
     first, last = positive_range(pairs)
     end = jnp.minimum(last, first * (math.log(1e-4) / math.log(decay)))
     return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, end, n)
