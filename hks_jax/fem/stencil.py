@@ -42,8 +42,43 @@ class GridPattern(ByKey, Pattern):
         return 3**self.space.dimension // 2 * self.space.free.size + np.flatnonzero(self.space.free)
 
     def bisect(self) -> Parts:
-        """Return the nested bisection of the grid."""
-        return _bisect(self.space)
+        """Bisect recursively by one or two lines of nodes (a plane in 3D), at the median of the longest side."""
+        x = np.stack(np.nonzero(self.space.free)).astype(np.int32)
+        d, n = x.shape
+        level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
+        depth = 0
+        while True:
+            parts = 1 << depth
+            counts = np.bincount(q, minlength=parts)
+            if counts.max() <= _CELL[d]:
+                level[left], part[left] = depth, q
+                return Parts(level, part, depth + 1)
+            # Cut every part across its longest side, at the median.
+            low, high = np.full((d, parts), np.iinfo(np.int32).max, np.int32), np.full((d, parts), -1, np.int32)
+            for axis in range(d):
+                np.minimum.at(low[axis], q, x[axis])
+                np.maximum.at(high[axis], q, x[axis])
+            longest = np.argmax(high - low, axis=0)
+            lowest, highest = (ends[longest, np.arange(parts)] for ends in (low, high))
+            across, along = longest.astype(np.int8)[q], x[0]
+            for axis in range(1, d):
+                along = np.where(across == axis, x[axis], along)
+            extent = int(np.max(highest - lowest)) + 1
+            first = np.arange(parts) * extent - lowest
+            sizes = np.bincount(first[q] + along, minlength=parts * extent).reshape(parts, extent)
+            cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1).astype(np.int32)
+            beyond = along - cut[q]
+            separates = beyond == 0
+            if d == 2:  # with an even number of lines, two cut lines leave equal halves, and so batches without padding
+                even = (highest - lowest) % 2 == 1
+                separates |= (beyond == -1) & even[q]
+            if depth == 0:  # also cut at node 0, so that the parts are not periodic
+                separates |= np.any(x[list(self.space.periodic)] == 0, axis=0)
+            cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
+            level[left[cutting]], part[left[cutting]] = depth, q[cutting]
+            q = 2 * q[stays] + (beyond[stays] > 0)
+            left, x = left[stays], np.take(x, stays, axis=1)
+            depth += 1
 
 
 @lru_cache(maxsize=16)
@@ -57,46 +92,6 @@ def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rows.append(own.ravel()[both] - 1)
         cols.append(other.ravel()[both] - 1)
     return np.concatenate(where), np.concatenate(rows), np.concatenate(cols)
-
-
-def _bisect(space: GridSpace) -> Parts:
-    """Bisect the grid recursively by one or two lines of nodes (a plane in 3D), at the median of the longest side."""
-    x = np.stack(np.nonzero(space.free)).astype(np.int32)
-    d, n = x.shape
-    level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
-    depth = 0
-    while True:
-        parts = 1 << depth
-        counts = np.bincount(q, minlength=parts)
-        if counts.max() <= _CELL[d]:
-            level[left], part[left] = depth, q
-            return Parts(level, part, depth + 1)
-        # Cut every part across its longest side, at the median.
-        low, high = np.full((d, parts), np.iinfo(np.int32).max, np.int32), np.full((d, parts), -1, np.int32)
-        for axis in range(d):
-            np.minimum.at(low[axis], q, x[axis])
-            np.maximum.at(high[axis], q, x[axis])
-        longest = np.argmax(high - low, axis=0)
-        lowest, highest = (ends[longest, np.arange(parts)] for ends in (low, high))
-        across, along = longest.astype(np.int8)[q], x[0]
-        for axis in range(1, d):
-            along = np.where(across == axis, x[axis], along)
-        extent = int(np.max(highest - lowest)) + 1
-        first = np.arange(parts) * extent - lowest
-        sizes = np.bincount(first[q] + along, minlength=parts * extent).reshape(parts, extent)
-        cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1).astype(np.int32)
-        beyond = along - cut[q]
-        separates = beyond == 0
-        if d == 2:  # with an even number of lines, two cut lines leave equal halves, and so batches without padding
-            even = (highest - lowest) % 2 == 1
-            separates |= (beyond == -1) & even[q]
-        if depth == 0:  # also cut at node 0, so that the parts are not periodic
-            separates |= np.any(x[list(space.periodic)] == 0, axis=0)
-        cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
-        level[left[cutting]], part[left[cutting]] = depth, q[cutting]
-        q = 2 * q[stays] + (beyond[stays] > 0)
-        left, x = left[stays], np.take(x, stays, axis=1)
-        depth += 1
 
 
 class Stencil(eqx.Module):

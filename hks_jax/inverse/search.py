@@ -118,7 +118,7 @@ class Run:
             save(self.path, self.mark, now)
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
-        """Solve one problem from given unknowns; a factor multiplies tolerances, and the step size divides the damping."""
+        """Solve one problem from given unknowns; a factor multiplies tolerances, the step size divides the damping."""
         method, tolerance = self.search.optimiser, tolerances * self.search.tolerance
         if method == "gauss-newton":
             # Noise requires small steps, because the misfit must not fall far below it.
