@@ -252,10 +252,10 @@ def mesh_points(nodes: Float[Array, "nodes 3"], space: MeshSpace) -> Float[Array
 def assemble_mesh(
     mesh: SimplicialMesh,
     nodes: Float[Array, "nodes 3"],
+    curved: bool,
     fields: dict[str, Field],
     space: MeshSpace,
     operator: WeakForm,
-    curved: bool,
 ) -> Pencil:
     """Return the pencil of a mesh; if it is ``curved``, its edges pass through their midpoints."""
     element = simplex_element(space.dimension, space.degree)

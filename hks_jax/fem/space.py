@@ -296,19 +296,17 @@ def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "of
 
     The result is None if the values are traced and all nodes of the domain are free.
     """
-    if not (is_traced(values) and is_staged()):
-        return free_couplings(space)
-    if (space.free == space.domain).all():
+    staged = is_traced(values) and is_staged()
+    if staged and (space.free == space.domain).all():
         return None
-    axes = _box(space.free)
+    axes = _box(space.free) if staged else None
     if axes is None:
-        return free_couplings(space)
+        return _free_couplings(space)
     return _outer([_coupled(axis, (wraps,)) for axis, wraps in zip(axes, space.periodic, strict=True)])
 
 
 @lru_cache(maxsize=16)
-def free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
-    """Mark the offsets and nodes of couplings with two free ends."""
+def _free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
     return _coupled(space.free, space.periodic)
 
 

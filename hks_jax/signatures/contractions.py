@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -10,7 +11,9 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import StaticArray
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.products import matmul, quadratic_forms
+from hks_jax.linear.products import quadratic_forms
+
+_matmul = partial(jnp.matmul, precision="highest")
 
 
 class Contraction(eqx.Module):
@@ -32,7 +35,7 @@ class Diagonal(Contraction):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m n"]:
         """Return Σᵢ cᵢ φᵢ(x)²."""
-        return matmul(weights, jnp.square(vectors))
+        return _matmul(weights, jnp.square(vectors))
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
@@ -50,13 +53,13 @@ class _Bilinear(Contraction):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
         """Return Σᵢ cᵢ aᵢ φᵢ(x)."""
-        return matmul(weights[:, None, :] * self.coefficients(vectors), vectors)
+        return _matmul(weights[:, None, :] * self.coefficients(vectors), vectors)
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
     ) -> Float[Array, "m s n"]:
         """Return Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x)."""
-        return matmul(matmul(self.coefficients(vectors), matrices), vectors)
+        return _matmul(_matmul(self.coefficients(vectors), matrices), vectors)
 
 
 class Applied(_Bilinear):
@@ -70,7 +73,7 @@ class Applied(_Bilinear):
 
     def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
         """Return the inner products φᵢ·w."""
-        return matmul(self.functionals, vectors.T)
+        return _matmul(self.functionals, vectors.T)
 
 
 class _FromSources(Contraction):
@@ -95,7 +98,7 @@ class SquaredDistances(_FromSources):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s nodes"]:
         """Return Σᵢ cᵢ (φᵢ(x) − φᵢ(x_s))²."""
-        return self._map(vectors, lambda apart: matmul(weights, jnp.square(apart)))
+        return self._map(vectors, lambda apart: _matmul(weights, jnp.square(apart)))
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
@@ -103,7 +106,7 @@ class SquaredDistances(_FromSources):
         """Return Σᵢⱼ Cᵢⱼ (φᵢ(x) − φᵢ(x_s)) (φⱼ(x) − φⱼ(x_s))."""
 
         def reading(apart: Float[Array, "k nodes"]) -> Float[Array, "m nodes"]:
-            return jax.lax.map(lambda matrix: jnp.sum(apart * matmul(matrix, apart), axis=0), matrices)
+            return jax.lax.map(lambda matrix: jnp.sum(apart * _matmul(matrix, apart), axis=0), matrices)
 
         return self._map(vectors, reading)
 
