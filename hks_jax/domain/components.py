@@ -1,12 +1,27 @@
 """The elements of a masked grid, and their connected components."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy
 from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+
+from hks_jax.checks import require_real
+
+
+def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
+    """Return zeros and ones as booleans; raise ValueError for anything else."""
+    array = np.asarray(values)
+    require_real(name, array)
+    if array.dtype != bool and not np.isin(array, (0, 1)).all():
+        raise ValueError(
+            f"{name}: got dtype {array.dtype} with values other than 0 and 1; expected booleans. Threshold them, for "
+            "example mask > 0.5"
+        )
+    return array.astype(bool)
 
 
 def wrap_nodes(nodes: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:

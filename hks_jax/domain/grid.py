@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hks_jax.arrays import ByKey, StaticArray
 from hks_jax.checks import require_real
-from hks_jax.domain.components import active_elements, label_nodes
+from hks_jax.domain.components import active_elements, as_mask, label_nodes
 
 
 @jax.tree_util.register_static
@@ -155,13 +155,9 @@ def _per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension:
 
 
 def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndarray:
-    array = np.asarray(mask)
-    if array.shape != shape:
-        raise ValueError(f"mask: got shape {array.shape}; expected the grid's shape {shape}")
-    if array.dtype != bool:
-        if not np.isin(array, (0, 1)).all():
-            raise ValueError(f"mask: got dtype {array.dtype} with values other than 0 and 1; expected booleans")
-        array = array.astype(bool)
+    if np.shape(mask) != shape:
+        raise ValueError(f"mask: got shape {np.shape(mask)}; expected the grid's shape {shape}")
+    array = as_mask("mask", mask)
     if not array.any():
         raise ValueError("mask: no node is inside (the mask is empty); expected True at the nodes of the domain")
     wrapped = (True,) * array.ndim

@@ -20,7 +20,6 @@ from hks_jax.domain.tensor_checks import (
     PositiveMap,
     check_metric_choice,
     checked_interpolation,
-    checked_map,
     checked_tensors,
     positive_map,
     right_cauchy_green,
@@ -195,12 +194,11 @@ class TensorField(eqx.Module):
             [3. 1.]
         """
         _require_grid(grid)
-        chosen = checked_map(how)
         tensors = real_array(name, S)
         if tensors.shape != (*grid.shape, grid.dimension, grid.dimension):
             expected = (*grid.shape, grid.dimension, grid.dimension)
             raise ValueError(f"{name}: got shape {tensors.shape}; expected (*grid.shape, d, d) = {expected}")
-        return cls(grid, positive_map(name, tensors, chosen, number, grid.inside), interpolation)
+        return cls(grid, positive_map(name, tensors, how, number, grid.inside), interpolation)
 
     def __repr__(self) -> str:
         values = "a function" if self.function is not None else describe_array(self._tensors)

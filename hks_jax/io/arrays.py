@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.domain.components import as_mask
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
-from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 

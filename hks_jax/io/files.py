@@ -11,15 +11,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_number
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.io import components, mesh, nifti
+from hks_jax.io import mesh, nifti
 from hks_jax.io.formats import WRITTEN, format_of
 from hks_jax.io.masks import read_mask
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
-from hks_jax.io.volume import TensorVolume, as_mask, describe, digest
+from hks_jax.io.volume import TensorVolume, describe, digest
 from hks_jax.io.vtk_image import by_time
 from hks_jax.storage import write_npz
 
@@ -92,23 +93,21 @@ def read_tensors(
         4.0 (0.125, 0.125)
     """
     require_number("confidence", confidence, above=-math.inf)
-    if not isinstance(path, str | os.PathLike):
+    paths = nifti.siblings(path) if isinstance(path, str | os.PathLike) else [os.fspath(each) for each in path]
+    if len(paths) != 1:
         if array is not None or spacing is not None:
             raise ValueError("array, spacing: only NumPy's and VTK's files need them. Leave them out for six images")
-        volume = components.read_tensors(list(path), order, frame)
+        volume = nifti.read_components(paths, order, frame)
     else:
-        name, reader = os.fspath(path), format_of(path)
+        (name,), reader = paths, format_of(paths[0])
         if array is not None and "array" not in reader.options:
             raise ValueError(f"array: got {array!r}, but only npz and VTK files have arrays by name. Leave it out")
         if spacing is not None and "spacing" not in reader.options:
             raise ValueError(f"spacing: {name} has its own, and only NumPy's files may need one. Leave it out")
-        if reader is nifti.FORMAT and components.is_one_of_six(path):
-            volume = components.read_tensors(components.siblings(path), order, frame)
-        else:
-            given = {"array": array, "spacing": spacing, "confidence": confidence}
-            volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
-            if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
-                volume = replace(volume, digest=digest(name))
+        given = {"array": array, "spacing": spacing, "confidence": confidence}
+        volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
+        if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
+            volume = replace(volume, digest=digest(name))
     if unit is not None:
         volume = in_mm2_per_s(volume, unit)
     if mask is not None:

@@ -246,8 +246,9 @@ def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 
 
 
 def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
-    """Return the indices of the voxels at the corners of a volume as homogeneous coordinates."""
-    return np.stack(np.meshgrid(*((0, n - 1) for n in shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
+    """Return the indices of the voxels at the corners of an image in 2D or 3D as homogeneous coordinates."""
+    ends = ((0, n - 1) for n in (*shape, 1)[:3])
+    return np.stack(np.meshgrid(*ends, [1], indexing="ij"), -1).reshape(-1, 4)
 
 
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
@@ -256,15 +257,6 @@ def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
     if volume.dimension == 2:
         array = np.expand_dims(array, n + volume.thin_axis)
     return np.moveaxis(array, 0, -1) if n else array
-
-
-def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
-    """Return zeros and ones as booleans; raise ValueError for anything else."""
-    array = np.asarray(values)
-    require_real(name, array)
-    if array.dtype != bool and not np.isin(array, (0, 1)).all():
-        raise ValueError(f"{name}: got mask values other than 0 and 1. Threshold the mask, for example mask > 0.5")
-    return array.astype(bool)
 
 
 def digest(path: str | os.PathLike[str]) -> str:

@@ -14,8 +14,9 @@ from urllib.parse import quote
 
 import numpy as np
 
+from hks_jax.domain.components import as_mask
 from hks_jax.io.tensor_order import matrices, nearest_rotation
-from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors, placed
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, placed
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, load_npz, reading
 
