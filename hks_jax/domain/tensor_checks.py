@@ -35,15 +35,13 @@ def checked_interpolation(interpolation: Any) -> Interpolation:
     return interpolation
 
 
-def checked_tensors(
-    name: str, tensors: Any, inside: Bool[np.ndarray, "*shape"], d: int, expected: str, place: str = "node"
-) -> Float[Array, "*shape d d"]:
-    """Return tensors (*inside.shape, d, d) as floating-point numbers; raise ValueError unless they are SPD inside."""
-    array = real_array(name, tensors)
-    if array.shape != (*inside.shape, d, d):
-        raise ValueError(f"{name}: got shape {array.shape}; expected {expected}")
-    if not is_traced(array):
-        require_spd(name, np.asarray(array), inside, place)
+def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]:
+    """Return tensors at the nodes of a grid as floating-point numbers; raise ValueError for another shape."""
+    if not isinstance(grid, Grid):
+        raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
+    array, expected = real_array(name, tensors), (*grid.shape, grid.dimension, grid.dimension)
+    if array.shape != expected:
+        raise ValueError(f"{name}: got shape {array.shape}; expected (*grid.shape, d, d) = {expected}")
     return array
 
 

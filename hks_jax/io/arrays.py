@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.domain.components import as_mask
+from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors
 from hks_jax.storage import load_npy, load_npz, write_npz
@@ -67,8 +68,8 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,
-        _per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
-        _per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
+        per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
+        per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
         None if mask is None else as_mask(f"{name}: mask", mask),
         None if affine is None else _real(f"{name}: affine", affine),
         **about,
@@ -105,11 +106,6 @@ def _real(name: str, value: Any) -> Float[np.ndarray, "..."]:
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name}: got dtype {array.dtype}; expected real numbers")
     return array.astype(np.float64)
-
-
-def _per_axis(name: str, value: Any, d: int) -> tuple[float, ...]:
-    array = _real(name, value)
-    return tuple((np.full(d, array) if array.ndim == 0 else array.ravel()).tolist())
 
 
 FORMAT = Format((".npz", ".npy"), read_tensors, ("array", "spacing"), read_image, (".npz",), write, write_tensors)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from hks_jax import __version__
 from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
-from hks_jax.domain.grid import Grid
+from hks_jax.domain.grid import Grid, per_axis
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
 from hks_jax.uncertainty.noise import TensorNoise
 
@@ -102,8 +102,7 @@ class TensorVolume:
                 f"{where}tensors: got shape {tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)"
             )
         for name, value in (("spacing", self.spacing), ("origin", self.origin)):
-            if len(value) != d or not np.isfinite(value).all():
-                raise ValueError(f"{where}{name}: got {value}; expected {d} finite numbers, one per axis")
+            per_axis(f"{where}{name}", value, d)
         if min(self.spacing) <= 0:
             raise ValueError(f"{where}spacing: got {self.spacing}; expected positive numbers")
         if mask is not None and (mask.shape != shape or mask.dtype != bool):
