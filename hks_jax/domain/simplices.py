@@ -50,8 +50,7 @@ def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> 
         raise ValueError(
             f"{words.argument}: got vertex indices {span}; expected 0 … {n_vertices - 1} for {n_vertices} vertices"
         )
-    used = np.zeros(n_vertices, dtype=bool)
-    used[indices] = True
+    used = np.isin(np.arange(n_vertices), indices)
     if not (used.all() or masked):
         raise ValueError(
             f"vertices: {int((~used).sum())} of {n_vertices} belong to no {words.one} (the first is vertex "

@@ -115,13 +115,9 @@ def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
     return {}
 
 
-def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`."""
-    return tensors_of(name, load(name), order, frame)
-
-
-def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> TensorVolume:
-    """Return the tensors of a loaded image."""
+def read_tensors(name: str, order: str | None, frame: str | None, image: Any = None) -> TensorVolume:
+    """Read tensors, or return those of a loaded image; see `hks_jax.io.read_tensors`."""
+    image = load(name) if image is None else image
     shape = image.shape
     if shape[3:] not in ((6,), (1, 6)):
         remedy = "Fit tensors to diffusion-weighted images first by hks_jax.io.fit_dwi, or by --bval and --bvec"
@@ -214,7 +210,7 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
     joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
     joined.header["xyzt_units"] = first.header["xyzt_units"]
     joined.header.set_intent(SYMMETRIC_MATRIX, (3,))
-    return tensors_of(files["xx"], joined, None, frame)
+    return read_tensors(files["xx"], None, frame, joined)
 
 
 def placement_notes(image: Any) -> list[str]:
@@ -245,8 +241,6 @@ def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra:
         about = {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources}
         settings = json.loads(record).get("settings")
         write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
-    if array.dtype not in (np.float32, np.float64):
-        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
     image.header["intent_name"] = name[:15].encode()
     _write(path, image, record)

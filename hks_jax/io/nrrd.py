@@ -58,7 +58,7 @@ def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
         start = stream.tell()
         stream.seek(0)
         check_header(stream.read(start), header)
-        check_data(file, header, stream, start)
+        check_data(file, header, start)
         stream.seek(start)
         data = nrrd.read_data(header, stream, str(file), index_order="F")
     return data.astype(data.dtype.newbyteorder("=")), header
@@ -160,8 +160,6 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
         header["space units"] = ["mm"] * d
     header |= {"space directions": directions, "space origin": origin, "kinds": kinds, "encoding": "gzip"}
     header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in more.items()}
-    if array.dtype not in (np.float32, np.float64):
-        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     with atomic_path(path) as temporary:
         nrrd.write(str(temporary), array, {**header, "provenance": record}, index_order="F")
 

@@ -47,12 +47,11 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
         >>> print(hj.io.find_invalid(volume).sum(), hj.io.find_invalid(volume, floor=2.0).sum())  # eigenvalues 1 and 4
         0 81
     """
-    if floor is not None:
-        require_number("floor", floor, above=-math.inf)
     inside = volume.inside
     bad = np.zeros(volume.shape, bool)
     bad[inside] = ~spd.is_spd(volume.tensors[inside])
     if floor is not None:
+        require_number("floor", floor, above=-math.inf)
         good = inside & ~bad
         bad[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor
     return bad
@@ -138,10 +137,9 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         )
     wrong = "are not positive definite" if floor is None else f"have an eigenvalue below {floor:g}"
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
-    mask, tensors = volume.mask, volume.tensors.copy()
-    noise: dict[str, Any] = {"covariance": volume.covariance, "modes": volume.modes}
+    tensors, changed = volume.tensors.copy(), dict[str, Any]()
     if method == "mask":
-        mask, done = inside & ~bad, "their voxels are left out"
+        changed["mask"], done = inside & ~bad, "their voxels are left out"
     elif method == "clip":
         if report["not_finite"]:
             raise ValueError(
@@ -161,12 +159,12 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         )
         source, done = tuple(index[bad] for index in nearest), "they are replaced by the nearest valid tensor"
         tensors[bad] = tensors[source]
-        for name, known in noise.items():
-            if known is not None:
-                noise[name] = known.copy()
-                noise[name][bad] = known[source]
+        for name in ("covariance", "modes"):
+            if (known := getattr(volume, name)) is not None:
+                changed[name] = known.copy()
+                changed[name][bad] = known[source]
     notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
-    return replace(volume, tensors=tensors, mask=mask, **noise, repair=report, notes=notes)
+    return replace(volume, tensors=tensors, **changed, repair=report, notes=notes)
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:

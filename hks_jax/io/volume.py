@@ -113,7 +113,6 @@ class TensorVolume:
             raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected (*shape, m, m), m = d(d+1)/2")
 
     def __repr__(self) -> str:
-        """Return a summary in one line, without the arrays."""
         inside = "" if self.mask is None else f", mask={int(self.mask.sum())} of {self.mask.size} voxels"
         cut = "" if self.slice_axis is None else f", slice_axis={self.slice_axis}"
         return (
@@ -162,36 +161,26 @@ class TensorVolume:
             raise ValueError(f'axis: got {axis!r}; expected 0, 1, 2 or "x", "y", "z"')
         if not 0 <= index < self.shape[a]:
             raise ValueError(f"index: got {AXES[a]} = {index}; expected 0 … {self.shape[a] - 1}")
-        mask = None
+        keep, (rows, columns) = [b for b in range(3) if b != a], np.tril_indices(3)
+        within = np.flatnonzero((rows != a) & (columns != a))
+        cut: dict[str, Any] = {"tensors": np.take(self.tensors, index, axis=a)[..., keep, :][..., keep]}
         if self.mask is not None:
-            mask = np.take(self.mask, index, axis=a)
-            if not mask.any():
-                filled = np.flatnonzero(self.mask.any(axis=tuple(b for b in range(3) if b != a)))
+            cut["mask"] = np.take(self.mask, index, axis=a)
+            if not cut["mask"].any():
+                filled = np.flatnonzero(self.mask.any(axis=tuple(keep)))
                 where = f"{AXES[a]} = {filled[0]} … {filled[-1]}" if filled.size else "no slice at all"
                 raise ValueError(f"mask: got no voxels in slice {AXES[a]} = {index}; the mask has voxels at {where}")
-        keep = [b for b in range(3) if b != a]
-        affine = covariance = modes = None
-        rows, columns = np.tril_indices(3)
-        within = np.flatnonzero((rows != a) & (columns != a))
         if self.covariance is not None:
-            covariance = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
+            cut["covariance"] = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
         if self.modes is not None:
-            modes = np.take(self.modes, index, axis=a)[..., within]
+            cut["modes"] = np.take(self.modes, index, axis=a)[..., within]
         if self.affine is not None:
-            affine = self.affine.copy()
-            affine[:3, 3] += index * affine[:3, a]
-        return replace(
-            self,
-            tensors=np.take(self.tensors, index, axis=a)[..., keep, :][..., keep],
-            spacing=tuple(self.spacing[b] for b in keep),
-            origin=tuple(self.origin[b] for b in keep),
-            mask=mask,
-            affine=affine,
-            slice_axis=a,
-            covariance=covariance,
-            modes=modes,
-            notes=(*self.notes, f"slice {AXES[a]} = {index}: its tensors are the in-plane blocks"),
-        )
+            cut["affine"] = self.affine.copy()
+            cut["affine"][:3, 3] += index * self.affine[:3, a]
+        for name in ("spacing", "origin"):
+            cut[name] = tuple(getattr(self, name)[b] for b in keep)
+        note = f"slice {AXES[a]} = {index}: its tensors are the in-plane blocks"
+        return replace(self, **cut, slice_axis=a, notes=(*self.notes, note))
 
     def noise(self, grid: Grid) -> TensorNoise:
         """Return the noise that the fit of the tensors estimated (`fit_dwi`), by images if `modes` are known.

@@ -195,7 +195,6 @@ class TensorNoise(eqx.Module):
         return cls.relative(values, level, grid)
 
     def __repr__(self) -> str:
-        """Return one line."""
         shared = f", correlation length {self.correlation:.3g}" if self.correlation else ""
         return f"TensorNoise({self.covariance.shape[-1]} components at {self.covariance.shape[:-2]}{shared})"
 
