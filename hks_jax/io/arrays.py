@@ -14,7 +14,7 @@ from hks_jax.io.volume import Format, TensorVolume, describe_tensors
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
-def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
+def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
     """Return the array of an npy, or the array ``mask`` of an npz, and None in place of an affine."""
     if name.lower().endswith(".npy"):
         return load_npy(name), None
@@ -24,10 +24,9 @@ def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray,
     return arrays["mask"], None
 
 
-def read_tensors(
+def _read_tensors(
     name: str, order: str | None, frame: str | None, array: str | None, spacing: float | Sequence[float] | None
 ) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`."""
     wanted = array or "tensors"
     if name.lower().endswith(".npy"):
         arrays: Mapping[str, Any] = {wanted: load_npy(name)}
@@ -76,14 +75,12 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
     )
 
 
-def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars and the position of their grid; see `hks_jax.io.save`."""
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
     write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})
 
 
-def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
-    """Write the arrays that `read_tensors` reads."""
+def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     record = describe_tensors(volume, "matrix", "voxel", provenance)
     units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
     content = {"tensors": volume.tensors, **place_of(volume), "frame": "voxel", **units, "provenance": record}
@@ -108,4 +105,4 @@ def _real(name: str, value: Any) -> Float[np.ndarray, "..."]:
     return array.astype(np.float64)
 
 
-FORMAT = Format((".npz", ".npy"), read_tensors, ("array", "spacing"), read_image, (".npz",), write, write_tensors)
+FORMAT = Format((".npz", ".npy"), _read_tensors, ("array", "spacing"), _read_image, (".npz",), _write, _write_tensors)

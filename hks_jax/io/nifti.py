@@ -76,7 +76,7 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
-def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return voxel values and the affine in mm; if the file has no unit, guess it from the related affine `beside`."""
     image = load(name)
     own, unit = affine_in_mm(name, image)
@@ -231,8 +231,7 @@ def placement_notes(image: Any) -> list[str]:
     ]
 
 
-def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars with times along the fourth axis, and a slice one voxel thick; see `hks_jax.io.save`."""
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     others = sorted(extra.keys() - {"times"})
     if others:
         raise ValueError(f"extra: got {', '.join(others)}, but NIfTI allows only times. Write an .npz as well")
@@ -243,21 +242,20 @@ def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra:
         write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
     image.header["intent_name"] = name[:15].encode()
-    _write(path, image, record)
+    _store(path, image, record)
 
 
-def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
-    """Write a symmetric-matrix image; see `hks_jax.io.save_tensors`."""
+def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     if volume.dimension != 3:
         raise ValueError("volume: got a slice, but NIfTI has no 2×2 tensors. Write the volume, or .npz, .nrrd or .vti")
     require_symmetric(volume)
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)
     image.header.set_intent(SYMMETRIC_MATRIX, (3,))
-    _write(path, image, describe_tensors(volume, "nifti", "voxel", provenance))
+    _store(path, image, describe_tensors(volume, "nifti", "voxel", provenance))
 
 
-def _write(path: Path, image: Any, record: str) -> None:
+def _store(path: Path, image: Any, record: str) -> None:
     nib = optional("nibabel")
     image.header.set_xyzt_units("mm")
     image.header.extensions.append(nib.nifti1.Nifti1Extension("comment", record.encode()))
@@ -265,4 +263,4 @@ def _write(path: Path, image: Any, record: str) -> None:
         nib.save(image, temporary)
 
 
-FORMAT = Format(SUFFIXES, read_tensors, (), read_image, (".nii.gz", ".nii"), write, write_tensors, image=".nii.gz")
+FORMAT = Format(SUFFIXES, read_tensors, (), _read_image, (".nii.gz", ".nii"), _write, _write_tensors, image=".nii.gz")
