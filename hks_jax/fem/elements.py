@@ -59,11 +59,6 @@ def element_matrices(
     return (stiffness, mass) if form.checked else (symmetric_or_nan(stiffness), symmetric_or_nan(mass))
 
 
-def at_quadrature(nodal: Float[Array, "n d d"], element: Element) -> Float[Array, "q d d"]:
-    """Interpolate nodal tensors to the quadrature points with the element's shape functions."""
-    return jnp.einsum("qn,nab->qab", jnp.asarray(element.values, nodal.dtype), nodal, precision="highest")
-
-
 GAUSS = 1 / math.sqrt(3)
 """The coordinate ξ of the two Gauss points ±ξ on [−1, 1]."""
 

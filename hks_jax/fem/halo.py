@@ -8,27 +8,30 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from hks_jax.traced import is_traced
 
 
-def with_rim(x: Float[Array, "*shape"], periodic: tuple[bool, ...], first: int = 0) -> Float[Array, "*rimmed"]:
-    """Pad x by one node at both ends of the axes from ``first`` on: periodically, or by zeros."""
+def with_rim(x: Any, periodic: tuple[bool, ...], first: int = 0) -> Any:
+    """Pad x (*shape) by one node at both ends of the axes from ``first`` on: periodically, or by zeros."""
+    pad = np.pad if isinstance(x, np.ndarray) else jnp.pad
     for axis, wraps in enumerate(periodic, start=first):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
-        x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
+        x = pad(x, widths, mode="wrap" if wraps else "constant")
     return x
 
 
-def neighbours(x: Float[Array, "*rimmed"], dimension: int) -> Iterator[Float[Array, "*shape"]]:
+def neighbours(x: Any, dimension: int) -> Iterator[Any]:
     """Yield x shifted by each of 3^d offsets along its first d = ``dimension`` axes, along which x is padded."""
     after = (0,) * (x.ndim - dimension)
     shape = [n - 2 if axis < dimension else n for axis, n in enumerate(x.shape)]
     for start in product((0, 1, 2), repeat=dimension):
         start = (*start, *after)
-        yield jax.lax.slice(x, start, [s + n for s, n in zip(start, shape, strict=True)])
+        end = [s + n for s, n in zip(start, shape, strict=True)]
+        yield x[tuple(map(slice, start, end))] if isinstance(x, np.ndarray) else jax.lax.slice(x, start, end)
 
 
 def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:
