@@ -171,7 +171,7 @@ def positive_map(
     if known:
         require_finite_symmetric(name, np.asarray(tensors), inside, place)
         values = np.linalg.eigvalsh(np.asarray(tensors, np.float64)[inside])
-        got = f"number: got the {NUMBERS[how]} {float(number):g} of {name}"
+        got = f"number: got the {NUMBERS[how]} {float(number):g} for {name}"
         if how == "shift" and not float(number) + values.min() > 0:
             raise ValueError(
                 f"{got} whose least eigenvalue is {values.min():g}; expected more than {-values.min():g}, so that "

@@ -181,7 +181,7 @@ def fans(
     if polygons.ndim != 2 or size < 3 or not 0 <= used.min() <= used.max() < len(points):
         raise ValueError(
             f"{file}: got faces of shape {polygons.shape} with vertices from {used.min()} to {used.max()}; expected "
-            f"(n, 3) or more corners, and vertices from 0 to {len(points) - 1}"
+            f"at least 3 corners each, and vertices from 0 to {len(points) - 1}"
         )
     if size == 3:
         return polygons[:, None]
