@@ -128,7 +128,7 @@ class FactorisedMatrix(eqx.Module):
             if self.error > _DOUBTFUL:
                 warn_of_accuracy(
                     f"matrix: rounding in {self.matrix.dtype} causes an error of about {float(self.error):.1g} in "
-                    "log|det A|, and as large a relative error in the inverse. Use float64, or shift A slightly"
+                    "log|det A|, and the same relative error in the inverse. Use float64, or shift A slightly"
                 )
         return _nan_unless(jnp.isfinite(self.error), function(self.matrix.flat(), jax.lax.stop_gradient(self.factor)))
 
