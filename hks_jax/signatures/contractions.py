@@ -63,11 +63,7 @@ class _Bilinear(Contraction):
 
 
 class Applied(_Bilinear):
-    """The products Φ C Φᵀ w of the kernel with functionals w.
-
-    Attributes:
-        functionals: (s, n) the s functionals w.
-    """
+    """The products Φ C Φᵀ w of the kernel with functionals w."""
 
     functionals: Float[Array, "s n"]
 

@@ -175,12 +175,7 @@ class Power(Filter):
 
 
 class Custom(Filter):
-    """Any function f(parameters, λ) that JAX differentiates twice.
-
-    Attributes:
-        function: maps (parameters, λ) to f, elementwise in λ.
-        parameters: any pytree of floating point arrays.
-    """
+    """Any function f(parameters, λ) that JAX differentiates twice, elementwise in λ."""
 
     function: Callable[[Any, Array], Array] = eqx.field(static=True)
     parameters: Any

@@ -240,11 +240,7 @@ def _instantiated(tree: Any) -> Any:
 
 
 def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
-    """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ().
-
-    Raises:
-        ValueError: if a source has a wrong shape or type, is out of range, or lies outside the mask.
-    """
+    """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ()."""
     shape = pairs.space.node_shape
     array = np.asarray(sources)
     if not np.issubdtype(array.dtype, np.integer):
