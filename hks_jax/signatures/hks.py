@@ -1,4 +1,4 @@
-"""The heat kernel signature from eigenpairs, or without them at small times, and the influence of the boundary on it."""
+"""The heat kernel signature from eigenpairs, or without them at small times, and the influence of the boundary."""
 
 import math
 import warnings
