@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import ByKey
-from hks_jax.compilation import by_numpy, known_here
+from hks_jax.compilation import by_numpy, is_concrete_on_cpu
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
@@ -119,7 +119,7 @@ def _spread(
 
 
 def _by_numpy(values: Array) -> bool:
-    return np.size(values) <= _COPIED and known_here(values)
+    return np.size(values) <= _COPIED and is_concrete_on_cpu(values)
 
 
 # The indices are passed as arrays, so that sets of equally many indices share one compilation.

@@ -10,7 +10,7 @@ in JAX, and `FilteredAdjoint` a polynomial.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic
+from typing import Any, Generic
 
 import equinox as eqx
 import jax
@@ -53,11 +53,9 @@ class Adjoint(eqx.Module, Generic[P]):
     Every eigensolver has a default in its field ``adjoint``; any other that supports the pencil may replace it.
 
     Attributes:
-        warns: whether `solve` itself warns of rows that do not converge, even if values are traced.
         tolerance: the error in the energy norm, relative to the largest row. Rounding of eigenvectors is a lower bound.
     """
 
-    warns: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
 
     def __check_init__(self) -> None:
