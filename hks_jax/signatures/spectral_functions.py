@@ -19,9 +19,8 @@ from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
-from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
-from hks_jax.signatures.filters import Custom, Derivative, Filter
-from hks_jax.signatures.mixing import by_numpy, mixing, shapes, weights_of
+from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy, shapes
+from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
 from hks_jax.traced import is_traced
 
 _ROWS = 128
