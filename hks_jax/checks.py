@@ -15,14 +15,9 @@ from hks_jax.traced import is_traced
 def require_number(
     name: str, value: Any, below: float = math.inf, *, above: float = 0.0, inclusive: bool = False
 ) -> None:
-    """Raise ValueError unless a setting is a real number between two exclusive limits; traced numbers pass.
+    """Raise ValueError unless a setting is a real number between two limits; traced numbers pass.
 
-    Args:
-        name: the name of the argument.
-        value: a number, or an array without axes.
-        below: the upper limit.
-        above: the lower limit.
-        inclusive: whether the lower limit itself is allowed.
+    The limits are exclusive, except that the lower one may be inclusive.
     """
     if is_traced(value):
         return

@@ -130,17 +130,11 @@ for _unknown in (
 
 
 class _State(eqx.Module):
-    """A factorised operator.
+    """A factorised operator A."""
 
-    Attributes:
-        factor: the factorisation of A or, if A is complex, of the real symmetric matrix of its real and imaginary part.
-        hermitian: whether a complex A is Hermitian and not symmetric; None if A is real.
-        conjugate: whether the state stands for the conjugate of A.
-    """
-
-    factor: FactorisedMatrix
-    hermitian: bool | None = eqx.field(static=True)
-    conjugate: bool = eqx.field(static=True, default=False)
+    factor: FactorisedMatrix  # of A or, if A is complex, of the real symmetric matrix of its real and imaginary part
+    hermitian: bool | None = eqx.field(static=True)  # whether a complex A is Hermitian, not symmetric; None if real
+    conjugate: bool = eqx.field(static=True, default=False)  # whether the state stands for the conjugate of A
 
     def conjugated(self) -> "_State":
         return _State(self.factor, self.hermitian, self.hermitian is not None and not self.conjugate)

@@ -54,12 +54,9 @@ def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
 
 
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
-    """Return the first positive and the last eigenvalue.
+    """Return the first positive and the last eigenvalue; raise ValueError if none can be positive.
 
     A multiple eigenvalue is returned as the mean over its multiplet, which is differentiable.
-
-    Raises:
-        ValueError: if no eigenvalue can be positive.
     """
     if _n_positive(require_pairs(pairs)) < 1:
         raise ValueError(
