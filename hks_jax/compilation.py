@@ -281,11 +281,8 @@ def _abstract(*leaves: Any, linear_map: Any) -> list[Any]:
 
 
 def _full(changes: Sequence[Any]) -> list[Any]:
-    def full(change: Any) -> Any:
-        shape: Any = change.aval if isinstance(change, ad.Zero) else None
-        return change if shape is None else np.zeros(shape.shape, shape.dtype)
-
-    return list(map(full, changes))
+    shapes = [getattr(change, "aval", None) if isinstance(change, ad.Zero) else None for change in changes]
+    return [d if zero is None else np.zeros(zero.shape, zero.dtype) for d, zero in zip(changes, shapes, strict=True)]
 
 
 def _transpose(cotangents: list[Any], *leaves: Any, linear_map: _LinearMap) -> list[Any]:

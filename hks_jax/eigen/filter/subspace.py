@@ -9,6 +9,7 @@ the blocks i, i + p, i + 2p, … of rows; this balances the load, because low mo
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.dense_eigh import pencil_eigh
+from hks_jax.linear.loops import by_column_ranges
 from hks_jax.linear.products import matmul
 
 EVERYWHERE = PartitionSpec()
@@ -84,17 +86,7 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
     stiffness, mass = (jnp.moveaxis(p, 0, 1).reshape(m, m) for p in both)
     values, vectors = pencil_eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
     values, mix = (_of_first(slabs, found) for found in (values, vectors.T))
-
-    def rotate(number: Array, x: Array) -> Array:
-        rotated = matmul(mix, jax.lax.dynamic_slice_in_dim(x, number * _CHUNK, _CHUNK, axis=1))
-        return jax.lax.dynamic_update_slice_in_dim(x, rotated, number * _CHUNK, axis=1)
-
-    whole = nodes // _CHUNK
-    if whole:
-        x = jax.lax.fori_loop(0, whole, rotate, x)
-    if nodes % _CHUNK:
-        x = x.at[:, whole * _CHUNK :].set(matmul(mix, x[:, whole * _CHUNK :]))
-    return values, x
+    return values, by_column_ranges(partial(matmul, mix), _CHUNK, x)
 
 
 def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Values, x: Rows) -> tuple[Values, Values]:
