@@ -193,7 +193,7 @@ def _pairs(
     )
 
 
-@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known")))
+@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known")), most=3 << 18)
 def _quality(
     xp: Any, pencil: Any, values: Any, vectors: Any, origin: Any, n_null: int, tolerance: float, known: bool
 ) -> tuple[Any, ...]:
