@@ -168,7 +168,7 @@ class _Program(NamedTuple):
         return [own if fixed is None else fixed for own, fixed in zip(known, self.fixed, strict=True)], x
 
     def by_numpy(self, *leaves: Any) -> Any:
-        """Evaluate the function by NumPy, or return None."""
+        """Evaluate the function by NumPy, or return None if there is no rule or values are not concrete on one CPU."""
         return _apply(self.numpy_rule, self.args(*leaves), None, None)
 
 
@@ -207,7 +207,7 @@ class _LinearMap(NamedTuple):
         return list(jax.linear_transpose(forward, *self.x)(rest)) if self.transposed else forward(*rest)
 
     def by_numpy(self, *leaves: Any) -> Any:
-        """Apply the map by NumPy, or return None."""
+        """Apply the map by NumPy, or return None if there is no rule or values are not concrete on one CPU."""
         known, rest = self.split(leaves)
         x, y = (self.x, [np.asarray(each) for each in rest]) if self.transposed else (rest, None)
         args, change = self.program.split(*known[: len(known) - self.tangent * len(x)], *x)

@@ -129,11 +129,11 @@ def eigsh(
     pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the
     interval. A ``LinearOperator`` is not accepted, because K and M are factorised (by nested dissection).
 
-    First derivatives with respect to the entries of K and M are available in forward and reverse mode. At any
-    multiplicity, derivatives of signatures and of sums over all equal eigenvalues are exact. The derivative of an
-    eigenvector is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ f(λᵢ) φᵢ(x)². The
-    function works under `jit`, and under `vmap` over the entries of one pattern (map over a pencil from
-    `sparse_pencil`). Derivatives in an interval keep its ends fixed.
+    First derivatives with respect to the entries of K and M are available in forward and reverse mode. For eigenvalues
+    of any multiplicity, derivatives of signatures are exact, and of sums over all copies of an eigenvalue. The
+    derivative of an eigenvector is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ
+    f(λᵢ) φᵢ(x)². The function works under `jit`, and under `vmap` over the entries of one pattern (map over a pencil
+    from `sparse_pencil`). Derivatives in an interval keep its ends fixed.
 
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of

@@ -98,7 +98,8 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     above = np.flatnonzero(order_of_ends > 0)
     boundaries = _boundaries(level, front, depth, rows[above], cols[above])
     ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
-    # The width is at least 1 (only padding if no front is coupled), except on the first level, which has no parent.
+    # The width is at least 1; if no front is coupled to its parent, this column is padding. On the first level, which
+    # has no parent, the width is 0.
     width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
     # List each boundary node's front, and the node's place among the own and boundary nodes of the parent.
     placed = [(keys // n, slot[keys % n]) for keys in boundaries]

@@ -108,9 +108,6 @@ def log_determinant(
             surface, (0.5, 1) with a curved boundary, none on flat tori and polygons.
         time: T, in (metric length)²; by default the time with the least estimated error.
 
-    Returns:
-        The value with an estimate of its error.
-
     Raises:
         ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if pairs are in an interval,
             if an eigenvalue is negative or none is positive, or if the dimension is not known.

@@ -54,7 +54,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import recorded_boundary
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
-from hks_jax.signatures.suitable import LAST
+from hks_jax.signatures.times import LAST
 
 OPTIONS = f"""
 subjects SUBJECTS  the table of subjects

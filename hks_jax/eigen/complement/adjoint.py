@@ -2,10 +2,10 @@
 
 Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
 eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
-indefinite on the whole space. Preconditioned with K − σM, the spectrum of K − λᵢM lies between 1 and (Λ − λᵢ)/(Λ − σ).
-So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice for
-fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those in JAX, and
-`FilteredAdjoint` a polynomial.
+indefinite on the whole space. If K − λᵢM is preconditioned with K − σM, its spectrum lies between 1 and
+(Λ − λᵢ)/(Λ − σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations
+then suffice for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those
+in JAX, and `FilteredAdjoint` a polynomial.
 """
 
 from abc import abstractmethod
