@@ -52,7 +52,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         solves: the expected number of solves per preparation. For many solves, more factorisations are computed.
 
     Examples:
-        >>> solver = hj.Dense(adjoint=hj.FactorisedAdjoint(tolerance=1e-6))
+        >>> solver = hj.ShiftInvert(adjoint=hj.FactorisedAdjoint(tolerance=1e-6))
         >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
         >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
         >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike

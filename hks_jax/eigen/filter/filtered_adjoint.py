@@ -36,7 +36,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         block: the number of right-hand sides solved together.
 
     Examples:
-        >>> solver = hj.Dense(adjoint=hj.FilteredAdjoint(tolerance=1e-6))
+        >>> solver = hj.ShiftInvert(adjoint=hj.FilteredAdjoint(tolerance=1e-6))
         >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
         >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
         >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike

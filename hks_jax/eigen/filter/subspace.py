@@ -82,7 +82,8 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
         # Images stay columns. If images became rows, XLA would compute stencils in that layout, seven times slower.
         return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
-    both = _total(slabs, jax.lax.map(among_rows, jnp.arange(m // block)))
+    both = jax.lax.map(among_rows, jnp.arange(m // block))
+    both = both if slabs is None else slabs.total(both)
     stiffness, mass = (jnp.moveaxis(p, 0, 1).reshape(m, m) for p in both)
     values, vectors = pencil_eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
     values, mix = (_of_first(slabs, found) for found in (values, vectors.T))
@@ -100,13 +101,10 @@ def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Value
         terms = (image - theta * moved) ** 2, moved**2, columns * image, pencil.lumped[..., None] * columns**2
         return tuple(jnp.sum(term, tuple(range(columns.ndim - 1))) for term in terms)
 
-    sums = _total(slabs, jax.lax.map(of_block, jnp.arange(values.size // block)))
+    sums = jax.lax.map(of_block, jnp.arange(values.size // block))
+    sums = sums if slabs is None else slabs.total(sums)
     residual, moved, energy, lumped = (s.ravel() for s in sums)
     return jnp.sqrt(residual / moved), energy / lumped
-
-
-def _total(slabs: Slabs | None, tree: Any) -> Any:
-    return tree if slabs is None else slabs.total(tree)
 
 
 def _of_first(slabs: Slabs | None, x: Array) -> Array:

@@ -35,7 +35,7 @@ class HostAdjoint(Adjoint[Pencil]):
         tolerance: the error in the energy norm, relative to the largest row.
 
     Examples:
-        >>> solver = hj.Dense(adjoint=hj.HostAdjoint(tolerance=1e-6))
+        >>> solver = hj.ShiftInvert(adjoint=hj.HostAdjoint(tolerance=1e-6))
         >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
         >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
         >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike
