@@ -129,9 +129,8 @@ class Eigenpairs(eqx.Module):
     @property
     def null_space_known(self) -> bool:
         """Whether the pairs are the lowest, and the pencils' null spaces are known."""
-        if self.pencil is None:  # pairs inside a fit have no pencil; fits are for fields, whose null spaces are known
-            return self.lowest
-        return self.lowest and all(part.null_space is not None for part in self.pencil.parts)
+        # Pairs inside a fit have no pencil; fits are for fields, whose null spaces are known.
+        return self.lowest and (self.pencil is None or all(part.null_space is not None for part in self.pencil.parts))
 
     @property
     def n_null(self) -> int:
