@@ -676,11 +676,6 @@ def test_what_fit_offers_is_what_there_is():
     assert (offered["parametrisation"], offered["optimiser"]) == (tuple(PARAMETRISATIONS), tuple(OPTIMISERS))
 
 
-def test_help_does_not_wait_for_the_optimisers():
-    script = "import sys, hks_jax.cli; assert 'optimistix' not in sys.modules; hks_jax.cli.build_parser()"
-    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
-
-
 FIT_GRID = hj.Grid((14, 13), 1 / 13)
 FIT_TIMES = np.array([0.02, 0.05, 0.1])
 FIT_ARGUMENTS = ["--parametrisation", "conformal", "--h1", "1e-8"]  # the same ones compile once

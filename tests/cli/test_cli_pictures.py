@@ -160,7 +160,7 @@ def test_plot_draws_what_is_asked_for(result, tmp_path, capsys, arguments, times
     assert [p.name for p in picture.parent.iterdir()] == ["p.png"]
 
 
-@pytest.mark.parametrize("points", [[], ["--points", "1.5,4", "3,7"]])
+@pytest.mark.parametrize("points", [pytest.param([], marks=pytest.mark.slow), ["--points", "1.5,4", "3,7"]])
 def test_a_raw_signature_is_scaled_once_and_a_flat_one_never(result, tmp_path, capsys, points):
     raw = Result.read(result)
     drawn = {}

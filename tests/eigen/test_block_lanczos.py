@@ -61,7 +61,9 @@ def test_separators_halve_a_grid_so_that_batches_need_no_padding(n):
     assert dissection.padding.size == 0
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [n if n in ("torus", "mask") else pytest.param(n, marks=pytest.mark.slow) for n in CASES]
+)
 def test_factorisation_solves_and_counts(rng, name):
     pencil = problem(rng, name)
     K, M = dense_matrices(pencil)
@@ -128,7 +130,7 @@ def test_torus_multiplets_and_certificate():
     assert "none missed" in pairs.summary()
 
 
-@pytest.mark.parametrize("domain", ["torus", pytest.param("mirror", marks=pytest.mark.slow), "mesh"])
+@pytest.mark.parametrize("domain", ["torus", *(pytest.param(d, marks=pytest.mark.slow) for d in ("mirror", "mesh"))])
 def test_eigenvalues_are_counted_without_being_computed(rng, domain):
     if domain == "torus":
         pencil = hj.assemble(flat((20, 20), (1.0, 1.0), (True, True)), "periodic")

@@ -46,7 +46,9 @@ def dense_matrices(pencil):
     return np.asarray(pencil.stiffness.to_dense()), np.asarray(pencil.mass.to_dense())
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [n if n in ("torus, lumped", "mixed, mask") else pytest.param(n, marks=pytest.mark.slow) for n in CASES]
+)
 def test_products_in_columns_equal_the_operators(rng, name):
     pencil = problem(name)
     space = pencil.space

@@ -49,10 +49,11 @@ CASES = {
     "chebyshev-filter": (hks_of_grid, (8, 7, 6), 5),
     "block-lanczos, 3d, many pairs": (hks_of_grid, (8, 7, 6), 20),
 }
-QUICK = ("dense", "block-lanczos")
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in CASES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == "block-lanczos" else pytest.mark.slow) for n in CASES]
+)
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_the_jitted_gradient_of_the_default_has_no_callback(monkeypatch, name, dtype):
     monkeypatch.setattr(automatic, "_SMALL", SMALL)

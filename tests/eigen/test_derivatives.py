@@ -71,18 +71,28 @@ def hks_of(tensors, k=20, solver="dense", boundary="neumann", mass="consistent",
 TRUNCATIONS = [("generic", 60), ("identity", 58)]
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+QUICK = [
+    ("generic", 20, "dense"),
+    ("rotational", 20, "dense"),
+    ("identity", 58, "dense"),
+    ("generic", 60, "shift-invert"),
+]
+CASES = [(*case, solver) for case in [(name, 20) for name in FIELDS] + TRUNCATIONS for solver in SOLVERS]
+
+
 @pytest.mark.parametrize(
-    ("name", "k"),
-    [pytest.param(name, 20, marks=pytest.mark.slow if "1e-" in name else []) for name in FIELDS] + TRUNCATIONS,
+    ("name", "k", "solver"),
+    [case if case in QUICK else pytest.param(*case, marks=pytest.mark.slow) for case in CASES],
 )
-def test_hks_against_differences(rng, name, solver, k):
+def test_hks_against_differences(rng, name, k, solver):
     tensors = FIELDS[name](rng)
     assert hj.eigenpairs(hj.TensorField(GRID, tensors), k, solver="dense").cut_multiplet == 0
     check(partial(hks_of, k=k, solver=solver), tensors, 0.1 * symmetric(rng, SHAPE))
 
 
-@pytest.mark.parametrize("name", ["generic", "identity", "noise 1e-9"])
+@pytest.mark.parametrize(
+    "name", ["identity", *(pytest.param(n, marks=pytest.mark.slow) for n in ("generic", "noise 1e-9"))]
+)
 def test_truncated_hks_against_contour_integrals(rng, name):
     """The gradient at every node, from linear solves differentiated by JAX itself: no eigensolver anywhere."""
     tensors, k, times = FIELDS[name](rng), 20, TIMES[1:]
@@ -261,12 +271,9 @@ SIGNATURES = {
 MULTIPLE = ["heat kernel", "heat trace", "wks", "scale-invariant", "diffusion distance", "custom"]
 
 
-QUICK = ["heat kernel", "wks", "diffusion distance", "custom"]
-
-
 @pytest.mark.parametrize(
     ("name", "at"),
-    [pytest.param(name, "generic", marks=[] if name in QUICK else pytest.mark.slow) for name in SIGNATURES]
+    [pytest.param(name, "generic", marks=[] if name in ("wks", "custom") else pytest.mark.slow) for name in SIGNATURES]
     + [pytest.param(n, "rotational", marks=[] if n == "heat kernel" else pytest.mark.slow) for n in MULTIPLE],
 )
 def test_every_signature_against_differences(rng, name, at):
@@ -309,7 +316,7 @@ SHARP = {
 }
 
 
-@pytest.mark.parametrize("name", SHARP)
+@pytest.mark.parametrize("name", ["root", *(pytest.param(n, marks=pytest.mark.slow) for n in ("step", "constant"))])
 def test_filters_with_sharp_transitions_or_no_derivative_at_zero(rng, name):
     function, parameter = SHARP[name]
 

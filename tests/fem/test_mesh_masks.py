@@ -30,7 +30,7 @@ def left(kind, vertices, cells, inside):
     return kind(vertices[numbers], cells.reshape(kept.shape)), numbers
 
 
-@pytest.mark.parametrize("boundary", ["neumann", "dirichlet", "mean"])
+@pytest.mark.parametrize("boundary", ["dirichlet", "mean", pytest.param("neumann", marks=pytest.mark.slow)])
 def test_a_mask_leaves_the_same_as_renumbering(whole, boundary):
     kind, vertices, cells, inside = whole
     other, numbers = left(*whole)

@@ -47,6 +47,7 @@ def test_harmonic_oscillator(d):
     assert 1.7 < order < 2.4
 
 
+@pytest.mark.slow
 def test_finite_well_has_its_bound_states_below_zero():
     """V = −8 for |x₁| < 1, on elements; with y periodic the states are those of the line, plus (2πm/L)²."""
     n, periodic, depth = 65, 16, 8.0
@@ -74,6 +75,7 @@ def test_finite_well_has_its_bound_states_below_zero():
     assert at_zero[n // 2] > np.exp(6) / 12
 
 
+@pytest.mark.slow
 def test_gaussian_weight_has_hermite_polynomials_for_eigenfunctions():
     """−ρ⁻¹ div(ρ∇·), ρ = exp(−|x|²): 2n; as an argument and as a form."""
     field = euclidean(25, 4.0)

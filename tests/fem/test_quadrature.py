@@ -127,6 +127,7 @@ def test_potentials_and_densities_are_taken_at_the_points_of_the_mass(rng):
     np.testing.assert_allclose(hj.hks(others, [8.0]), np.exp(-24) / 2 * hj.hks(pairs, [8.0]), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_spacings_are_tensors_of_another_size(rng):
     tensors, spacing = random_spd(rng, (4, 3, 3)), np.array([0.5, 2.0, 0.3])
     scaled = tensors * spacing[:, None] * spacing
@@ -166,7 +167,9 @@ MASK = np.ones((5, 4), bool)
 MASK[:2, 2:] = False
 
 
-@pytest.mark.parametrize("boundary", ["neumann", "mean", ("dirichlet", "periodic")])
+@pytest.mark.parametrize(
+    "boundary", [pytest.param("neumann", marks=pytest.mark.slow), "mean", ("dirichlet", "periodic")]
+)
 def test_masks_give_the_same_on_all_nodes(rng, boundary):
     # Signatures of concrete values work on all nodes of the grid; under `jit` nothing does.
     mask = np.ones((7, 6), bool)

@@ -79,6 +79,7 @@ def test_a_fibre_on_a_surface_through_an_oblique_volume(tmp_path, volume, name, 
     np.testing.assert_allclose(lowest, np.pi**2 * ACROSS / 64, rtol=0.02)
 
 
+@pytest.mark.parametrize("volume", [1, pytest.param(-1, marks=pytest.mark.slow)], indirect=True)
 def test_the_command_line_and_what_is_refused(tmp_path, volume, capsys):
     image, affine = volume
     places, faces = square(affine)

@@ -116,7 +116,14 @@ def test_merged_levels_solve_as_the_tree_does(rng, monkeypatch, domain, traffic)
         np.testing.assert_allclose(factor.solve(rhs), exact, atol=1e-10 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize(("n", "b", "dtype"), [(1, 1, float), (1100, 8, float), (300, 8, np.float32), (70, 20, float)])
+@pytest.mark.parametrize(
+    ("n", "b", "dtype"),
+    [
+        (1, 1, float),
+        (300, 8, np.float32),
+        *(pytest.param(*c, float, marks=pytest.mark.slow) for c in [(1100, 8), (70, 20)]),
+    ],
+)
 def test_kernels_of_columns(rng, interpreted, n, b, dtype):
     x, y, z = (jnp.asarray(rng.standard_normal((n, b)).astype(dtype)) for _ in range(3))
     mix, tolerance = jnp.asarray(rng.standard_normal((b, b)).astype(dtype)), 1e4 * np.finfo(dtype).eps

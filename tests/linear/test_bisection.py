@@ -78,7 +78,9 @@ def test_single_vertices_beside_a_graph_do_not_turn_its_cuts():
     assert np.sum(level == 0) <= 20 * 1.2
 
 
-def test_products_with_a_few_long_rows(matrix, rng):
+@pytest.mark.parametrize("name", ["components", "arrow"])
+def test_products_with_a_few_long_rows(name, rng):
+    matrix = GRAPHS[name](rng)
     operator = hj.sparse_pencil(matrix).stiffness
     x = rng.standard_normal((matrix.shape[0], 3))
     np.testing.assert_allclose(operator.of_columns()(jnp.asarray(x)), matrix @ x, atol=1e-12)
@@ -98,7 +100,11 @@ def test_tables_of_a_pattern_are_arguments_of_what_is_compiled(matrix, rng):
     np.testing.assert_array_equal(pencil.stiffness.diagonal(), matrix.diagonal())
 
 
-def test_factorisation_of_any_pattern_solves_and_counts(matrix, rng):
+@pytest.mark.parametrize(
+    "name", [n if n in ("random", "components") else pytest.param(n, marks=pytest.mark.slow) for n in GRAPHS]
+)
+def test_factorisation_of_any_pattern_solves_and_counts(name, rng):
+    matrix = GRAPHS[name](rng)
     pencil = hj.sparse_pencil(matrix)
     factor = factorise(dissect(pencil.pattern), pencil.stiffness.flat())
     spectrum = np.linalg.eigvalsh(matrix.toarray())

@@ -88,6 +88,7 @@ def test_derivatives_under_vmap_of_first_and_second_order(rng, kind):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-7, atol=1e-8), found, expected)
 
 
+@pytest.mark.slow
 def test_sparse_operators_of_which_one_is_large(rng):
     """Not made full, which would take 1600² numbers."""
     n = 40

@@ -105,7 +105,7 @@ def test_third_derivatives_are_refused():
         along(along(along(lambda A: hj.matrix_function(A, jnp.exp))))(jnp.eye(2))
 
 
-@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("double", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_of_a_pencil_it_is_f_of_the_quotient_times_the_inverse(rng, double):
     """f(B⁻¹A) B⁻¹ = B^(−½) f(B^(−½) A B^(−½)) B^(−½), here with A of three equal eigenvalues against B."""
     root = with_spectrum(rng, [0.5, 0.8, 1.0, 1.4, 2.0])

@@ -59,7 +59,9 @@ def entries_and_dense(pencil, shift=POLE):
     return shifted(pencil.stiffness, pencil.mass, shift), np.asarray(matrix)
 
 
-@pytest.mark.parametrize("name", DOMAINS)
+@pytest.mark.parametrize(
+    "name", [n if n in ("slot", "few nodes", "volume") else pytest.param(n, marks=pytest.mark.slow) for n in DOMAINS]
+)
 def test_it_is_the_diagonal_of_the_dense_inverse(name):
     pencil = hj.assemble(*DOMAINS[name]())
     entries, matrix = entries_and_dense(pencil)

@@ -28,7 +28,9 @@ def exact(field, boundary, u):
     return np.stack([expm(-t * A) @ np.asarray(pencil.space.restrict(jnp.asarray(u))) for t in TIMES]), pencil.space
 
 
-@pytest.mark.parametrize(("boundary", "k"), [("dirichlet", 11), (("neumann", "mirror"), 42)])
+@pytest.mark.parametrize(
+    ("boundary", "k"), [pytest.param("dirichlet", 11, marks=pytest.mark.slow), (("neumann", "mirror"), 42)]
+)
 def test_heat_flow_is_the_matrix_exponential(field, boundary, k, rng):
     u = np.where(field.grid.inside, rng.standard_normal(SHAPE), np.nan)
     plain = boundary if k == 11 else "neumann"  # a mirrored function flows as with natural sides

@@ -182,7 +182,7 @@ SIGNATURES = {
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[] if name in ("hks", "wks", "heat flow") else pytest.mark.slow) for name in SIGNATURES],
+    [pytest.param(name, marks=[] if name == "hks" else pytest.mark.slow) for name in SIGNATURES],
 )
 def test_signatures_are_those_of_the_domain(name):
     """The matrices of a mesh, with null vectors and geometry said: the same signatures and derivatives."""
@@ -401,6 +401,7 @@ def test_an_empty_interval_has_signatures_and_derivatives():
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_counts_take_matrices_and_the_checks_of_eigenpairs():
     K, M = sp.diags([1.0, 2.0, 2.0, 5.0]).tocsr(), sp.diags([1.0, 1.0, 1.0, 2.0]).tocsr()
     assert int(hj.count_eigenvalues((K, M), 2.2)) == 3
