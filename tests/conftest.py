@@ -30,7 +30,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 jax.config.update("jax_traceback_in_locations_limit", 0)
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # nor in the processes that tests start
 # Tracing makes many objects that live, among which the collector, at its usual pace, looks for garbage in vain.
-gc.set_threshold(50_000, 20, 50)
+gc.set_threshold(200_000, 20, 50)
 matplotlib.use("Agg")
 
 
@@ -41,8 +41,8 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_what_was_compiled() -> Iterator[None]:
-    """Clear the caches once the process has needed 2 GiB: a thousand tests compile more than fits into memory."""
+    """Clear the caches once the process has needed 4 GiB: a thousand tests compile more than fits into memory."""
     yield
-    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 2 << 20:  # KiB
+    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 4 << 20:  # KiB
         jax.clear_caches()
         gc.collect()

@@ -127,7 +127,7 @@ def test_an_anisotropic_torus_converges_to_its_chart(metric):
     [
         pytest.param("tensor", "linear", marks=pytest.mark.slow),
         pytest.param("inverse", "linear", marks=pytest.mark.slow),
-        ("adjugate", "linear"),
+        pytest.param("adjugate", "linear", marks=pytest.mark.slow),
         ("inverse", "log-euclidean"),
     ],
 )

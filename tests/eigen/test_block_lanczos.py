@@ -234,6 +234,7 @@ def test_counts_are_right_at_eigenvalues_of_parts_of_the_domain(rng):
     assert int(at_one(float(spectrum[20]))) in (-1, 20, 21)
 
 
+@pytest.mark.slow
 def test_a_count_at_a_square_of_unit_metric():
     """A shift at which the elimination without pivots counts 72."""
     assert int(hj.count_eigenvalues(flat((16, 16), (15.0, 15.0)), 3.6491651253263275)) == 63

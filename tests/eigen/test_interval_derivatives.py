@@ -169,6 +169,7 @@ def lattice_pattern(n: int) -> sp.csr_matrix:
     return (sp.eye(n, k=1) + sp.eye(n, k=-1)).tocsr()
 
 
+@pytest.mark.slow
 def test_no_second_derivatives():
     pencil = hj.sparse_pencil(sp.diags(np.arange(1.0, 9)).tocsr())
 

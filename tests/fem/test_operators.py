@@ -103,8 +103,9 @@ def test_gaussian_weight_has_hermite_polynomials_for_eigenfunctions():
     np.testing.assert_allclose(hj.eigenpairs(nodal, 6).eigenvalues, exact[:6], atol=0.3)
 
 
-@pytest.mark.parametrize("mass", ["consistent", pytest.param("lumped", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("solver", ["shift-invert", pytest.param("chebyshev-filter", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mass", ["consistent", "lumped"])
+@pytest.mark.parametrize("solver", ["shift-invert", "chebyshev-filter"])
 def test_solvers_for_positive_matrices_count_from_the_potential_s_minimum(rng, solver, mass):
     """Also where it is far below the spectrum, and where all of it is far above zero; with derivatives."""
     n, spike = (25, 0) if solver == "chebyshev-filter" else (15, -3e4)

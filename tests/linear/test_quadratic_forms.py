@@ -35,7 +35,7 @@ def test_transpose(rng, shape):
     """Of symmetric matrices: the transpose may have their upper triangle alone, twice."""
     matrices, vectors, matters = problem(rng, shape)
     weights = jnp.asarray(rng.normal(size=(shape[0], shape[2])))
-    (got,) = jax.linear_transpose(lambda c: quadratic_forms(c, vectors, matters), matrices)(weights)
+    (got,) = jax.jit(jax.linear_transpose(lambda c: quadratic_forms(c, vectors, matters), matrices))(weights)
     expected = np.einsum("mn,in,jn->mij", weights, vectors, vectors, optimize=True)
     counts = np.asarray(matters[:, :, None] | matters[:, None, :])
     both = np.asarray(got + jnp.swapaxes(got, 1, 2))
@@ -46,9 +46,10 @@ def test_rows_that_do_not_matter_are_left_out(rng):
     """That is where the time is saved; what stands there does not count."""
     matrices, vectors, _ = problem(rng, (2, 130, 50))
     matters = jnp.arange(130) < jnp.asarray([[64], [0]])
-    expected = quadratic_forms(matrices.at[0, 64:, 64:].set(0), vectors, jnp.ones_like(matters))[0]
+    run = jax.jit(quadratic_forms)
+    expected = run(matrices.at[0, 64:, 64:].set(0), vectors, jnp.ones_like(matters))[0]
     spoiled = matrices.at[0, 64:, 64:].set(np.nan).at[1].set(np.nan)
-    got = quadratic_forms(spoiled, vectors, matters)
+    got = run(spoiled, vectors, matters)
     np.testing.assert_allclose(got[0], expected, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_array_equal(got[1], 0)
 

@@ -190,6 +190,7 @@ def draw(name, tmp_path, drawn, monkeypatch, size=None, time=None):
 
 
 @pytest.mark.usefixtures("cheap")
+@pytest.mark.slow
 def test_figure_1_shows_a_surface_and_its_chart(tmp_path, drawn, monkeypatch):
     fig = draw("figure1", tmp_path, drawn, monkeypatch, size=(60, 10))
     assert [ax.name for ax in fig.axes[:4]] == ["3d", "3d", "rectilinear", "rectilinear"]

@@ -334,6 +334,7 @@ def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatc
     assert more["vmax"] - more["vmin"] == pytest.approx(0.01 * values.max(), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_fit_is_the_same_picture_too(monkeypatch, tmp_path):
     """The ellipses of the metric turn with the images."""
     monkeypatch.setattr("hks_jax.plot.fit._draw_loss", lambda ax, fit: None)

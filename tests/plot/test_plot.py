@@ -1,6 +1,5 @@
 """The pictures: what is drawn is where, as large and as coloured as the mathematics says."""
 
-
 import numpy as np
 import pytest
 from annotations import unchecked

@@ -317,6 +317,7 @@ def test_as_many_pairs_as_rigid_modes():
     assert pairs.residuals.max() < 1e-10
 
 
+@pytest.mark.slow
 def test_too_few_pairs_of_an_interval_are_told():
     K, M = graph()
     pencil = hj.sparse_pencil(K, M)

@@ -31,7 +31,7 @@ def test_noise_has_the_covariance_asked_for(rng, d, rank):
     m = d * (d + 1) // 2
     covariance = random_covariance(rng, (4,), m, rank)
     noise = hj.TensorNoise(covariance)
-    J = jax.jacobian(lambda white: components(noise.tensors(white)))(jnp.zeros((4, m))).reshape(4 * m, 4 * m)
+    J = jax.jit(jax.jacobian(lambda white: components(noise.tensors(white))))(jnp.zeros((4, m))).reshape(4 * m, 4 * m)
     found = (J @ J.T).reshape(4, m, 4, m)
     for i in range(4):
         np.testing.assert_allclose(found[i, :, i], covariance[i], atol=1e-12)
@@ -43,7 +43,7 @@ def test_noise_has_the_covariance_asked_for(rng, d, rank):
 def test_neighbours_share_noise_as_blurred_white_noise_does():
     grid = hj.Grid((3, 24), (0.7, 0.5))
     noise = hj.TensorNoise(np.tile(np.eye(3), (3, 24, 1, 1)), grid, correlation=0.9)
-    J = jax.jacobian(lambda white: components(noise.tensors(white))[1, :, 0])(jnp.zeros((3, 24, 3)))
+    J = jax.jit(jax.jacobian(lambda white: components(noise.tensors(white))[1, :, 0]))(jnp.zeros((3, 24, 3)))
     C = np.einsum("aijk,bijk->ab", J, J)
     np.testing.assert_allclose(np.diag(C), 1, atol=1e-12)
     r = 0.5 * np.arange(6)
@@ -77,7 +77,7 @@ def test_the_derivative_by_the_noise_says_which_measurement_matters(rng):
         return hj.uncertainty(volume, D, hj.TensorNoise(covariance), method="exact").deviation ** 2
 
     slope = jax.jit(jax.grad(variance))(jnp.asarray(1e-3 * random_covariance(rng, (5, 4), 3)))
-    g = jax.grad(volume)(jnp.asarray(D))
+    g = jax.jit(jax.grad(volume))(jnp.asarray(D))
     parts = components(g + np.swapaxes(g, -1, -2)) * np.where(np.equal(*np.tril_indices(2)), 0.5, 1.0)
     symmetric = (slope + np.swapaxes(slope, -1, -2)) / 2
     np.testing.assert_allclose(symmetric, parts[..., :, None] * parts[..., None, :], rtol=1e-8, atol=1e-14)
