@@ -41,8 +41,8 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_what_was_compiled() -> Iterator[None]:
-    """Clear the caches once the process has needed 4 GiB: a thousand tests compile more than fits into memory."""
+    """Clear the caches once the process has needed 3 GiB: a thousand tests compile more than fits into memory."""
     yield
-    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 4 << 20:  # KiB
+    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 3 << 20:  # KiB
         jax.clear_caches()
         gc.collect()

@@ -6,9 +6,10 @@ import numpy as np
 
 def directional(f, x, direction, step: float = 4e-3):
     """The derivative of f at x by central differences, two Richardson extrapolations: error O(step⁶)."""
+    x, direction = np.asarray(x), np.asarray(direction)  # of which no program is compiled for every operation
 
     def central(h):
-        return (f(x + h * direction) - f(x - h * direction)) / (2 * h)
+        return (np.asarray(f(x + h * direction)) - np.asarray(f(x - h * direction))) / (2 * h)
 
     a, b, c = (central(step / 2**i) for i in range(3))
     return (16 * (4 * c - b) / 3 - (4 * b - a) / 3) / 15

@@ -199,6 +199,7 @@ def test_nodal_expansion_in_float32_is_sound_up_to_30_h_squared():
     np.testing.assert_allclose(got, expected, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_slip_u2_as_printed_leaves_an_error_of_order_two():
     def right(v):
         K = torus_curvature(v)
@@ -248,6 +249,7 @@ def test_slip_varadhan_is_a_limit_of_small_times():
     assert inside == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.slow
 def test_slip_laplacian_without_its_minus_goes_with_a_negative_mass():
     """div grad is negative: with Δf = div grad f the weak form is Kφ = −λMφ, and all λ ≤ 0; heat would grow."""
     n = 33

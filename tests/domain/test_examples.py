@@ -9,6 +9,7 @@ from hks_jax.domain import examples
 from hks_jax.domain.examples import phantom
 
 
+@pytest.mark.slow
 def test_bumpy_torus_mesh_and_field_are_one_surface():
     mesh, field = examples.bumpy_torus_mesh(160), examples.bumpy_torus_field(160)
     inner, outer = hj.assemble(mesh).volume, hj.assemble(field, "periodic").volume

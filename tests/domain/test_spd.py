@@ -1,5 +1,7 @@
 """Functions of small symmetric matrices against SciPy's, where eigenvalues are apart, close, and equal."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,16 @@ def matrices(rng, d, spread):
     return (found + np.swapaxes(found, 1, 2)) / 2
 
 
+@partial(jax.jit, static_argnums=0)
+def along(f, x, direction):
+    return jax.jvp(f, (x,), (direction,))
+
+
+@jax.jit
+def pulled_back(S, weights):
+    return jax.grad(lambda S: jnp.vdot(spd.exp(S), weights))(S)
+
+
 @pytest.mark.parametrize("spread", [0.0, 1e-9, 1e-4, 0.2, 2.0])
 @pytest.mark.parametrize("d", [2, 3])
 def test_exponential_logarithm_and_their_derivatives_agree_with_scipy(rng, d, spread):
@@ -26,14 +38,14 @@ def test_exponential_logarithm_and_their_derivatives_agree_with_scipy(rng, d, sp
     direction = direction + np.swapaxes(direction, 1, 2)
     expected = expm(S)
     slope = np.stack([expm_frechet(a, b, compute_expm=False) for a, b in zip(S, direction, strict=True)])
-    got, got_slope = jax.jvp(spd.exp, (jnp.asarray(S),), (jnp.asarray(direction),))
+    got, got_slope = along(spd.exp, S, direction)
     np.testing.assert_allclose(got, expected, atol=1e-13 * np.abs(expected).max())
     np.testing.assert_allclose(got_slope, slope, atol=1e-13 * np.abs(slope).max())
     # The logarithm undoes both; its own derivative is applied to that of the exponential.
-    back, back_slope = jax.jvp(spd.log, (jnp.asarray(expected),), (jnp.asarray(slope),))
+    back, back_slope = along(spd.log, expected, slope)
     np.testing.assert_allclose(back, S, atol=1e-12)
     np.testing.assert_allclose(back_slope, direction, atol=1e-11)
-    gradient = jax.grad(lambda S: jnp.vdot(spd.exp(S), jnp.asarray(direction)))(jnp.asarray(S))
+    gradient = pulled_back(S, direction)
     np.testing.assert_allclose(gradient, slope, atol=1e-13 * np.abs(slope).max())
 
 
@@ -45,17 +57,15 @@ def test_large_and_small_exponents():
 
 def test_second_derivatives_where_eigenvalues_are_equal():
     """exp(S + hD) = exp S (1 + hD + h²D²/2 + …) where S is a multiple of the identity."""
-    D = jnp.asarray([[0.3, 0.7], [0.7, -1.1]])
-    S = 0.4 * jnp.eye(2)
+    D2, D3 = np.array([[0.3, 0.7], [0.7, -1.1]]), np.array([[0.3, 0.7, 0.1], [0.7, -1.1, 0.2], [0.1, 0.2, 0.5]])
 
-    def second(f, at):
+    @partial(jax.jit, static_argnums=0)
+    def second(f, at, D):
         return jax.jvp(lambda x: jax.jvp(f, (x,), (D,))[1], (at,), (D,))[1]
 
-    np.testing.assert_allclose(second(spd.exp, S), np.exp(0.4) * D @ D, rtol=1e-13)
-    np.testing.assert_allclose(second(spd.log, 2 * jnp.eye(2)), -D @ D / 4, rtol=1e-13)
-    D3 = jnp.asarray([[0.3, 0.7, 0.1], [0.7, -1.1, 0.2], [0.1, 0.2, 0.5]])
-    got = jax.jvp(lambda x: jax.jvp(spd.exp, (x,), (D3,))[1], (0.4 * jnp.eye(3),), (D3,))[1]
-    np.testing.assert_allclose(got, np.exp(0.4) * D3 @ D3, rtol=1e-12)
+    np.testing.assert_allclose(second(spd.exp, 0.4 * np.eye(2), D2), np.exp(0.4) * D2 @ D2, rtol=1e-13)
+    np.testing.assert_allclose(second(spd.log, 2 * np.eye(2), D2), -D2 @ D2 / 4, rtol=1e-13)
+    np.testing.assert_allclose(second(spd.exp, 0.4 * np.eye(3), D3), np.exp(0.4) * D3 @ D3, rtol=1e-12)
 
 
 def test_no_logarithm_of_what_is_not_positive_definite():

@@ -192,6 +192,7 @@ def of_one_half(pencil):
     return scipy.linalg.eigh(K, M, eigvals_only=True)
 
 
+@pytest.mark.slow
 def test_a_shift_where_a_front_is_singular_is_moved(rng):
     pencil = problem(rng, "neumann")
     dissection = dissect(pencil.pattern)

@@ -248,6 +248,7 @@ def test_degrees_are_bounded_however_wide_the_band(dtype, low):
     assert degree == pytest.approx(min(exact, MOST_DEGREE), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_rounds_in_steps_give_the_same_and_say_what_is_left(monkeypatch):
     pencil, k, solver, told = problem("2d"), 24, hj.ChebyshevFilter(block=8), []
     whole = hj.eigenpairs(pencil, k, solver=solver)

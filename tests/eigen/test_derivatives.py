@@ -272,7 +272,7 @@ MULTIPLE = ["heat kernel", "heat trace", "wks", "scale-invariant", "diffusion di
 
 @pytest.mark.parametrize(
     ("name", "at"),
-    [pytest.param(name, "generic", marks=[] if name in ("wks", "custom") else pytest.mark.slow) for name in SIGNATURES]
+    [pytest.param(name, "generic", marks=[] if name == "custom" else pytest.mark.slow) for name in SIGNATURES]
     + [pytest.param(n, "rotational", marks=[] if n == "heat kernel" else pytest.mark.slow) for n in MULTIPLE],
 )
 def test_every_signature_against_differences(rng, name, at):

@@ -121,10 +121,11 @@ def one(_, x):
     return jnp.ones_like(x)
 
 
-SIMPLE = pytest.param(lambda: indefinite(300), 12, marks=pytest.mark.slow)
+SIMPLE = (lambda: indefinite(300), 12)
 MULTIPLE = (lambda: (lattice(18), sp.eye(324)), 9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("matrices", "k"), [SIMPLE, MULTIPLE])
 def test_gradients_at_simple_and_multiple_eigenvalues(rng, matrices, k):
     K, M = matrices()

@@ -162,10 +162,10 @@ def test_nodes_outside_the_mask_have_no_influence_and_no_gradient(rng):
         x = jnp.cos(jnp.arange(pencil.space.n_dof))
         return x @ (pencil.stiffness @ x) + x @ (pencil.mass @ x)
 
-    poisoned = tensors.at[:3, :3].set(jnp.nan)
-    assert np.isnan(poisoned).any()
+    poisoned = np.array(tensors)
+    poisoned[:3, :3] = np.nan
     assert energy(poisoned) == energy(tensors)
-    gradient = jax.grad(energy)(poisoned)
+    gradient = np.asarray(jax.grad(energy)(poisoned))
     assert np.isfinite(gradient).all()
     np.testing.assert_array_equal(gradient[:3, :3], 0)
     assert (np.abs(gradient[mask]).max(axis=(-2, -1)) > 0).all()

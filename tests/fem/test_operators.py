@@ -290,6 +290,7 @@ def test_components_know_masks_and_boundaries(rng):
         assert np.isnan(pairs.eigenfunctions[:, 0, 0]).all()
 
 
+@pytest.mark.slow
 def test_forms_on_a_surface_see_space(rng):
     """The gradient is tangential, and the metric that of the mesh, whatever the order of a triangle's vertices."""
     torus = hj.examples.bumpy_torus_mesh(8)

@@ -97,7 +97,7 @@ def test_only_a_step_with_a_tight_linear_system_may_be_the_last(changes, tight, 
     assert (bool(state.tight), bool(state.done)) == (tight, done)
 
 
-@pytest.mark.parametrize("start", [2.0, 1.0])
+@pytest.mark.parametrize("start", [2.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_an_exact_solution_is_an_end(start):
     """In float32 the root of x² − 4 has no residual, so that the gradient is zero and no step is left."""
     solution = optx.least_squares(lambda x, _: x**2 - 4, GaussNewton(), jnp.full(1, start, jnp.float32), max_steps=20)

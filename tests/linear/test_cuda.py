@@ -66,7 +66,7 @@ COMPUTATIONS = {
     "matrix function": (lambda T: hj.matrix_function(T[0, 0], jnp.exp), PLANE),
     "batch": (lambda T: jax.vmap(lambda T: signature(grid(T), "block-lanczos"))(jnp.stack([T, T])), PLANE),
 }
-DIFFERENTIATED = ["block Lanczos", "dense", "filter", "mirror", "surface", "colouring", "selected inversion", "batch"]
+DIFFERENTIATED = ["dense", "block Lanczos", "filter", "mirror", "surface", "colouring", "selected inversion", "batch"]
 
 
 def cases(names):

@@ -186,8 +186,11 @@ def decimal_tanh(x):
 
 @pytest.mark.parametrize(
     ("f", "exact"),
-    [(jnp.exp, Decimal.exp), (lambda x: 1 / (1 + x * x), lambda x: 1 / (1 + x * x)), (jnp.tanh, decimal_tanh)],
-    ids=["exp", "1/(1 + x²)", "tanh"],
+    [
+        pytest.param(jnp.exp, Decimal.exp, id="exp"),
+        pytest.param(lambda x: 1 / (1 + x * x), lambda x: 1 / (1 + x * x), id="1/(1 + x²)"),
+        pytest.param(jnp.tanh, decimal_tanh, id="tanh", marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("scale", [1, 30])
 def test_second_divided_differences(f, exact, scale):

@@ -29,7 +29,7 @@ def of_spectrum(rng, values):
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("n", [1, 7, 32, 75, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [1, 75, *(pytest.param(n, marks=pytest.mark.slow) for n in (7, 32, 200))])
 def test_inverse_and_inertia_of_indefinite_matrices(rng, way, n):
     a = rng.standard_normal((3, n, n))
     a = a + np.swapaxes(a, 1, 2)

@@ -295,7 +295,7 @@ def test_evenly_spaced_lines_cover_and_keep_their_distance(index, which):
 
 
 def test_circles_close():
-    lines = evenly_spaced_lines(rotating_field(1), "minor", separation=0.15)
+    lines = evenly_spaced_lines(rotating_field(1, n=41), "minor", separation=0.15)
     full = [line for line in lines if np.linalg.norm(line, axis=1).max() < 0.97]
     closed = [line for line in full if np.array_equal(line[0], line[-1])]
     assert len(closed) >= 4

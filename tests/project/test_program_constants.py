@@ -66,5 +66,6 @@ def test_the_filter_has_no_constants_of_the_grids_size():
     assert bytes_of_constants(pairs_by(ChebyshevFilter()), (SIDE, SIDE)) < FEW + 2 * 36 * SIDE
 
 
+@pytest.mark.slow
 def test_block_lanczos_has_nothing_but_the_elimination_tree_for_constants():
     assert bytes_of_constants(pairs_by(BlockLanczos()), (SIDE, SIDE)) < FEW + 80 * SIDE**2

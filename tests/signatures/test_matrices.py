@@ -129,7 +129,7 @@ def test_hks_and_its_derivative_by_the_entries(name, rng):
     np.testing.assert_allclose(backward, forward, rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n == "P2" else ()) for n in PROBLEMS])
 def test_zeros_are_counted(name):
     matrices, zeros = PROBLEMS[name]
     K, M = matrices()

@@ -142,7 +142,7 @@ def test_few_vectors_serve_a_large_grid_and_the_bound_is_not_absurd():
     [
         ((13, 12), "neumann", "consistent"),
         pytest.param((9, 8), ("periodic", "periodic"), "consistent", marks=pytest.mark.slow),
-        ((8, 9), ("periodic", "periodic"), "lumped"),
+        pytest.param((8, 9), ("periodic", "periodic"), "lumped", marks=pytest.mark.slow),
         pytest.param((8, 11), ("periodic", ("dirichlet", "neumann")), "consistent", marks=pytest.mark.slow),
         pytest.param((8, 7), "mirror", "lumped", marks=pytest.mark.slow),
         pytest.param(

@@ -25,7 +25,7 @@ def quietly(*args, **settings):
         return hj.uncertainty(*args, **settings)
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rank", [pytest.param(1, marks=pytest.mark.slow), None])
 def test_noise_has_the_covariance_asked_for(rng, d, rank):
     m = d * (d + 1) // 2
@@ -198,7 +198,7 @@ def test_roughness_tells_the_level_on_smooth_fields(rng):
     assert abs(np.median(ratio) - 1) < 0.1
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_smoothing_is_log_euclidean_and_keeps_to_the_mask(rng, d):
     shape = (7, 6, 5)[:d]
     mask = rng.random(shape) < 0.8
