@@ -199,6 +199,7 @@ def test_covariances_agree_with_the_wild_bootstrap(scan, rng):
     assert abs(np.mean(ratios) - 1) < 0.1
 
 
+@pytest.mark.slow
 def test_the_error_of_anisotropy_is_that_of_koay(scan, rng):
     noisy_scan(scan, 30, rng)
     fit = scan.fit(head(), noise="residuals")

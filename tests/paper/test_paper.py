@@ -100,6 +100,7 @@ def test_table_files_state_their_conventions(tmp_path, monkeypatch):
 # --- triangles --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_which_triangles_violate_the_inequality():
     """None on smooth fields at the figures' sizes; some, by every rule, where a grid is coarse for its field."""
     counts = {(n, rule): triangles.count(figure3_fields(n)["T³"], rule) for n in (11, 51) for rule in triangles.LENGTHS}

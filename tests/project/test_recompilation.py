@@ -135,6 +135,7 @@ def test_tolerances_of_fits_compile_nothing_anew(optimiser):
     assert len(fine.history) > len(rough.history)
 
 
+@pytest.mark.slow
 def test_all_slices_are_one_compilation(rng):
     pencil = hj.assemble(hj.TensorField(hj.Grid((21, 22)), random_spd(rng, (21, 22))))
     told = []

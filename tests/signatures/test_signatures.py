@@ -345,6 +345,7 @@ def test_bad_sources(pairs, sources, message):
         hj.heat_kernel(pairs, [0.5], sources)
 
 
+@pytest.mark.slow
 def test_shape_dna_of_pairs_that_are_not_kept_has_a_gradient():
     field = hj.TensorField(hj.Grid((12, 12), 1 / 11), jnp.broadcast_to(jnp.eye(2), (12, 12, 2, 2)))
 
