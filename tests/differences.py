@@ -6,7 +6,7 @@ import numpy as np
 
 def directional(f, x, direction, step: float = 4e-3):
     """The derivative of f at x by central differences, two Richardson extrapolations: error O(step⁶)."""
-    x, direction = np.asarray(x), np.asarray(direction)  # of which no program is compiled for every operation
+    x, direction = np.asarray(x), np.asarray(direction)  # NumPy compiles no operation
 
     def central(h):
         return (np.asarray(f(x + h * direction)) - np.asarray(f(x - h * direction))) / (2 * h)

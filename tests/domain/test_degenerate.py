@@ -19,9 +19,8 @@ def plane(grid):
     return grid.nodes[..., 0] + 1j * grid.nodes[..., 1]
 
 
-@pytest.mark.parametrize(
-    "n", [20, 21, pytest.param(40, marks=pytest.mark.slow)]
-)  # the point is at a node, or in the middle of a cell
+# The point is at a node, or in the middle of a cell.
+@pytest.mark.parametrize("n", [20, 21, pytest.param(40, marks=pytest.mark.slow)])
 def test_the_papers_points(n):
     for index in INDICES:
         points = hj.degenerate_points(hj.examples.degenerate_point_field(index, n))
