@@ -40,7 +40,7 @@ from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.io import TensorVolume, read_mask, read_mesh, read_mesh_arrays, sample_tensors
+from hks_jax.io import read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN, is_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.result import Result
@@ -49,7 +49,9 @@ from hks_jax.optional import optional
 
 OPTIONS = f"""
 @file @metric {READING} @output {SOLVING}
---through I,J,K  voxel through which the slices in the picture of a volume pass (default: a voxel in the middle)
+--through I,J,K
+    voxel through which the slices in the picture of a volume pass, or else the nearest voxel in the domain (default: a
+    voxel in the middle)
 @clean
 --tensors FILE
     tensors of a volume that contains the mesh, such as a cortical surface. The tensors are interpolated at the vertices
@@ -91,8 +93,8 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
         volume = solved.volume
     else:
         volume, image = read_volume(args, progress), image_suffix(args.file)
-    if args.through is not None:
-        _check_voxel(args.through, volume)
+    if volume.dimension == 2:
+        refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     if not saved:
         solved = compute_pairs(volume, settings, progress)
     if args.save_pairs:  # at once, because later steps may fail
@@ -104,18 +106,6 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
     drawing = partial(signature_panels, result, view=args.view, through=args.through)
     done = write_outputs(args.output, result, progress, drawing, image)
     return done._replace(files=[*done.files, *[args.output / PAIRS] * args.save_pairs])
-
-
-def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
-    """Raise ValueError, before the long computation, if no slices can be drawn through a voxel."""
-    text = ",".join(map(str, voxel))
-    if volume.dimension != 3:
-        raise ValueError(f"--through: got {text} for a slice; expected a volume. Leave this option out")
-    if not all(i < n for i, n in zip(voxel, volume.shape, strict=True)):
-        raise ValueError(f"--through: got {text}; expected a voxel of the volume with shape {volume.shape}")
-    if not volume.inside[voxel]:
-        middle = ",".join(map(str, np.argwhere(volume.inside)[volume.inside.sum() // 2]))
-        raise ValueError(f"--through: got {text}, which is outside the mask; expected a voxel inside, such as {middle}")
 
 
 def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
@@ -223,15 +213,18 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
 def _draw_mesh(result: Result, path: Path) -> None:
     """Draw the signature on the surface, or on the boundary of a solid, with a separate colour scale for each time."""
     from hks_jax.plot import new_figure, number_text, save_figure, surface
+    from hks_jax.plot.images import colours_of
+    from hks_jax.plot.signature import LEAST_RANGE, caption
 
-    mesh, n = result.place, len(result.times)
+    mesh = result.place
     assert isinstance(mesh, SurfaceMesh | TetMesh)
-    columns = min(n, 4)
-    rows = math.ceil(n / columns)
-    figure = new_figure(3.4 * columns, 3.0 * rows)
+    columns = min(len(result.times), 4)
+    rows = math.ceil(len(result.times) / columns)
+    figure = new_figure(3.4 * columns, 3.0 * rows + 0.3)
+    figure.suptitle(caption(result))
     for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        mappable = surface(ax, mesh, values)
-        ax.set_title(f"t = {number_text(float(time))}", fontsize="medium")
-        figure.colorbar(mappable, ax=ax, shrink=0.6)
+        ((low, high, _),) = colours_of([values], least_range=LEAST_RANGE)
+        figure.colorbar(surface(ax, mesh, values, vmin=low, vmax=high), ax=ax, shrink=0.6)
+        ax.set_title(f"$t$ = {number_text(float(time))}", fontsize="medium")
     save_figure(figure, path)

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.glyphs import ellipses
-from hks_jax.plot.images import masked, scalar_image, shared_colours
+from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
 from hks_jax.plot.panels import checked_times
 
@@ -86,7 +86,7 @@ def fit_panels(
     for row, index in enumerate(rows):
         pair = masked("target", wanted[index], grid), masked("fit.hks", fitted[index], grid)
         images = {"target": pair[0], "fitted": pair[1], "fitted / target − 1": difference[index]}
-        colours = [shared_colours(pair, {})] * 2 + [{"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}]
+        colours = [*panel_colours(pair, shared=True), {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}]
         for column, (text, values) in enumerate(images.items()):
             ax = figure.add_subplot(panels[row, column])
             scalar_image(ax, values, grid, orientation=orientation, **colours[column])

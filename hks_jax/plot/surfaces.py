@@ -143,7 +143,7 @@ def isosurfaces(
     """
     require_volume(grid)
     array = masked("values", values, grid)
-    low, high, _ = colours_of(array.compressed(), quantiles, vmin=vmin, vmax=vmax)
+    ((low, high, _),) = colours_of([array.compressed()], quantiles, vmin=vmin, vmax=vmax)
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
         raise ValueError(f"levels: got {levels}; expected a number of at least 1, or finite values")

@@ -9,13 +9,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Real
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
-from hks_jax.plot.images import colours_of, masked, scalar_image, shared_colours
+from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
 from hks_jax.plot.panels import checked_times, panel_titles
 
@@ -52,6 +51,7 @@ def orthogonal_slices(
     node: Sequence[int] | None = None,
     cross: bool = True,
     orientation: Orientation | None = None,
+    z: Real[ArrayLike, "nx ny nz"] | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the slices xy, xz and yz of a volume through a node in the same colours, and return the last image.
@@ -64,6 +64,7 @@ def orthogonal_slices(
         cross: whether thin lines show the positions of the other two slices.
         orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
             letters.
+        z: (*shape,), by which values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
@@ -78,35 +79,23 @@ def orthogonal_slices(
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
     require_volume(grid)
-    array, grid, node = _turned(masked("values", values, grid), grid, node, orientation)
-    kwargs = shared_colours([array], kwargs)
-    return _slices(axes, array, grid, node, orientation, cross=cross, **kwargs)
-
-
-def _slices(
-    axes: Sequence[Axes] | np.ndarray,
-    array: np.ma.MaskedArray,
-    grid: Grid,
-    chosen: tuple[int, ...],
-    orientation: Orientation | None,
-    *,
-    cross: bool = True,
-    z: np.ma.MaskedArray | None = None,
-    **kwargs: Any,
-) -> AxesImage:
-    """Draw the slices of values that are already turned, and return the last image."""
+    noise = None if z is None else masked("z", z, grid)
+    if noise is not None and orientation is not None:
+        noise = orientation.array(noise)
+    array, grid, chosen = _turned(masked("values", values, grid), grid, node, orientation)
+    (style,) = panel_colours([array], **kwargs)
     for ax, (first, second) in zip(axes, PLANES, strict=True):
         normal = 3 - first - second
         plane = (np.take(of, (first, second)).tolist() for of in (grid.shape, grid.spacing, grid.origin))
         slab = np.take(array, chosen[normal], axis=normal)
-        faded = None if z is None else np.take(z, chosen[normal], axis=normal)
-        image = scalar_image(ax, slab, Grid(*plane), colorbar=False, z=faded, **kwargs)
+        faded = None if noise is None else np.take(noise, chosen[normal], axis=normal)
+        image = scalar_image(ax, slab, Grid(*plane), colorbar=False, z=faded, **style)
         if orientation is not None:
             orientation.letter(ax, (first, second))
         if cross:
-            style: dict[str, Any] = {"color": "0.5", "linewidth": 0.6, "linestyle": (0, (4, 3))}
-            ax.axvline(grid.axes[first][chosen[first]], **style)
-            ax.axhline(grid.axes[second][chosen[second]], **style)
+            lines: dict[str, Any] = {"color": "0.5", "linewidth": 0.6, "linestyle": (0, (4, 3))}
+            ax.axvline(grid.axes[first][chosen[first]], **lines)
+            ax.axhline(grid.axes[second][chosen[second]], **lines)
     return image
 
 
@@ -121,12 +110,11 @@ def volume_panels(
     length_unit: str = "",
     limits: Sequence[tuple[float, float]] | None = None,
     path: str | os.PathLike[str] | None = None,
-    cmap: str | Colormap | Sequence[str] = "viridis",
-    quantiles: tuple[float, float] = (0.0, 1.0),
     label: str = "",
     suptitle: str = "",
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "n_times nx ny nz"] | None = None,
+    **kwargs: Any,
 ) -> Figure:
     """Return a figure with a column of three orthogonal slices of the HKS and a colour bar for each time.
 
@@ -138,14 +126,13 @@ def volume_panels(
         titles: a title for each time, by default “t = …”.
         unit: the unit of t, which follows its value.
         length_unit: the unit of the coordinates.
-        limits: the values of the first and the last colour for each time, by default from `quantiles`.
+        limits: the values of the first and the last colour for each time.
         path: the file in which to save the figure, if given.
-        cmap: a colour map, or one per time.
-        quantiles: the quantiles of each volume with the first and the last colour.
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: the same as for `orthogonal_slices`.
         z: (n_times, *shape), by which values within the noise fade as in `hks_panels`.
+        **kwargs: arguments of `scalar_image` for all volumes, such as cmap, centre and quantiles.
 
     Raises:
         ValueError: if shapes disagree or there is no time, or as in `orthogonal_slices`.
@@ -160,18 +147,9 @@ def volume_panels(
     t = checked_times(times, grid.shape, values=values)
     titles = panel_titles(t, titles, unit)
     volumes = [masked("values", each, grid) for each in np.asarray(values)]
-    noise = [None] * t.size if z is None else [masked("z", each, grid) for each in np.asarray(z)]
-    if limits is None:
-        limits = [colours_of(volume.compressed(), quantiles)[:2] for volume in volumes]
-    elif len(limits) != t.size:
-        raise ValueError(f"limits: got {len(limits)}; expected {t.size}, one pair per time")
-    cmaps = [cmap] * t.size if isinstance(cmap, str | Colormap) else list(cmap)
-    if len(cmaps) != t.size:
-        raise ValueError(f"cmap: got {len(cmaps)}; expected {t.size}, one per time")
+    noise = [None] * t.size if z is None else np.asarray(z)
+    colours = panel_colours(volumes, limits, **kwargs)
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
-    if orientation is not None:
-        volumes = [orientation.array(volume) for volume in volumes]
-        noise = [None if each is None else orientation.array(each) for each in noise]
 
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
@@ -188,18 +166,8 @@ def volume_panels(
                 for ax in panels[:, column]:
                     ax.remove()
                 continue
-            low, high = limits[index]
-            image = _slices(
-                panels[:3, column],
-                volumes[index],
-                shown,
-                chosen,
-                orientation,
-                z=noise[index],
-                cmap=cmaps[index],
-                vmin=low,
-                vmax=high,
-            )
+            style = {"node": node, "orientation": orientation, "z": noise[index], **colours[index]}
+            image = orthogonal_slices(panels[:3, column], volumes[index], grid, **style)
             panels[0, column].set_title(titles[index], fontsize="medium")
             _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
             colour_bar_in(panels[3, column], image, label, values=volumes[index], orientation="horizontal")

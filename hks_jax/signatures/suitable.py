@@ -15,10 +15,8 @@ DEFAULT_K = {2: 200, 3: 100}
 """The default number of eigenpairs by dimension. It is smaller in 3D, where factorisations cost more."""
 RESOLVED = {2: 4.6, 3: 5.7}
 """The least λ_k·t, by dimension, at which at most 1 % of the signature lies beyond k pairs (`hks_jax.truncation`)."""
-SHOWN = 1e-2
-"""The decay of the first nonconstant mode at the largest time; a picture still shows this variation."""
-LAST = -math.log(SHOWN)
-"""The value of λ₁·t at the largest time."""
+LAST = (math.pi / 2) ** 2
+"""The value of λ₁·t at the largest time, at which √t is half the length of an interval with this eigenvalue."""
 COARSE = 6.0
 """The least t/h² at which the grid spacing h biases the signature by at most 1 %."""
 

@@ -85,7 +85,8 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
     At the first time the last mode has decayed by the factor 1e-4. At the last, which is not before the first, all
-    modes except the constant have decayed by `decay`. The command line uses 1e-2, which pictures still show.
+    modes except the constant have decayed by `decay`. The command line uses 0.085, at
+    which √t is half the length of an interval with the same λ₁.
 
     Examples:
         >>> times = hj.default_times(pairs, 3)

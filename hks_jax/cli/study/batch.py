@@ -209,8 +209,8 @@ def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float,
     least, largest = ranges[late].least, ranges[flat].largest
     if least >= largest:
         raise ValueError(
-            f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and {flat} is nearly constant "
-            f"for t ≥ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: tensors "
+            f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and the size of {flat} allows "
+            f"only t ≤ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: tensors "
             "with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
         )
     return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))

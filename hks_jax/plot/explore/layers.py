@@ -30,15 +30,11 @@ class Regions(NamedTuple):
 
 
 def tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarray, "*shape"]) -> list[Layer]:
-    """Return mean eigenvalue, anisotropy and principal direction, whose length is the anisotropy.
+    """Return mean eigenvalue, anisotropy and principal direction; raise ValueError unless tensors inside are finite.
 
-    Raises:
-        ValueError: if the tensors have another shape or are not finite inside.
+    The length of the principal direction is the anisotropy.
     """
-    array, d = np.asarray(tensors), inside.ndim
-    if array.shape != (*inside.shape, d, d):
-        raise ValueError(f"tensors: got shape {array.shape}; expected (*shape, d, d) = {(*inside.shape, d, d)}")
-    array = array[inside].astype(np.float64)
+    array, d = np.asarray(tensors, np.float64)[inside], inside.ndim
     if not np.isfinite(array).all():
         raise ValueError("tensors: got NaN or infinite values in the domain; exclude their nodes by the mask")
     values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
