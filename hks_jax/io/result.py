@@ -217,12 +217,13 @@ def signature_file(result: Path) -> Path:
 
 def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
     """Return the boundary in settings from JSON, with tuples in place of lists, or None."""
-
-    def tuples(value: Any) -> Any:
-        return tuple(map(tuples, value)) if isinstance(value, list) else value
-
     boundary: BoundarySpec | None = tuples(settings.get("boundary"))
     return boundary
+
+
+def tuples(value: Any) -> Any:
+    """Return a value from JSON with tuples in place of lists."""
+    return tuple(map(tuples, value)) if isinstance(value, list) else value
 
 
 def plain(value: Any) -> Any:
