@@ -4,6 +4,7 @@ Describe a file of tensors: the shape, the order of the components and its sourc
 its connected components, the eigenvalues, the number of tensors that are not positive definite, and suitable k and t.
 The command also asks questions if the frame or a unit looks wrong. For a mesh of triangles or tetrahedra
 ({meshes}, or a FreeSurfer surface), it gives the size, the boundary, the connected components, and suitable k and t.
+For a result of another command, it gives the times and settings, and the commands that draw the result.
 
 examples:
   hks-jax info tensor.nii.gz --mask mask.nii.gz
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.options import READING, as_options
+from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read
 from hks_jax.domain.components import label_nodes
@@ -30,6 +32,7 @@ from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import is_mesh
 from hks_jax.io.repair import find_unsymmetric
+from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
 from hks_jax.io.volume import digest
 from hks_jax.signatures.suitable import suitable, suitable_times
@@ -40,11 +43,35 @@ OPTIONS = f"@file {READING} @clean"
 def run(args: argparse.Namespace, progress: Progress) -> None:
     """Run the command."""
     progress.quiet, questions = True, list[str]()
-    if is_mesh(args.file):
+    if (result := _result_of(args.file)) is not None:
+        description = _describe_result(result)
+    elif is_mesh(args.file):
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
     else:
         description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
     print(json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description)))
+
+
+def _result_of(path: Path) -> Result | None:
+    """Return the result in a file or a folder, or beside its image; None for other files."""
+    file = signature_file(path) if path.is_dir() else Path(str(path).removesuffix(".gz")).with_suffix(".npz")
+    return Result.read(file) if arrays_in(file).intersection(NAMES) else None
+
+
+def _describe_result(result: Result) -> dict[str, Any]:
+    commands = [f"hks-jax plot {result.source} -o picture.png"]
+    if result.name == "hks":
+        commands += [f"hks-jax explore {result.source}", f"hks-jax stats {result.source} --atlas LABELS"]
+    return {
+        "file": result.source,
+        "result": {"hks": "heat kernel signature", "curvature": "Gaussian curvature"}[result.name],
+        "shape": result.values.shape[1:],
+        "inside": int(np.isfinite(result.values[0]).sum()),
+        "times": result.times.tolist(),
+        "lengths": None if result.lengths is None else result.lengths.tolist(),
+        "settings": result.settings,
+        "commands": commands,
+    }
 
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
@@ -107,6 +134,8 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
 
 
 def _lines(description: dict[str, Any]) -> list[str]:
+    if "result" in description:
+        return _result_lines(description)
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     words = next((words for words in WORDS.values() if words.simplices in description), None)
     if words is not None:
@@ -163,6 +192,18 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} from the size"
         )
     return lines
+
+
+def _result_lines(description: dict[str, Any]) -> list[str]:
+    lines = [
+        f"{description['file']}: a {description['result']}, which hks-jax computed",
+        f"nodes           {by_axis(description['shape'])}, {description['inside']} in the domain",
+    ]
+    for name, numbers in (("times", description["times"]), ("√(Dt)", description["lengths"])):
+        if numbers:
+            lines.append(f"{name:<16}{numbers[0]:.4g} … {numbers[-1]:.4g}, {len(numbers)} values")
+    lines += [f"{name:<16}{value}" for name, value in description["settings"].items() if name != "times" and value]
+    return [*lines, "to continue     " + "\n                ".join(description["commands"])]
 
 
 def _units(description: dict[str, Any]) -> tuple[str, str]:

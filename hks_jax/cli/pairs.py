@@ -26,12 +26,17 @@ _ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "un
 """The attributes of a volume that are saved as text."""
 
 
+def arrays_in(path: Path) -> set[str]:
+    """Return the names of the arrays in an npz; the empty set for other files."""
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return set()
+    with zipfile.ZipFile(path) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
+
+
 def is_saved_pairs(path: Path) -> bool:
     """Return whether a file contains eigenpairs with their field."""
-    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return f"{_RECORD}.npy" in archive.namelist()
+    return _RECORD in arrays_in(path)
 
 
 def check_options(args: argparse.Namespace) -> None:

@@ -195,6 +195,25 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
     assert "absent.nii: no such file" in error_of(capsys, ["info", str(tmp_path / "absent.nii")])
 
 
+def test_info_of_results_says_what_they_are_and_how_to_draw_them(tensors, tmp_path, capsys):
+    volume = read_tensors(tensors)
+    report = {"settings": {"metric": "inverse", "normalisation": "flat"}}
+    (tmp_path / "out").mkdir()
+    result = Result(volume, np.ones((8, *SHAPE)), np.arange(1.0, 9.0), report=report)
+    result.save(tmp_path / "out" / "hks", ".nii.gz")
+    replace(result, values=np.ones((1, *SHAPE)), times=np.zeros(0), name="curvature").save(tmp_path / "K", "")
+    for name in ("out", "out/hks.npz", "out/hks.nii.gz"):
+        assert main(["info", str(tmp_path / name)]) == 0
+        text = capsys.readouterr().out
+        assert "hks.npz: a heat kernel signature, which hks-jax computed" in text
+        assert "times           1 … 8, 8 values\n" in text
+        assert "normalisation   flat\n" in text
+        assert f"hks-jax plot {tmp_path / 'out' / 'hks.npz'} -o picture.png\n" in text
+    assert main(["info", str(tmp_path / "K.npz"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["result"], found["times"], len(found["commands"])) == ("Gaussian curvature", [], 1)
+
+
 # ------------------------------------------------------------------------------------------------------ meshes
 
 

@@ -26,7 +26,7 @@ tables that are missing, or whose input files have changed. Omitted options are 
 
 examples:
   hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
-  hks-jax batch subjects.tsv -o study --metric inverse --times 20 40 80 160 --only sub-07 sub-08
+  hks-jax batch subjects.tsv -o study --metric inverse --times 8e5 1.6e6 3.2e6 --only sub-07 sub-08
 """
 
 import argparse
