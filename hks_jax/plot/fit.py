@@ -1,5 +1,6 @@
 """Figures of fits: the metric and its agreement with the signature."""
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -7,6 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Real
 from matplotlib.axes import Axes
+from matplotlib.colors import TABLEAU_COLORS
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
@@ -18,7 +20,7 @@ from hks_jax.plot.orientation import Orientation
 from hks_jax.plot.panels import checked_times
 
 if TYPE_CHECKING:  # slow to import
-    from hks_jax.inverse.metric_fit import MetricFit, Step
+    from hks_jax.inverse.metric_fit import MetricFit
 
 LEAST_DIFFERENCE = 1e-6
 """The minimum of the colours' range for relative differences; the errors of the eigenpairs are smaller."""
@@ -37,7 +39,7 @@ def fit_panels(
 
     A few times, including the first and the last, have a row each. It shows the target, the fitted signature in the
     same colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
-    metric and the loss over the steps. Each start has a curve, which is interrupted at a new stage or a resumed fit.
+    metric and the loss over the steps, with a curve for each start.
 
     Args:
         fit: the result of `hks_jax.fit_metric`.
@@ -105,28 +107,15 @@ def fit_panels(
 
 
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
-    """Draw the loss over the steps and, if there are penalties, the data's part of the loss."""
+    """Draw the loss over the steps of each start and, if there are penalties, the data's part of the loss."""
     starts = sorted({step.start for step in fit.history})
-    # Each stage, start or resumed fit numbers its steps from 0.
-    pieces: list[list[Step]] = []
-    for step in fit.history:
-        last = pieces[-1][-1] if pieces else None
-        if last is None or step.step <= last.step or (step.start, step.stage) != (last.start, last.stage):
-            pieces.append([])
-        pieces[-1].append(step)
-    offset, before = 0, None
-    for piece in pieces:
-        if before is not None:
-            offset = offset + before.step if before.start == piece[0].start else 0
-        before = piece[-1]
-        steps = [offset + step.step for step in piece]
-        color = f"C{starts.index(before.start) % 10}"
-        first = offset == 0
-        label = "loss" if len(starts) == 1 else f"start {before.start}"
-        ax.plot(steps, [step.loss for step in piece], ".-", color=color, label=label if first else None)
+    for color, start in zip(itertools.cycle(TABLEAU_COLORS), starts, strict=False):
+        steps = [step for step in fit.history if step.start == start]
+        label = "loss" if len(starts) == 1 else f"start {start}"
+        ax.plot([step.loss for step in steps], ".-", color=color, label=label)
         if fit.problem.regularisers:
-            label = "misfit" if before.start == starts[0] else ""
-            ax.plot(steps, [step.misfit for step in piece], ":", color=color, label=label if first and label else None)
+            label = "misfit" if start == starts[0] else ""
+            ax.plot([step.misfit for step in steps], ":", color=color, label=label)
     ax.set_yscale("log", nonpositive="mask")
     ax.yaxis.set_major_locator(LogLocator(numticks=6))
     ax.yaxis.set_minor_formatter(NullFormatter())

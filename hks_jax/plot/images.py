@@ -104,8 +104,6 @@ def influence_map(
     grid: Grid,
     *,
     levels: Sequence[float] = (0.01, 0.1),
-    cmap: str | Colormap = "cividis",
-    label: str = "boundary's influence",
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the share of the HKS that is due to the boundary at one time, with contour lines.
@@ -115,12 +113,7 @@ def influence_map(
         influence: (*shape) the result of `hks_jax.boundary_influence` at one time.
         grid: the 2D grid of the values.
         levels: the levels of the contour lines, ascending between 0 and 1.
-        cmap: the colour map from 0 to 1.
-        label: the colour bar's label.
         **kwargs: arguments of `scalar_image`.
-
-    Returns:
-        The image.
 
     Raises:
         ValueError: if the grid is 3D, or if the values have another shape.
@@ -131,9 +124,9 @@ def influence_map(
         (0.0, 1.0)
     """
     values = masked("influence", influence, grid)
-    image = scalar_image(ax, values, grid, cmap=cmap, vmin=0.0, vmax=1.0, label=label, **kwargs)
-    reached = [level for level in levels if values.min() < level < values.max()]
-    if reached:
+    style = {"cmap": "cividis", "vmin": 0.0, "vmax": 1.0, "label": "boundary's influence", **kwargs}
+    image = scalar_image(ax, values, grid, **style)
+    if reached := [level for level in levels if values.min() < level < values.max()]:
         lines = ax.contour(*grid.axes, values.T, levels=reached, colors="white", linewidths=1.0)
         ax.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize="x-small")
     return image

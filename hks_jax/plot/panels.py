@@ -62,7 +62,8 @@ def hks_panels(
     titles = panel_titles(t, titles, unit)
     images = [masked("values", v, grid) for v in np.asarray(values)]
     colours = panel_colours(images, limits, shared_range, **kwargs)
-    rows, columns = _layout(t.size)
+    rows = math.ceil(t.size / 4)
+    columns = math.ceil(t.size / rows)
     width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
     fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
     noise = [None] * t.size if z is None else np.asarray(z)
@@ -82,7 +83,7 @@ def time_rows(
     grid: Grid,
     *,
     unit: str = "",
-    shared: str = "none",
+    shared_range: bool = False,
     cmap: str | Colormap | Mapping[str, str] = "viridis",
     quantiles: tuple[float, float] = (0.0, 1.0),
     suptitle: str = "",
@@ -94,13 +95,13 @@ def time_rows(
         times: (n_times,).
         grid: the 2D grid of the values.
         unit: the unit of t.
-        shared: the images that share one range of colours: ``"none"``, or those of each ``"row"``.
+        shared_range: whether the images of a row use the colours of one range.
         cmap: a colour map, or one for each row by name.
         quantiles: the same as for `scalar_image`.
         suptitle: the figure's title.
 
     Raises:
-        ValueError: if there are no rows or times, if values are not one image per time, or if `shared` is unknown.
+        ValueError: if there are no rows or times, or if values are not one image per time.
 
     Examples:
         >>> fig = hj.plot.time_rows({"HKS": hj.hks(pairs, [0.2, 0.5])}, [0.2, 0.5], field.grid)
@@ -108,8 +109,6 @@ def time_rows(
         2
     """
     require_plane("grid", grid)
-    if shared not in ("none", "row"):
-        raise ValueError(f'shared: got {shared!r}; expected "none" or "row"')
     if not rows:
         raise ValueError("rows: got no scalars; expected at least one")
     t = checked_times(times, grid.shape, **{f"rows: {name}": values for name, values in rows.items()})
@@ -119,7 +118,7 @@ def time_rows(
     for line, (name, values) in zip(panels, rows.items(), strict=True):
         images = [masked(f"rows: {name}", each, grid) for each in np.asarray(values)]
         own = cmap[name] if isinstance(cmap, Mapping) else cmap
-        colours = panel_colours(images, shared=shared == "row", cmap=own, quantiles=quantiles)
+        colours = panel_colours(images, shared=shared_range, cmap=own, quantiles=quantiles)
         for ax, image, style in zip(line, images, colours, strict=True):
             scalar_image(ax, image, grid, **style)
             ax.set(xticks=[], yticks=[])
@@ -148,11 +147,3 @@ def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None,
     if len(titles) != t.size:
         raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
     return titles
-
-
-def _layout(n: int) -> tuple[int, int]:
-    """Return the numbers of rows and columns for n panels, with at most four per row and evenly filled rows."""
-    if n <= 4:
-        return 1, n
-    columns = min(range(3, 6), key=lambda c: (-n % c, math.ceil(n / c)))
-    return math.ceil(n / columns), columns

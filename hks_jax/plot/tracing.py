@@ -101,7 +101,6 @@ def evenly_spaced_lines(
     separation: float,
     step: float | None = None,
     max_length: float | None = None,
-    least_length: float | None = None,
 ) -> list[Float[np.ndarray, "m 2"]]:
     """Return integral lines that fill the domain with a distance of about `separation`, in coordinates.
 
@@ -114,8 +113,7 @@ def evenly_spaced_lines(
         which: ``"major"`` or ``"minor"``.
         separation: the distance between neighbouring lines where they start.
         step: the same as for `trace`.
-        max_length: the same as for `trace`.
-        least_length: the length below which lines are omitted, by default twice the separation.
+        max_length: the same as for `trace`. Lines shorter than twice the separation are omitted.
 
     Examples:
         >>> lines = hj.plot.evenly_spaced_lines(field, separation=0.2)
@@ -128,8 +126,6 @@ def evenly_spaced_lines(
     h = min(h, separation / 4)
     seeds = _candidates(field, separation / 2)
     forward, backward = _both_ways(DirectionField(field, which), seeds, h, n_steps)
-    least = 2 * separation if least_length is None else least_length
-
     lines: list[np.ndarray] = []
     tree: cKDTree | None = None
     centre = np.array([0.5 * (a[0] + a[-1]) for a in field.grid.axes])
@@ -143,7 +139,7 @@ def evenly_spaced_lines(
         index = int(np.argmin(np.where(allowed, distance, np.inf)))
         free[index] = False
         line = _grow(forward[index], backward[index], tree, separation / 2, h)
-        if (len(line) - 1) * h < least:
+        if (len(line) - 1) * h < 2 * separation:
             continue
         if not lines:
             distance[:] = np.inf

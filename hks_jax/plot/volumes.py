@@ -153,7 +153,9 @@ def volume_panels(
 
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
-    heights = _heights(shown)
+    sizes = np.multiply(shown.shape, shown.spacing)
+    heights = [float(np.clip(_COLUMN * sizes[up] / max(sizes[:2]), 0.25, 3 * _COLUMN)) for _, up in PLANES]
+    coordinates = [f"{name} ({length_unit})" if length_unit else name for name in AXES]
     fig = new_figure(
         columns * (_COLUMN + 0.2) + 0.6, rows * (sum(heights) + 1.35 + 0.15 * bool(label)) + 0.3 * bool(suptitle)
     )
@@ -169,29 +171,14 @@ def volume_panels(
             style = {"node": node, "orientation": orientation, "z": noise[index], **colours[index]}
             image = orthogonal_slices(panels[:3, column], volumes[index], grid, **style)
             panels[0, column].set_title(titles[index], fontsize="medium")
-            _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
+            for ax, (first, second) in zip(panels[:3, column], PLANES, strict=True):
+                normal = 3 - first - second
+                place = f"{AXES[normal]} = {shown.axes[normal][chosen[normal]]:.4g} {length_unit}".rstrip()
+                ax.set_xlabel(coordinates[first], fontsize=SMALL, labelpad=1)
+                ax.set_ylabel(f"{place}\n{coordinates[second]}" if column == 0 else "", fontsize=SMALL)
+                ax.tick_params(labelleft=column == 0)
             colour_bar_in(panels[3, column], image, label, values=volumes[index], orientation="horizontal")
     return finished(fig, suptitle, path)
-
-
-def _label_slices(
-    axes: Sequence[Axes] | np.ndarray, grid: Grid, node: tuple[int, ...], unit: str, leftmost: bool
-) -> None:
-    suffix = f" ({unit})" if unit else ""
-    for ax, (first, second) in zip(axes, PLANES, strict=True):
-        ax.set_xlabel(AXES[first] + suffix, fontsize=SMALL, labelpad=1)
-        ax.tick_params(labelleft=leftmost)
-        if leftmost:
-            normal = 3 - first - second
-            place = f"{AXES[normal]} = {grid.axes[normal][node[normal]]:.4g} {unit}".rstrip()
-            ax.set_ylabel(f"{place}\n{AXES[second]}{suffix}", fontsize=SMALL)
-
-
-def _heights(grid: Grid) -> list[float]:
-    """Return the slices' heights in inches if the widest slice has the width of a column."""
-    sizes = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
-    scale = _COLUMN / max(sizes[0], sizes[1])
-    return [min(max(scale * sizes[second], 0.25), 3 * _COLUMN) for _, second in PLANES]
 
 
 def require_volume(grid: Grid) -> None:

@@ -23,6 +23,7 @@ from hks_jax.plot import (
     surface,
     trace,
 )
+from hks_jax.plot.glyphs import FILL
 from hks_jax.plot.signature import away_from_rim, bounding_box
 
 
@@ -232,8 +233,6 @@ def test_ellipse_errors():
         ellipses(ax, field, kind="glyph")
     with unchecked(), pytest.raises(ValueError, match="sizes: got 'big'"):
         ellipses(ax, field, sizes="big")
-    with pytest.raises(ValueError, match=r"fill: got 1.5"):
-        ellipses(ax, field, fill=1.5)
     with pytest.raises(ValueError, match=r"every: got 0; expected one positive integer"):
         ellipses(ax, field, every=0)
 
@@ -405,17 +404,18 @@ def test_sensitivity_draws_the_eigenvectors_of_either_sign():
     gradient[2, 3] = [[4.0, 0.0], [0.0, -1.0]]
     gradient[4, 4] = [[0.0, 1.0], [1.0, 0.0]]  # ±1 along the diagonals
     ax = new_figure(3, 3).subplots()
-    bars = sensitivity(ax, grid, gradient, every=1, fill=1.0)
+    bars = sensitivity(ax, grid, gradient, every=1)
     segments, colours = np.array(bars.get_segments()), bars.get_colors()
     lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     longest = np.argmax(lengths)
-    assert lengths[longest] == pytest.approx(0.5)  # one cell
-    np.testing.assert_allclose(np.sort(segments[longest], axis=0), [[0.75, 1.5], [1.25, 1.5]])
-    crossing = np.flatnonzero(np.isclose(lengths, 0.25) & np.isclose(segments.mean(axis=1), [1.0, 1.5]).all(axis=1))
+    half = 0.25 * FILL  # of a cell
+    assert lengths[longest] == pytest.approx(2 * half)
+    np.testing.assert_allclose(np.sort(segments[longest], axis=0), [[1 - half, 1.5], [1 + half, 1.5]])
+    crossing = np.flatnonzero(np.isclose(lengths, half) & np.isclose(segments.mean(axis=1), [1.0, 1.5]).all(axis=1))
     assert len(crossing) == 1
     assert not np.allclose(colours[longest], colours[crossing[0]])
     diagonal = np.flatnonzero(np.isclose(segments.mean(axis=1), [2.0, 2.0]).all(axis=1))
-    np.testing.assert_allclose(lengths[diagonal], 0.25)
+    np.testing.assert_allclose(lengths[diagonal], half)
     rising = np.prod(segments[diagonal, 1] - segments[diagonal, 0], axis=1) > 0
     np.testing.assert_array_equal(colours[diagonal][rising][0], colours[longest])  # both positive
     np.testing.assert_array_equal(colours[diagonal][~rising][0], colours[crossing[0]])  # both negative

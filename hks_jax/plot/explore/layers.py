@@ -5,7 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, Integer, Real
+from jaxtyping import Bool, Float, Int, Real
+
+from hks_jax.signatures.regions import region_statistics
 
 
 class Layer(NamedTuple):
@@ -20,13 +22,6 @@ class Layer(NamedTuple):
     name: str
     kind: str
     values: Float[np.ndarray, "n_nodes *components"]
-
-
-class Regions(NamedTuple):
-    """A label at every node of the domain, or 0 for none, and the names of the labels that occur."""
-
-    values: Integer[np.ndarray, " n_nodes"]
-    names: dict[int, str]
 
 
 def tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarray, "*shape"]) -> list[Layer]:
@@ -63,24 +58,16 @@ def scalar_layers(maps: Mapping[str, Any], inside: Bool[np.ndarray, "*shape"]) -
 
 def regions(
     labels: Real[ArrayLike, "*shape"], names: Mapping[int, str] | None, inside: Bool[np.ndarray, "*shape"]
-) -> Regions:
-    """Return the labels inside, and their names or, without names, their numbers.
+) -> tuple[Int[np.ndarray, " n_nodes"], dict[int, str]]:
+    """Return the labels inside, and the name or, without names, the number of each label that occurs.
 
     Raises:
-        ValueError: if labels have another shape, are not integers, or are all 0 inside.
+        ValueError: if labels have another shape, are not integers, or are all 0.
     """
-    array = np.asarray(labels)
-    if array.shape != inside.shape:
-        raise ValueError(f"labels: got shape {array.shape}; expected the grid's shape {inside.shape}")
-    inner = array[inside]
-    whole = np.rint(inner).astype(np.int32)
-    if not np.array_equal(whole, inner):
-        raise ValueError("labels: got fractional numbers inside the domain; expected integers, 0 for no region")
-    present = [int(label) for label in np.unique(whole) if label != 0]
-    if not present:
-        raise ValueError("labels: got 0 at all nodes of the domain; expected a region's number at some nodes")
-    given = {} if names is None else names
-    return Regions(whole, {label: str(given.get(label, f"label {label}")) for label in present})
+    found = region_statistics(np.where(inside, 1.0, np.nan)[None], labels)
+    present = found.labels[found.nodes > 0].tolist()
+    known = {label: f"label {label}" for label in present} | dict(names or {})
+    return np.asarray(labels)[inside].astype("<i4"), {label: known[label] for label in present}
 
 
 def _single(values: np.ndarray) -> np.ndarray:

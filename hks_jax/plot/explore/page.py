@@ -18,7 +18,7 @@ from hks_jax import __version__
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
-from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
+from hks_jax.plot.explore.layers import regions, scalar_layers, tensor_layers
 from hks_jax.plot.orientation import LETTERS
 from hks_jax.plot.panels import checked_times
 from hks_jax.plot.signature import METRICS, bounding_box
@@ -100,7 +100,6 @@ def explore(
         raise ValueError("values: got no node inside the mask that is finite at all times; expected one")
     layers = [] if result.tensors is None else tensor_layers(result.tensors, inside)
     layers += scalar_layers(maps or {}, inside)
-    parts = None if labels is None else regions(labels, label_names, inside)
     size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(each.values.size for each in layers))
     if size > LIMIT:
         raise ValueError(
@@ -113,6 +112,11 @@ def explore(
     if noise is not None:
         shown["deviation"] = (scale * noise)[:, inside]
     box = bounding_box(inside, margin=0)
+    numbers = {"inside": inside[box].astype(np.uint8), **{name: array.astype("<f4") for name, array in shown.items()}}
+    numbers |= {f"layer-{i}": layer.values.astype("<f4") for i, layer in enumerate(layers)} | surface
+    names: dict[int, str] = {}
+    if labels is not None:
+        numbers["labels"], names = regions(labels, label_names, inside)
     about = {
         "title": title,
         "facts": [[name, str(value)] for name, value in _facts(result).items()],
@@ -132,10 +136,10 @@ def explore(
         "noise": noise is not None,
         "start": [0] if surface else _deep_node(inside[box]),
         "layers": [{"name": layer.name, "kind": layer.kind} for layer in layers],
-        "labels": [] if parts is None else [[label, name] for label, name in parts.names.items()],
+        "labels": list(names.items()),
         "colours": {name: _colour_table(colours) for name, colours in COLOURS.items()},
     }
-    page = _assemble(about, inside[box], shown, layers, parts, surface)
+    page = _assemble(about, numbers)
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(path)
@@ -186,28 +190,14 @@ def _colour_table(name: str) -> str:
     return _base64(colours)
 
 
-def _assemble(
-    about: dict[str, Any],
-    inside: Bool[np.ndarray, "*shape"],
-    shown: dict[str, np.ndarray],
-    layers: list[Layer],
-    parts: Regions | None,
-    surface: dict[str, np.ndarray],
-) -> str:
-    numbers = {
-        "inside": _base64(inside.astype(np.uint8)),
-        **{name: _base64(array.astype("<f4")) for name, array in shown.items()},
-    }
-    numbers |= {f"layer-{i}": _base64(layer.values.astype("<f4")) for i, layer in enumerate(layers)}
-    if parts is not None:
-        numbers["labels"] = _base64(parts.values.astype("<i4"))
-    numbers |= {name: _base64(array) for name, array in surface.items()}
+def _assemble(about: dict[str, Any], numbers: dict[str, np.ndarray]) -> str:
+    """Return the page, whose scripts read the description and the numbers."""
     own = files(__package__)
     scripts = "\n".join((own / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
     # "<" is escaped as JSON allows, so that no text can close its script element.
     described = json.dumps(about, allow_nan=False).replace("<", "\\u003c")
     blocks = [f'<script type="application/json" id="about">{described}</script>']
-    blocks += [f'<script type="text/plain" id="{name}">{text}</script>' for name, text in numbers.items()]
+    blocks += [f'<script type="text/plain" id="{name}">{_base64(array)}</script>' for name, array in numbers.items()]
     filled = {
         "TITLE": html.escape(about["title"]),
         "STYLE": (own / "style.css").read_text(encoding="utf-8"),
