@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
@@ -73,21 +73,19 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if is_mesh(args.file):
         return _on_mesh(args, Settings.of(args, metric=args.metric), progress)
-    refuse(args, ("clean",), "this option is for meshes; for tensors on a grid, see --repair")
-    refuse(args, ("inside",), "this option is for meshes; for tensors on a grid, see --mask")
+    refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
-    return _on_grid(args, Settings.of(args), progress)
-
-
-def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
     require_spectral(args)
-    if saved := saved_pairs.is_saved_pairs(args.file):
+    if saved := not args.others and saved_pairs.is_saved_pairs(args.file):
         refuse(args, ("noise",), _NO_NOISE)
-        saved_pairs.check_options(args)
+        settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
+        why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
+        refuse(args, (*settled, "save_pairs"), why)
     else:
         require_metric(args)
     from hks_jax.plot import signature_panels
 
+    settings = Settings.of(args)
     if saved:
         solved, image = saved_pairs.read_pairs(args.file, settings, progress)
         volume = solved.volume
@@ -187,18 +185,16 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
         n = values.shape[1]
         raise ValueError(f"--array: got {args.array!r} with {n} components; expected 9, or 6 with --order")
     tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
-    return domain(tensors), None if args.noise is None else Noisy(tensors, _relative(args.noise, tensors), domain)
-
-
-def _relative(noise: str, tensors: Float[np.ndarray, "V 3 3"]) -> TensorNoise:
+    if args.noise is None:
+        return domain(tensors), None
     try:
-        level = float(noise)
+        level = float(args.noise)
     except ValueError:
         raise ValueError(
-            f"--noise: got {noise!r}; expected a number, relative to the mean diffusivity, for tensors at the "
+            f"--noise: got {args.noise!r}; expected a number, relative to the mean diffusivity, for tensors at the "
             "vertices of a mesh"
         ) from None
-    return TensorNoise.relative(tensors, level)
+    return domain(tensors), Noisy(tensors, TensorNoise.relative(tensors, level), domain)
 
 
 def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:

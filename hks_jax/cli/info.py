@@ -59,19 +59,20 @@ def _result_of(path: Path) -> Result | None:
 
 
 def _describe_result(result: Result) -> dict[str, Any]:
-    commands = [f"hks-jax plot {result.source} -o picture.png"]
-    if result.name == "hks":
-        commands += [f"hks-jax explore {result.source}", f"hks-jax stats {result.source} --atlas LABELS"]
-    return {
+    facts = {
         "file": result.source,
         "result": {"hks": "heat kernel signature", "curvature": "Gaussian curvature"}[result.name],
         "shape": result.values.shape[1:],
         "inside": int(np.isfinite(result.values[0]).sum()),
+        **{name: value for name, value in result.settings.items() if value},
         "times": result.times.tolist(),
-        "lengths": None if result.lengths is None else result.lengths.tolist(),
-        "settings": result.settings,
-        "commands": commands,
+        "√(Dt)": [] if result.lengths is None else result.lengths.tolist(),
+        "to draw it": f"hks-jax plot {result.source} -o picture.png",
     }
+    if result.name == "hks":
+        facts["to explore it"] = f"hks-jax explore {result.source}"
+        facts["for regions"] = f"hks-jax stats {result.source} --atlas LABELS"
+    return facts
 
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
@@ -133,19 +134,20 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
     }
 
 
+def _plain(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value))
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
 def _lines(description: dict[str, Any]) -> list[str]:
-    if "result" in description:
-        return _result_lines(description)
+    if "sha256" not in description:  # of a result
+        return [f"{name:<16}{_plain(value)}" for name, value in description.items() if value]
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
-    words = next((words for words in WORDS.values() if words.simplices in description), None)
-    if words is not None:
-        lines += [
-            f"mesh            {description['vertices']} vertices, {description[words.simplices]} {words.simplices}",
-            f"boundary        {description['boundary_vertices']} vertices",
-            f"components      {description['components']}",
-            f"{words.measure:<16}{description[words.measure]:.5g}",
-            f"median edge     {description['median_edge']:.5g}",
-        ]
+    if "vertices" in description:
+        left_out = ("file", "format", "sha256", "suits")
+        facts = {name.replace("_", " "): value for name, value in description.items() if name not in left_out}
+        lines += [f"{name:<18}{_plain(value)}" for name, value in facts.items()]
     else:
         bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
         length = f" {description['length_unit']}" if description["length_unit"] else ", without a declared unit"
@@ -174,13 +176,17 @@ def _lines(description: dict[str, Any]) -> list[str]:
             lines[-1] += ": see --repair"
         if description["not_symmetric"]:
             lines.append(f"                {description['not_symmetric']} tensors are not symmetric")
-    unit, time = _units(description)
+    in_mm, unit = description.get("length_unit") == "mm", description.get("unit", "")
+    if in_mm and not unit:
+        known = is_plausible(description.get("median_mean_diffusivity", 0.0))
+        unit = f"{MM2_PER_S} (not declared)" if known else "(unit not declared)"
+    time = " s" if in_mm and unit.startswith(MM2_PER_S) else ""
     if "eigenvalues" in description:
         e = description["eigenvalues"]
         lines += [
-            f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g}{unit}",
-            f"diffusivity     {description['median_mean_diffusivity']:.3g}{unit}, the median of the tensors' mean "
-            "eigenvalues",
+            f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g} {unit}".rstrip(),
+            f"diffusivity     {description['median_mean_diffusivity']:.3g} {unit}".rstrip()
+            + ", the median of the tensors' mean eigenvalues",
         ]
     lines += [f"question        {question}" for question in description.get("questions", ())]
     for name, s in description.get("suits", {}).items():
@@ -192,25 +198,3 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} from the size"
         )
     return lines
-
-
-def _result_lines(description: dict[str, Any]) -> list[str]:
-    lines = [
-        f"{description['file']}: a {description['result']}, which hks-jax computed",
-        f"nodes           {by_axis(description['shape'])}, {description['inside']} in the domain",
-    ]
-    for name, numbers in (("times", description["times"]), ("√(Dt)", description["lengths"])):
-        if numbers:
-            lines.append(f"{name:<16}{numbers[0]:.4g} … {numbers[-1]:.4g}, {len(numbers)} values")
-    lines += [f"{name:<16}{value}" for name, value in description["settings"].items() if name != "times" and value]
-    return [*lines, "to continue     " + "\n                ".join(description["commands"])]
-
-
-def _units(description: dict[str, Any]) -> tuple[str, str]:
-    """Return the units of diffusivities and of times in the metric D⁻¹ as texts, empty if they are unknown."""
-    if description.get("unit"):
-        return f" {description['unit']}", " s" if description["length_unit"] == "mm" else ""
-    if description.get("length_unit") != "mm":
-        return "", ""
-    median = description.get("median_mean_diffusivity", 0.0)
-    return (f" {MM2_PER_S} (not declared)", " s") if is_plausible(median) else (" (unit not declared)", "")

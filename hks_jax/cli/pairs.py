@@ -1,6 +1,5 @@
 """Write and read eigenpairs together with their field, for ``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``."""
 
-import argparse
 import json
 import zipfile
 from collections.abc import Sequence
@@ -12,7 +11,6 @@ import numpy as np
 
 from hks_jax import assemble
 from hks_jax.cli.job import Settings, Solved, field_of
-from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
@@ -37,15 +35,6 @@ def arrays_in(path: Path) -> set[str]:
 def is_saved_pairs(path: Path) -> bool:
     """Return whether a file contains eigenpairs with their field."""
     return _RECORD in arrays_in(path)
-
-
-def check_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that the saved eigenpairs determine."""
-    if args.others:
-        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one file of eigenpairs")
-    settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
-    why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
-    refuse(args, (*settled, "save_pairs"), why)
 
 
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
