@@ -83,19 +83,16 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
     if not times.size:
         refuse(args, ("times", "points"), f"{args.result} has no times; leave this option out")
         return np.arange(1)
-    if args.times is None:
-        count = times.size if args.points is not None else MANY
-    else:
-        wanted, count = parse_times(args.times)
-        if wanted:
-            apart = np.abs(np.log(times) - np.log(wanted)[:, None])
-            far = apart.min(axis=1) > 0.05
-            if far.any():
-                raise ValueError(
-                    f"--times: got {wanted[int(np.argmax(far))]:g}; expected some of the saved times, "
-                    f"{', '.join(f'{t:.4g}' for t in times)}"
-                )
-            return np.unique(np.argmin(apart, axis=1))
+    wanted, count = parse_times(args.times) if args.times else ((), times.size if args.points else MANY)
+    if wanted:
+        apart = np.abs(np.log(times) - np.log(wanted)[:, None])
+        far = apart.min(axis=1) > 0.05
+        if far.any():
+            raise ValueError(
+                f"--times: got {wanted[int(np.argmax(far))]:g}; expected some of the saved times, "
+                f"{', '.join(f'{t:.4g}' for t in times)}"
+            )
+        return np.unique(np.argmin(apart, axis=1))
     return np.unique(np.linspace(0, times.size - 1, min(count, times.size)).round().astype(int))
 
 

@@ -19,7 +19,6 @@ from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.hks import Normalisation
 from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
@@ -159,14 +158,12 @@ class Result:
     @property
     def settings(self) -> Mapping[str, Any]:
         """The settings of the computation; empty if they are not known."""
-        settings: Mapping[str, Any] = self.report.get("settings", {})
-        return settings
+        return dict(self.report.get("settings", {}))
 
     @property
-    def normalisation(self) -> Normalisation:
+    def normalisation(self) -> str:
         """The normalisation of a signature, ``"raw"`` if it is not known."""
-        normalisation: Normalisation = self.settings.get("normalisation", "raw")
-        return normalisation
+        return str(self.settings.get("normalisation", "raw"))
 
     @property
     def tensors(self) -> Float[np.ndarray, "*shape d d"] | None:

@@ -32,7 +32,7 @@ def fit_panels(
     times: Sequence[float] | Real[ArrayLike, " n_times"] | None = None,
     *,
     max_times: int = 3,
-    title: str | None = None,
+    title: str = "",
     orientation: Orientation | None = None,
 ) -> Figure:
     """Return a figure of a fit in 2D with signatures, the metric and the loss.
@@ -64,8 +64,6 @@ def fit_panels(
         times = fit.problem.observation.times
     if times is None:
         raise ValueError("times: got None for a fit without times; expected one number per image of the target")
-    if max_times < 1:
-        raise ValueError(f"max_times: got {max_times}; expected at least 1")
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
     t = checked_times(times, grid.shape, **{"target": wanted, "fit.hks": fitted})
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -103,7 +101,7 @@ def fit_panels(
         orientation.letter(ax)
     ax.set_title("fitted metric, unit circles", fontsize="medium")
     _draw_loss(figure.add_subplot(last[1]), fit)
-    return finished(figure, title or "")
+    return finished(figure, title)
 
 
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:

@@ -73,9 +73,8 @@ def signature_panels(
     }
     if volume.dimension == 2:
         return hks_panels(result.values[:, *box], result.times, grid, **style)
-    if through is not None:  # the domain excludes the thinnest parts of the mask
-        nodes, corner = np.argwhere(inside[box]), [part.start for part in box]
-        style["node"] = nodes[np.argmin(np.sum((nodes + corner - through) ** 2, axis=1))].tolist()
+    if through is not None:
+        style["node"] = [voxel - part.start for voxel, part in zip(through, box, strict=True)]
     return volume_panels(result.values[:, *box], result.times, grid, length_unit=result.length_unit, **style)
 
 

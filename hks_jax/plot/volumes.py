@@ -25,7 +25,7 @@ _COLUMN, _COLUMNS = 2.3, 6
 """The width of a column of slices in inches, and the maximum number of columns."""
 
 
-def middle_node(inside: Bool[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
+def middle_node(inside: Bool[np.ndarray, "*shape"]) -> tuple[int, ...]:
     """Return the inside node that is nearest to the mean of all inside nodes.
 
     Raises:
@@ -60,7 +60,8 @@ def orthogonal_slices(
         axes: three axes, for the planes xy, xz and yz in this order.
         values: (*shape,), with NaN at nodes without a value.
         grid: the 3D grid of the values, whose spacing determines the aspect.
-        node: the indices (i, j, k) of the node, by default `middle_node` of the finite values.
+        node: the indices (i, j, k) of the node, or else of the nearest node with a value; by default `middle_node` of
+            the finite values.
         cross: whether thin lines show the positions of the other two slices.
         orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
             letters.
@@ -68,8 +69,8 @@ def orthogonal_slices(
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
-        ValueError: if there are not three axes, if the grid is not 3D, if the values have another shape or none is
-            finite, or if the node is out of range or has no value.
+        ValueError: if there are not three axes, if the grid is not 3D, or if the values have another shape or none is
+            finite.
 
     Examples:
         >>> axes, grid = hj.plot.new_figure(6, 2).subplots(1, 3), hj.Grid((5, 5, 5))
@@ -122,7 +123,7 @@ def volume_panels(
         values: (n_times, *shape) the result of `hks_jax.hks`.
         times: (n_times,).
         grid: the 3D grid of the values.
-        node: the indices (i, j, k) of a node on the slices, by default `middle_node` of the finite values.
+        node: the same as for `orthogonal_slices`.
         titles: a title for each time, by default “t = …”.
         unit: the unit of t, which follows its value.
         length_unit: the unit of the coordinates.
@@ -190,17 +191,12 @@ def require_volume(grid: Grid) -> None:
 def _turned(
     array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
 ) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
-    """Return values, grid and node in the order of the image; raise ValueError if the node has no value."""
+    """Return values, grid and node, or the nearest node with a value, in the order of the image."""
     if node is not None:
-        inside, node = ~np.ma.getmaskarray(array), tuple(int(i) for i in node)
-        if len(node) != 3 or not all(0 <= i < n for i, n in zip(node, grid.shape, strict=True)):
-            raise ValueError(f"node: got {node}; expected three indices within the grid's shape {grid.shape}")
-        if not inside[node]:
-            raise ValueError(
-                f"node: got {node}, which has no value; expected a node with one, such as {middle_node(inside)}"
-            )
+        nodes = np.argwhere(~np.ma.getmaskarray(array))
+        node = nodes[np.argmin(np.sum((nodes - np.asarray(node)) ** 2, axis=1))].tolist()
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)
         array, grid = orientation.array(array), orientation.grid(grid)
     # The middle is determined in the image, so that ties do not depend on the storage order.
-    return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else node
+    return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else tuple(node)

@@ -23,7 +23,7 @@ import hks_jax as hj
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.job import Settings
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.study.batch import Range, common_times, suitable_range
+from hks_jax.cli.study.batch import common_times, suitable_range
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.subjects import read_subjects
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
@@ -412,12 +412,12 @@ def test_rows_join_the_options_of_the_command(tmp_path):
 
 
 def test_common_times_suit_all_subjects():
-    ranges = {"sub-01": Range(2.0, 50.0), "sub-02": Range(3.0, 80.0)}
+    ranges = {"sub-01": (2.0, 50.0), "sub-02": (3.0, 80.0)}
     assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
     scaled = common_times(ranges, 2, "lambda1")
     np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1]), rtol=5e-3)
     with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and the size of sub-01 allows only t ≤ 3"):
-        common_times({"sub-01": Range(2.0, 3.0), "sub-02": Range(4.0, 9.0)}, 3, "scanner")
+        common_times({"sub-01": (2.0, 3.0), "sub-02": (4.0, 9.0)}, 3, "scanner")
 
 
 def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, monkeypatch, capsys):

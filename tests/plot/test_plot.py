@@ -425,7 +425,7 @@ def test_sensitivity_refuses_what_it_cannot_draw():
     ax = new_figure(3, 3).subplots()
     with pytest.raises(ValueError, match=r"gradient: got shape \(6, 6\); expected \(6, 6, 2, 2\)"):
         sensitivity(ax, Grid((6, 6)), np.zeros((6, 6)))
-    with pytest.raises(ValueError, match="gradient: got 36 NaN or infinite tensors of 36"):
+    with pytest.raises(ValueError, match="gradient: got NaN or infinite tensors"):
         sensitivity(ax, Grid((6, 6)), np.full((6, 6, 2, 2), np.nan), every=1)
 
 

@@ -35,7 +35,7 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -216,18 +216,15 @@ def _suitable(
     return times
 
 
-class Range(NamedTuple):
-    """The range of times that suits one subject: voxels and eigenpairs limit it from below, the size from above."""
-
-    least: float
-    largest: float
+Range = tuple[float, float]
+"""The least and the largest time that suit a subject: voxels and eigenpairs limit the first, the size the second."""
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
     """Estimate the range of times that suits a subject from its metric and its size, without eigenpairs."""
     of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][args.metric or "tensor"]
     by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
-    return Range(max(of["least_time"], by_pairs), of["largest_time"])
+    return max(of["least_time"], by_pairs), of["largest_time"]
 
 
 def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
@@ -236,14 +233,14 @@ def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float,
     For the unit ``"lambda1"``, the function returns products λ₁t; the largest product is `LAST`.
     """
     if unit == "lambda1":
-        ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}
-    late, flat = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
-    least, largest = ranges[late].least, ranges[flat].largest
+        ranges = {name: (LAST * least / most, LAST) for name, (least, most) in ranges.items()}
+    late, small = max(ranges, key=lambda s: ranges[s][0]), min(ranges, key=lambda s: ranges[s][1])
+    least, largest = ranges[late][0], ranges[small][1]
     if least >= largest:
         raise ValueError(
-            f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and the size of {flat} allows "
-            f"only t ≤ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: tensors "
-            "with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
+            f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and the size of {small} "
+            f"allows only t ≤ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: "
+            "tensors with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
         )
     return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))
 

@@ -18,10 +18,11 @@ from hks_jax import __version__
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
-from hks_jax.plot.explore.layers import regions, scalar_layers, tensor_layers
 from hks_jax.plot.orientation import LETTERS
 from hks_jax.plot.panels import checked_times
 from hks_jax.plot.signature import METRICS, bounding_box
+from hks_jax.plot.volumes import middle_node
+from hks_jax.signatures.regions import region_statistics
 from hks_jax.storage import atomic_path
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
@@ -92,15 +93,18 @@ def explore(
     if isinstance(mesh, SurfaceMesh):
         if not inside.all():
             raise ValueError("values: got NaN or infinite values on a surface; expected finite values")
-        surface = {"vertices": np.asarray(mesh.vertices, "<f4"), "faces": mesh.faces.astype("<i4")}
+        surface = {"vertices": _base64(mesh.vertices, "<f4"), "faces": _base64(mesh.faces, "<i4")}
     else:
         inside &= result.volume.inside
         place = {"spacing": result.volume.spacing, "origin": result.volume.origin}
     if not inside.any():
         raise ValueError("values: got no node inside the mask that is finite at all times; expected one")
-    layers = [] if result.tensors is None else tensor_layers(result.tensors, inside)
-    layers += scalar_layers(maps or {}, inside)
-    size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(each.values.size for each in layers))
+    layers = {} if result.tensors is None else _tensor_layers(result.tensors, inside)
+    for name, values in (maps or {}).items():
+        if np.shape(values) != inside.shape:
+            raise ValueError(f"maps[{name!r}]: got shape {np.shape(values)}; expected the grid's shape {inside.shape}")
+        layers[name] = np.asarray(values)[inside]
+    size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(map(np.size, layers.values())))
     if size > LIMIT:
         raise ValueError(
             f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
@@ -112,11 +116,12 @@ def explore(
     if noise is not None:
         shown["deviation"] = (scale * noise)[:, inside]
     box = bounding_box(inside, margin=0)
-    numbers = {"inside": inside[box].astype(np.uint8), **{name: array.astype("<f4") for name, array in shown.items()}}
-    numbers |= {f"layer-{i}": layer.values.astype("<f4") for i, layer in enumerate(layers)} | surface
+    numbers = {"inside": _base64(inside[box], "u1")}
+    numbers |= {name: _base64(array, "<f4") for name, array in shown.items()}
+    numbers |= {f"layer-{i}": _base64(array, "<f4") for i, array in enumerate(layers.values())}
     names: dict[int, str] = {}
     if labels is not None:
-        numbers["labels"], names = regions(labels, label_names, inside)
+        numbers["labels"], names = _regions(labels, label_names, inside)
     about = {
         "title": title,
         "facts": [[name, str(value)] for name, value in _facts(result).items()],
@@ -134,12 +139,16 @@ def explore(
         "flat": result.flat_scale.ravel().tolist(),
         "normalisation": result.normalisation,
         "noise": noise is not None,
-        "start": [0] if surface else _deep_node(inside[box]),
-        "layers": [{"name": layer.name, "kind": layer.kind} for layer in layers],
+        "start": [0] if surface else middle_node(inside[box]),
+        "layers": [
+            {"name": name, "kind": "scalar" if array.ndim == 1 else "direction"} for name, array in layers.items()
+        ],
         "labels": list(names.items()),
-        "colours": {name: _colour_table(colours) for name, colours in COLOURS.items()},
+        "colours": {
+            name: _base64(255 * colormaps[of](np.arange(256))[:, :3] + 0.5, "u1") for name, of in COLOURS.items()
+        },
     }
-    page = _assemble(about, numbers)
+    page = _assemble(about, numbers | surface)
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(path)
@@ -161,15 +170,35 @@ def _facts(result: Result) -> dict[str, Any]:
     return facts
 
 
-def _deep_node(inside: Bool[np.ndarray, "*shape"]) -> list[int]:
-    """Return the initial node, which is the node of the middle slice furthest from the boundary."""
-    from scipy import ndimage
+def _tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarray, "*shape"]) -> dict[str, np.ndarray]:
+    """Return mean eigenvalue and anisotropy (n_nodes,) inside, and principal direction (n_nodes, 3) of this length."""
+    array, d = np.asarray(tensors, np.float64)[inside], inside.ndim
+    if not np.isfinite(array).all():
+        raise ValueError("tensors: got NaN or infinite values in the domain; exclude their nodes by the mask")
+    values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
+    mean = values.mean(axis=-1)
+    spread = np.sqrt(np.sum(np.square(values - mean[:, None]), axis=-1))
+    # Both are 0 for multiples of the identity, and 1 if only one eigenvalue is nonzero.
+    size = np.abs(values.sum(axis=-1)) / np.sqrt(2) if d == 2 else np.sqrt(np.sum(values**2, axis=-1) / 1.5)
+    anisotropy = spread / np.where(size > 0, size, 1)
+    largest = np.argmax(np.abs(values), axis=-1)
+    direction = np.zeros((len(array), 3))
+    direction[:, :d] = anisotropy[:, None] * np.take_along_axis(vectors, largest[:, None, None], axis=2)[..., 0]
+    return {
+        "Mean eigenvalue (diffusivity)": mean,
+        "Anisotropy (λ₁ − λ₂)/(λ₁ + λ₂)" if d == 2 else "Fractional anisotropy": anisotropy,
+        "Principal direction": direction,
+    }
 
-    depth = ndimage.distance_transform_edt(np.pad(inside, 1))[(slice(1, -1),) * inside.ndim]
-    if inside.ndim == 3:
-        middle = np.abs(np.arange(inside.shape[2]) - int(np.median(np.nonzero(inside)[2])))
-        depth = np.where(middle == 0, depth, -1.0)
-    return [int(i) for i in np.unravel_index(int(np.argmax(depth)), inside.shape)]
+
+def _regions(
+    labels: Real[ArrayLike, "*shape"], names: Mapping[int, str] | None, inside: Bool[np.ndarray, "*shape"]
+) -> tuple[str, dict[int, str]]:
+    """Return the labels inside in base64, and the name or, without names, the number of each label that occurs."""
+    found = region_statistics(np.where(inside, 1.0, np.nan)[None], labels)
+    present = found.labels[found.nodes > 0].tolist()
+    known = {label: f"label {label}" for label in present} | dict(names or {})
+    return _base64(np.asarray(labels)[inside], "<i4"), {label: known[label] for label in present}
 
 
 def _in_space(result: Result) -> dict[str, Any]:
@@ -185,19 +214,14 @@ def _in_space(result: Result) -> dict[str, Any]:
     return {"world": matrix.tolist(), "ends": ends}
 
 
-def _colour_table(name: str) -> str:
-    colours = (255 * colormaps[name](np.linspace(0, 1, 256))[:, :3]).round().astype(np.uint8)
-    return _base64(colours)
-
-
-def _assemble(about: dict[str, Any], numbers: dict[str, np.ndarray]) -> str:
+def _assemble(about: dict[str, Any], numbers: dict[str, str]) -> str:
     """Return the page, whose scripts read the description and the numbers."""
     own = files(__package__)
     scripts = "\n".join((own / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
     # "<" is escaped as JSON allows, so that no text can close its script element.
     described = json.dumps(about, allow_nan=False).replace("<", "\\u003c")
     blocks = [f'<script type="application/json" id="about">{described}</script>']
-    blocks += [f'<script type="text/plain" id="{name}">{_base64(array)}</script>' for name, array in numbers.items()]
+    blocks += [f'<script type="text/plain" id="{name}">{text}</script>' for name, text in numbers.items()]
     filled = {
         "TITLE": html.escape(about["title"]),
         "STYLE": (own / "style.css").read_text(encoding="utf-8"),
@@ -209,5 +233,5 @@ def _assemble(about: dict[str, Any], numbers: dict[str, np.ndarray]) -> str:
     return "".join(filled[piece] if i % 2 else piece for i, piece in enumerate(pieces))
 
 
-def _base64(array: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+def _base64(array: ArrayLike, dtype: str) -> str:
+    return base64.b64encode(np.asarray(array).astype(dtype).tobytes()).decode("ascii")
