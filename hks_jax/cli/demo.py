@@ -23,7 +23,7 @@ from hks_jax.cli.outputs import Done, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.values import Times
 from hks_jax.domain import examples
-from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
+from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
 from hks_jax.io.units import MM2_PER_S
 
 OPTIONS = """
@@ -47,7 +47,12 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     from hks_jax.plot import signature_panels
 
-    brain = None if args.phantom else _installed_brain(progress)
+    brain = None if args.phantom else find_example_brain()
+    if not args.phantom and (brain is None or importlib.util.find_spec("dipy") is None):
+        progress.note(
+            'using the phantom, which needs neither the wheel mdt==1.2.7 nor DIPY (pip install "hks-jax[dti]")'
+        )
+        brain = None
     if brain is None:
         tensors, mask, spacing = map(np.asarray, examples.phantom(PHANTOM_SHAPE))
         h = tuple(np.broadcast_to(spacing, (2,)).astype(float).tolist())
@@ -71,13 +76,3 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")
     picture = next(file for file in done.files if file.suffix == ".png")
     return done._replace(text=f"The picture is {picture}")
-
-
-def _installed_brain(progress: Progress) -> ExampleBrain | None:
-    brain = find_example_brain()
-    if brain is None:
-        progress.note("the example brain (wheel mdt==1.2.7) is not installed; using the phantom")
-    elif importlib.util.find_spec("dipy") is None:
-        progress.note('DIPY, which fits tensors, is not installed (pip install "hks-jax[dti]"); using the phantom')
-        brain = None
-    return brain

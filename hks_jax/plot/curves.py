@@ -63,28 +63,22 @@ def hks_curves(
         True
     """
     t = checked_times(times, grid.shape, values=values, expansion=expansion)
-    curves = np.asarray(values, dtype=np.float64)
-    series = None if expansion is None else np.asarray(expansion, dtype=np.float64)
+    curves = np.moveaxis(np.asarray(values, dtype=np.float64), 0, -1)
+    series = None if expansion is None else np.moveaxis(np.asarray(expansion, dtype=np.float64), 0, -1)
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)
     if labels is None:
         labels = ["(" + ", ".join(f"{c:.3g}" for c in grid.nodes[node]) + ")" for node in nodes]
     factor = (4 * math.pi * t) ** (grid.dimension / 2) if scaled else np.ones_like(t)
     colours = colormaps[cmap](np.linspace(0.0, 0.85, len(nodes)))
+    ax.set(xscale="log", yscale="linear" if scaled else "log")
     lines = []
     for node, label, colour in zip(nodes, labels, colours, strict=True):
-        history: Any = (slice(None), *node)
-        style = {"color": colour, "label": label, **kwargs}
-        lines += ax.plot(t, factor * curves[history], **style)
-        if series is not None:
-            ax.plot(t, factor * series[history], color=style["color"], linestyle="--", linewidth=1.0)
-    # The curves determine the scale, because the series diverges at large t.
-    drawn = np.concatenate([np.asarray(line.get_ydata()) for line in lines])
-    ax.set(xscale="log", yscale="linear" if scaled else "log")
-    if scaled:
-        margin = 0.08 * float(np.ptp(drawn)) or 0.1
-        ax.set_ylim(drawn.min() - margin, drawn.max() + margin)
-    else:
-        ax.set_ylim(0.8 * drawn.min(), 1.25 * drawn.max())
+        lines += ax.plot(t, factor * curves[node], **{"color": colour, "label": label, **kwargs})
+    limits = ax.get_ylim()  # of the curves, because the series diverges at large t
+    if series is not None:
+        for node, line in zip(nodes, lines, strict=True):
+            ax.plot(t, factor * series[node], color=line.get_color(), linestyle="--", linewidth=1.0)
+    ax.set_ylim(limits)
     ax.set_xlabel(f"$t${' in ' * bool(unit)}{unit}")
     power = {2: r"4\pi t\,", 3: r"(4\pi t)^{3/2}\,"}[grid.dimension] if scaled else ""
     ax.set_ylabel(rf"${power}\mathrm{{HKS}}(t)$")

@@ -344,7 +344,7 @@ def test_hks_curves_are_the_values_at_the_nodes():
     np.testing.assert_allclose(lines[0].get_ydata(), values[:, 1, 1])
     np.testing.assert_allclose(lines[1].get_ydata(), values[:, 4, 3])
     assert len(ax.lines) == 4
-    np.testing.assert_allclose(ax.lines[1].get_ydata(), 2 * values[:, 1, 1])
+    np.testing.assert_allclose(ax.lines[2].get_ydata(), 2 * values[:, 1, 1])
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["(0.5, 0.5)", "(2, 1.5)", "expansion"]
     assert ax.get_xscale() == ax.get_yscale() == "log"
     scaled = hks_curves(new_figure(3, 3).subplots(), values, times, grid, [[0, 0]], scaled=True, labels=["a"])
