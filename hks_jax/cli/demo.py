@@ -49,9 +49,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
     brain = None if args.phantom else find_example_brain()
     if not args.phantom and (brain is None or importlib.util.find_spec("dipy") is None):
-        progress.note(
-            'using the phantom, which needs neither the wheel mdt==1.2.7 nor DIPY (pip install "hks-jax[dti]")'
-        )
+        progress.note('using a phantom, because the brain needs the wheel mdt==1.2.7 and pip install "hks-jax[dti]"')
         brain = None
     if brain is None:
         tensors, mask, spacing = map(np.asarray, examples.phantom(PHANTOM_SHAPE))

@@ -404,7 +404,7 @@ def test_demo_without_data_does_the_phantom(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
     captured = capsys.readouterr()
-    assert "using the phantom, which needs neither the wheel mdt==1.2.7" in captured.err
+    assert "using a phantom, because the brain needs the wheel mdt==1.2.7" in captured.err
     assert captured.out == "The picture is demo/hks.png\n"
     assert sorted(file.name for file in (tmp_path / "demo").iterdir()) == QUIET_FILES
 
