@@ -34,7 +34,6 @@ from hks_jax.domain.simplicial_mesh import TetMesh as TetMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
 from hks_jax.eigen.complement.adjoint import Adjoint as Adjoint
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint as FactorisedAdjoint
-from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.driver import eigenpairs as eigenpairs
 from hks_jax.eigen.driver import eigsh as eigsh
 from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
@@ -45,6 +44,7 @@ from hks_jax.eigen.host.host_adjoint import HostAdjoint as HostAdjoint
 from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert
 from hks_jax.eigen.inertia import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos as BlockLanczos
+from hks_jax.eigen.solver import Dense as Dense
 from hks_jax.eigen.solver import Eigensolver as Eigensolver
 from hks_jax.eigen.weyl import weyl_count as weyl_count
 from hks_jax.fem.assembly import assemble as assemble

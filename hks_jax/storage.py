@@ -120,25 +120,18 @@ def _hold(file: Path) -> IO[str] | None:
         # the file and its folder.
         with suppress(FileNotFoundError):
             held = open(file, "a", encoding="utf-8")  # noqa: SIM115
-            if not _lock(held):
+            try:
+                if fcntl is not None:
+                    fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
                 held.close()
                 return None
+            except OSError:  # a drive without locks
+                pass
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(held.fileno()), file.stat()):
                     return held
             held.close()
-
-
-def _lock(held: IO[str]) -> bool:
-    if fcntl is None:
-        return True
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a drive without locks
-        return True
-    return True
 
 
 def existing(path: str | os.PathLike[str]) -> Path:

@@ -20,7 +20,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
 from hks_jax.cli.values import parse_times
 from hks_jax.io.result import Result
-from hks_jax.signatures.suitable import RESOLVED
+from hks_jax.signatures.times import RESOLVED
 
 OPTIONS = """
 result RESULT  the result, as an .npz or the folder of a signature

@@ -1,12 +1,27 @@
 """The elements of a masked grid, and their connected components."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy
 from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+
+from hks_jax.checks import require_real
+
+
+def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
+    """Return zeros and ones as booleans; raise ValueError for anything else."""
+    array = np.asarray(values)
+    require_real(name, array)
+    if array.dtype != bool and not np.isin(array, (0, 1)).all():
+        raise ValueError(
+            f"{name}: got dtype {array.dtype} with values other than 0 and 1; expected booleans. Threshold them, for "
+            "example mask > 0.5"
+        )
+    return array.astype(bool)
 
 
 def wrap_nodes(nodes: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
@@ -40,14 +55,7 @@ def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarra
 
 def rim_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
     """Mark the nodes on the rim of a mask: nodes of the domain with an adjacent grid element outside the domain."""
-    count = np.zeros([n + (not wraps) for n, wraps in zip(elements.shape, periodic, strict=True)], dtype=int)
-    beside = elements
-    for axis, wraps in enumerate(periodic):
-        before = [(1, int(not wraps)) if a == axis else (0, 0) for a in range(elements.ndim)]
-        beside = np.pad(beside, before, mode="wrap" if wraps else "edge")  # beyond a side the elements are repeated
-    for start in product((0, 1), repeat=elements.ndim):
-        count += beside[tuple(slice(s, s + n) for s, n in zip(start, count.shape, strict=True))]
-    return (count > 0) & (count < 2**elements.ndim)
+    return element_nodes(elements, periodic) & element_nodes(~elements, periodic)
 
 
 def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> tuple[Int[np.ndarray, "*shape"], int]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hks_jax.arrays import ByKey, StaticArray
 from hks_jax.checks import require_real
-from hks_jax.domain.components import active_elements, label_nodes
+from hks_jax.domain.components import active_elements, as_mask, label_nodes
 
 
 @jax.tree_util.register_static
@@ -54,8 +54,8 @@ class Grid(ByKey):
         self.shape = _checked_shape(shape)
         if len(self.shape) not in (2, 3) or min(self.shape) < 2:
             raise ValueError(f"shape: got {tuple(shape)}; expected 2 or 3 axes with at least 2 nodes each")
-        self.spacing = _per_axis("spacing", spacing, self.dimension)
-        self.origin = _per_axis("origin", origin, self.dimension)
+        self.spacing = per_axis("spacing", spacing, self.dimension)
+        self.origin = per_axis("origin", origin, self.dimension)
         if min(self.spacing) <= 0:
             raise ValueError(f"spacing: got {self.spacing}; expected positive numbers")
         if components not in ("raise", "largest", "all"):
@@ -77,7 +77,7 @@ class Grid(ByKey):
             Grid(shape=(9, 9), spacing=(0.125, 0.125), origin=(0.0, 0.0))
         """
         shape = _checked_shape(shape)
-        low, high = _per_axis("lower", lower, len(shape)), _per_axis("upper", upper, len(shape))
+        low, high = per_axis("lower", lower, len(shape)), per_axis("upper", upper, len(shape))
         if any(b <= a for a, b in zip(low, high, strict=True)):
             raise ValueError(f"upper: got {high}; expected more than lower = {low} on every axis")
         spacing = [(b - a) / max(n - 1, 1) for a, b, n in zip(low, high, shape, strict=True)]
@@ -141,7 +141,8 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
         raise ValueError(f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, the nodes per axis") from None
 
 
-def _per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: int) -> tuple[float, ...]:
+def per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: int) -> tuple[float, ...]:
+    """Return a finite number for each axis, from such numbers or one number for all axes."""
     require_real(name, value)
     try:
         values = np.asarray(value, dtype=np.float64)
@@ -155,13 +156,9 @@ def _per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension:
 
 
 def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndarray:
-    array = np.asarray(mask)
-    if array.shape != shape:
-        raise ValueError(f"mask: got shape {array.shape}; expected the grid's shape {shape}")
-    if array.dtype != bool:
-        if not np.isin(array, (0, 1)).all():
-            raise ValueError(f"mask: got dtype {array.dtype} with values other than 0 and 1; expected booleans")
-        array = array.astype(bool)
+    if np.shape(mask) != shape:
+        raise ValueError(f"mask: got shape {np.shape(mask)}; expected the grid's shape {shape}")
+    array = as_mask("mask", mask)
     if not array.any():
         raise ValueError("mask: no node is inside (the mask is empty); expected True at the nodes of the domain")
     wrapped = (True,) * array.ndim

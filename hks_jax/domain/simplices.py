@@ -8,6 +8,7 @@ import scipy
 from jaxtyping import Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
@@ -49,8 +50,7 @@ def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> 
         raise ValueError(
             f"{words.argument}: got vertex indices {span}; expected 0 … {n_vertices - 1} for {n_vertices} vertices"
         )
-    used = np.zeros(n_vertices, dtype=bool)
-    used[indices] = True
+    used = np.isin(np.arange(n_vertices), indices)
     if not (used.all() or masked):
         raise ValueError(
             f"vertices: {int((~used).sum())} of {n_vertices} belong to no {words.one} (the first is vertex "
@@ -73,9 +73,7 @@ def checked_mask(
             f"mask: got shape {inside.shape}; expected {(n_vertices,)}, one for each vertex, or {(len(cells),)}, one "
             f"for each {words.one}"
         )
-    if inside.dtype != bool and not np.isin(inside, (0, 1)).all():
-        raise ValueError(f"mask: got dtype {inside.dtype} with values other than 0 and 1; expected booleans")
-    inside = inside.astype(bool)
+    inside = as_mask("mask", inside)
     kept = inside[cells].all(axis=1) if len(inside) == n_vertices else inside
     if len(inside) == len(cells) and (kept != inside).any():
         raise ValueError(

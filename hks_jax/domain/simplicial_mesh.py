@@ -12,7 +12,7 @@ from hks_jax.checks import real_array
 from hks_jax.domain import spd
 from hks_jax.domain.mesh_tensors import metric_of_tensors
 from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_cells, checked_mask
-from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, checked_tensors
+from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, require_spd
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.traced import is_traced
 
@@ -204,7 +204,11 @@ class TetMesh(SimplicialMesh):
 
 
 def _checked_metric(metric: Any, triangulation: Triangulation) -> Float[Array, "n d d"]:
-    d, n = triangulation.dimension, len(triangulation.cells)
+    d, n, array = triangulation.dimension, len(triangulation.cells), real_array("metric", metric)
     words = WORDS[d]
-    expected = f"({words.letter}, {d}, {d}) = {(n, d, d)}, one per {words.simplex}"
-    return spd.symmetrise(checked_tensors("metric", metric, np.ones(n, dtype=bool), d, expected, place=words.one))
+    if array.shape != (n, d, d):
+        expected = f"({words.letter}, {d}, {d}) = {(n, d, d)}, one per {words.simplex}"
+        raise ValueError(f"metric: got shape {array.shape}; expected {expected}")
+    if not is_traced(array):
+        require_spd("metric", np.asarray(array), np.ones(n, dtype=bool), words.one)
+    return spd.symmetrise(array)

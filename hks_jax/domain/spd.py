@@ -14,13 +14,9 @@ from hks_jax.linear.dense_eigh import differentiable_eigh
 from hks_jax.linear.products import matmul
 
 
-def symmetrise(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the symmetric part, ``(T + Tᵀ)/2``."""
-    return _symmetrised(tensors)
-
-
 @numpy_where_known()
-def _symmetrised(xp: Any, tensors: Any) -> Any:
+def symmetrise(xp: Any, tensors: Any) -> Any:
+    """Return the symmetric part, ``(T + Tᵀ)/2``."""
     return 0.5 * (tensors + xp.swapaxes(tensors, -1, -2))
 
 
@@ -94,12 +90,6 @@ def positive_or_nan(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]
     return tensors * jnp.where(_positive(tensors), 1, jnp.nan).astype(tensors.dtype)[..., None, None]
 
 
-@jax.jit
-def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the exponential of symmetric matrices, d = 2 or 3."""
-    return jax.checkpoint(_exp)(tensors)  # so that reverse mode stores the matrices, not a hundred numbers for each
-
-
 # If tr S = 0, the Cayley–Hamilton theorem gives S² = qI (d = 2) or S³ = pS + |S| I (d = 3). So exp S is a
 # polynomial in S of degree d − 1, whose coefficients are entire functions of q, or of p and |S|. No eigenvalues are
 # needed, and derivatives of any order are smooth where eigenvalues coincide. The coefficients are those of Taylor's
@@ -107,7 +97,10 @@ def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 _SQUARINGS, _TERMS = 8, 20
 
 
-def _exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+@jax.jit
+@jax.checkpoint  # so that reverse mode stores the matrices, not a hundred numbers for each
+def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+    """Return the exponential of symmetric matrices, d = 2 or 3."""
     d, tensors = tensors.shape[-1], symmetrise(tensors)
     eye = jnp.broadcast_to(jnp.eye(d, dtype=tensors.dtype), tensors.shape)
     mean = jnp.trace(tensors, axis1=-2, axis2=-1) / d

@@ -1,7 +1,7 @@
 """Checks of tensors and deformation gradients with their messages, and maps from indefinite tensors to metrics."""
 
 import math
-from typing import Any, Literal, NoReturn, get_args
+from typing import Any, Literal, NoReturn
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,15 +35,13 @@ def checked_interpolation(interpolation: Any) -> Interpolation:
     return interpolation
 
 
-def checked_tensors(
-    name: str, tensors: Any, inside: Bool[np.ndarray, "*shape"], d: int, expected: str, place: str = "node"
-) -> Float[Array, "*shape d d"]:
-    """Return tensors (*inside.shape, d, d) as floating-point numbers; raise ValueError unless they are SPD inside."""
-    array = real_array(name, tensors)
-    if array.shape != (*inside.shape, d, d):
-        raise ValueError(f"{name}: got shape {array.shape}; expected {expected}")
-    if not is_traced(array):
-        require_spd(name, np.asarray(array), inside, place)
+def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]:
+    """Return tensors at the nodes of a grid as floating-point numbers; raise ValueError for another shape."""
+    if not isinstance(grid, Grid):
+        raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
+    array, expected = real_array(name, tensors), (*grid.shape, grid.dimension, grid.dimension)
+    if array.shape != expected:
+        raise ValueError(f"{name}: got shape {array.shape}; expected (*grid.shape, d, d) = {expected}")
     return array
 
 
@@ -117,8 +115,8 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
     if shape != grid.shape or n != d or m < d:
         expected = (*grid.shape, d, d)
         raise ValueError(
-            f"{name}: got shape {gradients.shape}; expected (*grid.shape, d, d) = {expected}, one gradient per node, "
-            "or more rows than columns for a map into a space of more dimensions"
+            f"{name}: got shape {gradients.shape}; expected one gradient per node, (*grid.shape, d, d) = {expected}. "
+            "For a map into a space of more dimensions, gradients have more rows than columns"
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
@@ -149,60 +147,43 @@ NUMBERS = {"exp": "scale", "shift": "shift"}
 """The name of the number of each map."""
 
 
-def checked_map(how: Any) -> PositiveMap:
-    """Return the name of a map; raise ValueError for any other."""
-    if how not in get_args(PositiveMap):
-        choices = " or ".join(f'"{name}" ({does})' for name, does in MAPS.items())
+def positive_map(
+    name: str,
+    tensors: Float[Array, "*shape d d"],
+    how: PositiveMap | None,
+    number: Any,
+    inside: Bool[np.ndarray, "*shape"],
+    place: str = "node",
+) -> Float[Array, "*shape d d"]:
+    """Return exp(S/s) or S + c·I of symmetric tensors S; outside, S is the identity.
+
+    Raises:
+        ValueError: an unknown map; NaN, infinite or unsymmetric tensors; a number that is not a scale or shift, or for
+            which a mapped tensor is not positive definite.
+    """
+    if how not in NUMBERS:
+        choices = " or ".join(f'"{choice}" ({does})' for choice, does in MAPS.items())
         raise ValueError(f"how: got {how!r}; expected {choices}. There is no default: choose one")
-    return how
-
-
-def check_number(name: str, how: PositiveMap, number: Any) -> None:
-    """Raise ValueError unless the number is a positive scale or a finite shift; traced numbers pass."""
     if number is None:
         raise ValueError(f"number: got None; expected the {NUMBERS[how]} of the map {how!r}, in the units of {name}")
     require_number("number", number, above=0.0 if how == "exp" else -math.inf)
-
-
-def check_shift(name: str, tensors: Float[np.ndarray, "n d d"], how: PositiveMap, number: Any) -> None:
-    """Raise ValueError unless a shift is above minus the least eigenvalue of the tensors."""
-    least = least_eigenvalue(tensors)
-    if how == "shift" and not float(number) + least > 0:
-        raise ValueError(
-            f"number: got the shift {float(number):g} of {name} whose least eigenvalue is {least:g}; expected more "
-            f"than {-least:g}, so that S + c·I is positive definite"
-        )
-
-
-def check_mapped(
-    tensors: Float[np.ndarray, "n d d"], mapped: Float[np.ndarray, "n d d"], how: PositiveMap, number: Any
-) -> None:
-    """Raise ValueError if a mapped tensor is singular in its precision."""
-    if not spd.is_spd(mapped).all():
-        values = np.linalg.eigvalsh(tensors.astype(np.float64))
-        raise ValueError(
-            f"number: got the {NUMBERS[how]} {float(number):g} of tensors with eigenvalues from {values.min():.4g} "
-            f"to {values.max():.4g}: the metric is singular in {mapped.dtype}; expected a larger number"
-        )
-
-
-def positive_map(
-    name: str, tensors: Float[Array, "*shape d d"], how: PositiveMap, number: Any, inside: Bool[np.ndarray, "*shape"]
-) -> Float[Array, "*shape d d"]:
-    """Return exp(S/s) or S + c·I of symmetric tensors S at the nodes of a grid; outside, S is the identity.
-
-    Raises:
-        ValueError: NaN, infinite or unsymmetric tensors; a number for which a mapped tensor is not positive definite.
-    """
-    check_number(name, how, number)
     known = not is_traced((tensors, number))
     if known:
-        require_finite_symmetric(name, np.asarray(tensors), inside, "node")
-        check_shift(name, np.asarray(tensors)[inside], how, number)
+        require_finite_symmetric(name, np.asarray(tensors), inside, place)
+        values = np.linalg.eigvalsh(np.asarray(tensors, np.float64)[inside])
+        got = f"number: got the {NUMBERS[how]} {float(number):g} of {name}"
+        if how == "shift" and not float(number) + values.min() > 0:
+            raise ValueError(
+                f"{got} whose least eigenvalue is {values.min():g}; expected more than {-values.min():g}, so that "
+                "S + c·I is positive definite"
+            )
     symmetric = spd.symmetrise(spd.identity_outside(tensors, inside))
     number = jnp.asarray(number, tensors.dtype)
     eye = jnp.eye(tensors.shape[-1], dtype=tensors.dtype)
     mapped = spd.exp(symmetric / number) if how == "exp" else symmetric + number * eye
-    if known:
-        check_mapped(np.asarray(tensors)[inside], np.asarray(mapped)[inside], how, number)
+    if known and not spd.is_spd(np.asarray(mapped)[inside]).all():
+        raise ValueError(
+            f"{got} with eigenvalues from {values.min():.4g} to {values.max():.4g}: the metric is singular in "
+            f"{mapped.dtype}; expected a larger number"
+        )
     return mapped

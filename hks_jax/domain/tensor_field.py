@@ -20,11 +20,12 @@ from hks_jax.domain.tensor_checks import (
     PositiveMap,
     check_metric_choice,
     checked_interpolation,
-    checked_map,
-    checked_tensors,
     positive_map,
+    require_spd,
     right_cauchy_green,
+    tensors_on,
 )
+from hks_jax.traced import is_traced
 
 
 class TensorField(eqx.Module):
@@ -149,7 +150,6 @@ class TensorField(eqx.Module):
             >>> print(hj.TensorField.from_deformation(field.grid, shear).tensors[4, 4].tolist())
             [[1.0, 1.0], [1.0, 2.0]]
         """
-        _require_grid(grid)
         C = right_cauchy_green(name, grid, F)
         return cls(grid, _checked_tensors(f"{name}ᵀ{name}", grid, C), interpolation)
 
@@ -194,13 +194,8 @@ class TensorField(eqx.Module):
             >>> print(hj.TensorField.from_indefinite(field.grid, stress, "shift", 2.0).tensors[4, 4].diagonal())
             [3. 1.]
         """
-        _require_grid(grid)
-        chosen = checked_map(how)
-        tensors = real_array(name, S)
-        if tensors.shape != (*grid.shape, grid.dimension, grid.dimension):
-            expected = (*grid.shape, grid.dimension, grid.dimension)
-            raise ValueError(f"{name}: got shape {tensors.shape}; expected (*grid.shape, d, d) = {expected}")
-        return cls(grid, positive_map(name, tensors, chosen, number, grid.inside), interpolation)
+        mapped = positive_map(name, tensors_on(grid, name, S), how, number, grid.inside)
+        return cls(grid, mapped, interpolation)
 
     def __repr__(self) -> str:
         values = "a function" if self.function is not None else describe_array(self._tensors)
@@ -229,13 +224,8 @@ def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_com
     return flat.reshape(*grid.shape, *flat.shape[1:])
 
 
-def _require_grid(grid: Any) -> None:
-    if not isinstance(grid, Grid):
-        raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
-
-
 def _checked_tensors(name: str, grid: Grid, tensors: Any) -> Float[Array, "*shape d d"]:
-    _require_grid(grid)
-    d = grid.dimension
-    expected = f"(*grid.shape, d, d) = {(*grid.shape, d, d)}, one tensor per node"
-    return checked_tensors(name, tensors, grid.inside, d, expected)
+    array = tensors_on(grid, name, tensors)
+    if not is_traced(array):
+        require_spd(name, np.asarray(array), grid.inside, "node")
+    return array

@@ -87,9 +87,7 @@ class Triangulation(ByKey):
     @cached_property
     def boundary_vertices(self) -> Bool[np.ndarray, " V"]:
         """The vertices on facets that belong to one cell only, bool (V,)."""
-        on_boundary = np.zeros(self.n_vertices, dtype=bool)
-        on_boundary[self.facet_vertices(self.boundary_facets)] = True
-        return on_boundary
+        return np.isin(np.arange(self.n_vertices), self.facet_vertices(self.boundary_facets))
 
     @cached_property
     def _edges(self) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "n m"]]:
@@ -120,9 +118,7 @@ class Triangulation(ByKey):
     @cached_property
     def used(self) -> Bool[np.ndarray, " V"]:
         """The vertices that belong to a cell, bool (V,): all except those outside of a mask."""
-        used = np.zeros(self.n_vertices, dtype=bool)
-        used[self.cells] = True
-        return used
+        return np.isin(np.arange(self.n_vertices), self.cells)
 
     @cached_property
     def labels(self) -> tuple[Int[np.ndarray, " V"], int]:

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.one_pencil import solve_lowest, widened
-from hks_jax.eigen.solver import Eigensolver, Report, Status
+from hks_jax.eigen.solver import Dense, Eigensolver, Report, Status
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced

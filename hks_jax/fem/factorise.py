@@ -27,12 +27,13 @@ def factorise(
     boundary: BoundarySpec = "neumann",
     mass: MassKind = "consistent",
 ) -> FactorisedMatrix:
-    """Factorise A = K − σM, which gives solves, the determinant, the inertia and the diagonal of the inverse.
+    """Factorise A = K − σM for ``.solve(b)``, ``.logdet()``, ``.inertia`` and ``.inverse_diagonal()``.
 
     The matrix A may be indefinite. All results are differentiable with respect to K, M, σ and right-hand sides, in
     forward and reverse mode to any order, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ along a nested
     dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots spoil
-    it, the elimination is repeated with these pivots replaced, and solutions are refined iteratively.
+    it, the elimination is repeated with these pivots replaced, and solutions are refined iteratively. If values are
+    traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Args:
         domain: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the identity), or (K, M), as
@@ -40,10 +41,6 @@ def factorise(
         shift: the shift σ.
         boundary: see `assemble`; leave it out for a pencil or matrices.
         mass: likewise.
-
-    Returns:
-        The factorised matrix with ``.solve(b)``, ``.logdet()``, ``.inertia`` and ``.inverse_diagonal()``. If values are
-        traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Raises:
         ValueError: a shift that is not a finite number; a singular matrix (with the number of its null vectors); a

@@ -1,6 +1,7 @@
 """The pencil of a grid on all nodes, with masks as arrays, so that all masks share compiled code."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -156,8 +157,8 @@ def _of_one(pencil: Pencil) -> Pencil:
     sums = pencil.row_sums
     if sums is not None:  # an infinite sum ignores the neighbours
         sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
-    known_of_it = StencilOperator(of_stiffness, whole), mass, pencil.metric, pencil.volume, whole
-    return Pencil(*known_of_it, null_space=nulls, lower_bound=pencil.lower_bound, row_sums=sums)
+    stiffness = StencilOperator(of_stiffness, whole)
+    return replace(pencil, stiffness=stiffness, mass=mass, space=whole, null_space=nulls, row_sums=sums)
 
 
 # The largest Kᵢᵢ/Mᵢᵢ is a Rayleigh quotient and so at most the largest eigenvalue: the spectrum does not become wider.

@@ -89,10 +89,10 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
     return total
 
 
-# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element averages it. The exact
-# solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. An element lacks the energy of the corrector,
-# Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis.
-# The estimate holds for √t above the length on which A varies; for smaller t only its size is right.
+# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. The
+# exact solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. An element lacks the energy of the
+# corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along
+# one axis. The estimate holds for √t above the length on which A varies; for smaller t only its size is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]

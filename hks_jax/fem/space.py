@@ -1,5 +1,6 @@
 """Finite element spaces: their degrees of freedom, their null vectors, and masks for computations."""
 
+import math
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, reduce
 from itertools import product
@@ -10,18 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.compilation import by_numpy, known_here
+from hks_jax.arrays import ByKey
+from hks_jax.compilation import by_numpy, is_concrete_on_cpu
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
+from hks_jax.fem.halo import neighbours, with_rim
 from hks_jax.traced import is_staged, is_traced
 
 _COPIED = 1 << 22
 """The largest number of values that NumPy copies in less time than a compilation takes."""
 
 
-class FunctionSpace:
+class FunctionSpace(ByKey):
     """The nodes of a domain, and the free nodes, which carry a degree of freedom. Static and hashable.
 
     Attributes:
@@ -43,7 +46,6 @@ class FunctionSpace:
     n_components: int
     elements: Bool[np.ndarray, "*elements"]
     _labels: Int[np.ndarray, "*node_shape"]
-    _key: tuple
 
     def __repr__(self) -> str:
         """Return one line: the degrees of freedom, the nodes and the boundary."""
@@ -108,12 +110,6 @@ class FunctionSpace:
         """Return functions of this space as functions of another one on the same nodes, zero at its Dirichlet nodes."""
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
 
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, FunctionSpace) and self._key == other._key)
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
 
 def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Float[Array, "... m"]:
     """Return the values at given indices of the last axis."""
@@ -134,7 +130,7 @@ def _spread(
 
 
 def _by_numpy(values: Array) -> bool:
-    return np.size(values) <= _COPIED and known_here(values)
+    return np.size(values) <= _COPIED and is_concrete_on_cpu(values)
 
 
 # The indices are passed as arrays, so that sets of equally many indices share one compilation.
@@ -192,9 +188,16 @@ class GridSpace(FunctionSpace):
     @cached_property
     def cells(self) -> Int[np.ndarray, "E n"]:
         """The nodes of each element of the domain."""
-        numbers = wrap_nodes(np.arange(self.free.size).reshape(self.node_shape), self.periodic)
-        corners = [numbers[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * self.dimension)]
-        return np.stack(corners, axis=-1)[self.elements]
+        return cells_of(self.elements, self.node_shape, self.periodic)
+
+
+def cells_of(
+    elements: Bool[np.ndarray, "*elements"], shape: tuple[int, ...], periodic: tuple[bool, ...]
+) -> Int[np.ndarray, "E n"]:
+    """Return the nodes of each marked element of a grid, in the order of ``product((0, 1), repeat=d)``."""
+    numbers = wrap_nodes(np.arange(math.prod(shape)).reshape(shape), periodic)
+    corners = product(*[(slice(None, -1), slice(1, None))] * len(shape))
+    return np.stack([numbers[corner] for corner in corners], axis=-1)[elements]
 
 
 @jax.tree_util.register_static
@@ -262,10 +265,6 @@ class MatrixSpace(FunctionSpace):
         self.n_components, self._labels = 1, np.zeros(shape, int)
         self._key = (shape, dimension)
 
-    def __repr__(self) -> str:
-        """Return one line: the unknowns and their shape."""
-        return f"MatrixSpace({self.n_dof} unknowns, nodes={self.node_shape}, dimension={self.dimension})"
-
 
 def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
     """Return the space of a grid, which grids with the same nodes share."""
@@ -297,33 +296,22 @@ def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "of
 
     The result is None if the values are traced and all nodes of the domain are free.
     """
-    if not (is_traced(values) and is_staged()):
-        return free_couplings(space)
-    if (space.free == space.domain).all():
+    staged = is_traced(values) and is_staged()
+    if staged and (space.free == space.domain).all():
         return None
-    axes = _box(space.free)
+    axes = _box(space.free) if staged else None
     if axes is None:
-        return free_couplings(space)
-    rimmed = [
-        np.pad(axis, 1, mode="wrap" if wraps else "constant") for axis, wraps in zip(axes, space.periodic, strict=True)
-    ]
-    return _outer(
-        [np.stack([axis & end[s : s + axis.size] for s in range(3)]) for axis, end in zip(axes, rimmed, strict=True)]
-    )
+        return _free_couplings(space)
+    return _outer([_coupled(axis, (wraps,)) for axis, wraps in zip(axes, space.periodic, strict=True)])
 
 
 @lru_cache(maxsize=16)
-def free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
-    """Mark the offsets and nodes of couplings with two free ends."""
-    free, d = space.free, space.dimension
-    for axis, wraps in enumerate(space.periodic):
-        widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
-        free = np.pad(free, widths, mode="wrap" if wraps else "constant")
-    starts = product((0, 1, 2), repeat=d)
-    shape = space.node_shape
-    return np.stack(
-        [space.free & free[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))] for start in starts]
-    )
+def _free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
+    return _coupled(space.free, space.periodic)
+
+
+def _coupled(free: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> Bool[np.ndarray, "offsets *shape"]:
+    return np.stack([free & other for other in neighbours(with_rim(free, periodic), free.ndim)])
 
 
 def _box(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:

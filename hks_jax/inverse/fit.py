@@ -42,7 +42,8 @@ def fit_metric(
 
     The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
     penalties of the regularisers. Isometric metrics have the same signature, and high frequencies affect it little. So
-    the steps are damped, and smooth by default, and first change the directions that the data determine.
+    the steps are damped, and smooth by default, and first change the directions that the data determine. The result
+    states how the fit ended; a fit that stalls or is interrupted raises no error.
 
     Args:
         init: the initial metric: a field, or a grid for the flat metric. The fit keeps properties of the field that the
@@ -64,9 +65,6 @@ def fit_metric(
         search: the settings of the optimisation and its stopping criteria.
         progress: a function, such as ``print``, that is called with each step.
         checkpoint: a file that is written after each step. If the file exists, the fit resumes from it.
-
-    Returns:
-        The fit. ``fit.result`` states how it ended; a fit that stalls or is interrupted raises no error.
 
     Warns:
         AccuracyWarning: if the misfit is close to the truncation error of k pairs, so that the fit matches its own
@@ -127,15 +125,5 @@ def fit_metric(
             "The fitted metric does not explain the target, and its differences from init may be artefacts. Use "
             'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise='
         )
-    return MetricFit(
-        unknowns.field(values),
-        float(outcome.loss),
-        misfit,
-        left,
-        tuple(now.history),
-        result,
-        values,
-        problem,
-        tuple(now.losses),
-        noise,
-    )
+    field, history, losses = unknowns.field(values), tuple(now.history), tuple(now.losses)
+    return MetricFit(field, float(outcome.loss), misfit, left, history, result, values, problem, losses, noise)

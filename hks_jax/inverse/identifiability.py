@@ -85,9 +85,6 @@ def identifiability(
         iterations: the number of subspace iterations, each with n + 8 products with J and with Jᵀ.
         seed: the seed of the random initial subspace.
 
-    Returns:
-        The spectrum, directions, resolution and uncertainty.
-
     Raises:
         ValueError: if a problem is given without values, or if n is out of range.
 
@@ -120,17 +117,9 @@ def identifiability(
     share = strengths / (strengths + variance / prior**2)
     squares = directions.reshape(n, len(values), -1) ** 2
     resolution = jnp.einsum("n,nxc->x", share, squares) / squares.shape[2]
-    return Identifiability(
-        strengths,
-        directions,
-        weak[:n_weak],
-        weak_directions[:n_weak],
-        resolution,
-        prior * jnp.sqrt(jnp.maximum(1 - resolution, 0)),
-        jnp.sum(share),
-        noise,
-        prior,
-    )
+    deviation = prior * jnp.sqrt(jnp.maximum(1 - resolution, 0))
+    found = strengths, directions, weak[:n_weak], weak_directions[:n_weak], resolution, deviation
+    return Identifiability(*found, jnp.sum(share), noise, prior)
 
 
 def _information(problem: Problem, values: Values) -> Any:

@@ -94,10 +94,8 @@ class Observation(eqx.Module):
 
     def pairs_needed(self, k: int | None, pencil: AnyPencil, field: TensorField) -> int:
         """Return the number of eigenpairs to compute: k, or enough for the observed times."""
-        if self.signature.lowest:
-            return self.shape[0]
         times = None if self.times is None else self.observed_times
-        return self.signature.pairs_needed(k, times, pencil, field)
+        return self.shape[0] if self.signature.lowest else self.signature.pairs_needed(k, times, pencil, field)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
         """Return the residuals. The misfit is half their sum of squares."""

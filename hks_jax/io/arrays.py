@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.domain.components import as_mask
+from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
-from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
-def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
+def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
     """Return the array of an npy, or the array ``mask`` of an npz, and None in place of an affine."""
     if name.lower().endswith(".npy"):
         return load_npy(name), None
@@ -22,10 +24,9 @@ def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray,
     return arrays["mask"], None
 
 
-def read_tensors(
+def _read_tensors(
     name: str, order: str | None, frame: str | None, array: str | None, spacing: float | Sequence[float] | None
 ) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`."""
     wanted = array or "tensors"
     if name.lower().endswith(".npy"):
         arrays: Mapping[str, Any] = {wanted: load_npy(name)}
@@ -66,22 +67,20 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,
-        _per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
-        _per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
+        per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
+        per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
         None if mask is None else as_mask(f"{name}: mask", mask),
         None if affine is None else _real(f"{name}: affine", affine),
         **about,
     )
 
 
-def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars and the position of their grid; see `hks_jax.io.save`."""
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
     write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})
 
 
-def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
-    """Write the arrays that `read_tensors` reads."""
+def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     record = describe_tensors(volume, "matrix", "voxel", provenance)
     units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
     content = {"tensors": volume.tensors, **place_of(volume), "frame": "voxel", **units, "provenance": record}
@@ -106,9 +105,4 @@ def _real(name: str, value: Any) -> Float[np.ndarray, "..."]:
     return array.astype(np.float64)
 
 
-def _per_axis(name: str, value: Any, d: int) -> tuple[float, ...]:
-    array = _real(name, value)
-    return tuple((np.full(d, array) if array.ndim == 0 else array.ravel()).tolist())
-
-
-FORMAT = Format((".npz", ".npy"), read_tensors, ("array", "spacing"), read_image, (".npz",), write, write_tensors)
+FORMAT = Format((".npz", ".npy"), _read_tensors, ("array", "spacing"), _read_image, (".npz",), _write, _write_tensors)

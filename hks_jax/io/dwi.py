@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_number
+from hks_jax.domain.components import as_mask
 from hks_jax.io import nifti
 from hks_jax.io.masks import read_mask
 from hks_jax.io.tensor_order import Matrices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
-from hks_jax.io.volume import TensorVolume, as_mask, digest, placed
+from hks_jax.io.volume import TensorVolume, digest, placed
 from hks_jax.optional import optional
 from hks_jax.storage import existing, reading
 

@@ -11,15 +11,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_number
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.io import components, mesh, nifti
+from hks_jax.io import mesh, nifti
 from hks_jax.io.formats import WRITTEN, format_of
 from hks_jax.io.masks import read_mask
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
-from hks_jax.io.volume import TensorVolume, as_mask, describe, digest
+from hks_jax.io.volume import TensorVolume, describe, digest
 from hks_jax.io.vtk_image import by_time
 from hks_jax.storage import write_npz
 
@@ -42,22 +43,18 @@ def read_tensors(
     or their axes, the function raises an error that lists the choices. Lengths are in mm if the file declares their
     unit, and a note reports any conversion.
 
-    NIfTI: an image (nx, ny, nz, 1, 6) or (nx, ny, nz, 6). The symmetric-matrix intent (code 1005) or a BIDS sidecar
-    declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
-    each; give the path of one of them, or all six.
-
-    MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
-
-    NRRD: any axis may hold the components. Its kind is one of the format's 2D or 3D matrices, or the axis has six
-    components (three in the plane) and `order` is given. The measurement frame is applied. If the file's space is
-    patient-based, the affine's axes are right, anterior, superior.
-
-    VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at points or cells, and an optional
-    array ``mask``. An image one voxel thick whose tensors vanish across it gives 2×2 tensors.
-
-    npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), with array axis a along coordinate a, or with six
-    components (three in the plane) if `order` is given. Optional arrays are ``spacing`` (d,) = 1, ``origin`` (d,) = 0,
-    ``mask`` (*shape,), ``affine`` (4, 4), ``order`` and ``frame``. npy: only the tensors.
+    - NIfTI: an image (nx, ny, nz, 1, 6) or (nx, ny, nz, 6). The symmetric-matrix intent (code 1005) or a BIDS sidecar
+      declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
+      each; give the path of one of them, or all six.
+    - MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
+    - NRRD: any axis may hold the components. Its kind is one of the format's 2D or 3D matrices, or the axis has six
+      components (three in the plane) and `order` is given. The measurement frame is applied. If the file's space is
+      patient-based, the affine's axes are right, anterior, superior.
+    - VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at points or cells, and an
+      optional array ``mask``. An image one voxel thick whose tensors vanish across it gives 2×2 tensors.
+    - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), array axis a along coordinate a, or with six
+      components (three in the plane) if `order` is given. Optional are ``spacing`` (d,) = 1, ``origin`` (d,) = 0,
+      ``mask`` (*shape,), ``affine`` (4, 4), ``order`` and ``frame``. npy: only the tensors.
 
     Args:
         path: the file, or six files.
@@ -92,23 +89,21 @@ def read_tensors(
         4.0 (0.125, 0.125)
     """
     require_number("confidence", confidence, above=-math.inf)
-    if not isinstance(path, str | os.PathLike):
+    paths = nifti.siblings(path) if isinstance(path, str | os.PathLike) else [os.fspath(each) for each in path]
+    if len(paths) != 1:
         if array is not None or spacing is not None:
             raise ValueError("array, spacing: only NumPy's and VTK's files need them. Leave them out for six images")
-        volume = components.read_tensors(list(path), order, frame)
+        volume = nifti.read_components(paths, order, frame)
     else:
-        name, reader = os.fspath(path), format_of(path)
+        (name,), reader = paths, format_of(paths[0])
         if array is not None and "array" not in reader.options:
             raise ValueError(f"array: got {array!r}, but only npz and VTK files have arrays by name. Leave it out")
         if spacing is not None and "spacing" not in reader.options:
             raise ValueError(f"spacing: {name} has its own, and only NumPy's files may need one. Leave it out")
-        if reader is nifti.FORMAT and components.is_one_of_six(path):
-            volume = components.read_tensors(components.siblings(path), order, frame)
-        else:
-            given = {"array": array, "spacing": spacing, "confidence": confidence}
-            volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
-            if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
-                volume = replace(volume, digest=digest(name))
+        given = {"array": array, "spacing": spacing, "confidence": confidence}
+        volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
+        if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
+            volume = replace(volume, digest=digest(name))
     if unit is not None:
         volume = in_mm2_per_s(volume, unit)
     if mask is not None:
@@ -130,19 +125,15 @@ def save(
 ) -> Path:
     """Write scalars on the grid of a volume or slice, or at the vertices of a mesh; the suffix determines the format.
 
-    ``.nii``, ``.nii.gz``: an image with the volume's affine and times along the fourth axis. A slice is written as an
-    image one voxel thick at its position in space. NaN outside the mask is kept. Times in `extra` are written to
-    NAME.json beside the image as ``Times``, following BIDS.
-
-    ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
-
-    ``.vti``: point data with one array per time, whose name contains the time, and ``mask``; field data with `extra`.
-
-    ``.npz``: the values as the array `name`, and the arrays in `extra`. A grid adds ``spacing``, ``origin``, and if
-    they exist ``mask``, ``affine`` and ``slice_axis``. A mesh adds ``vertices`` and ``faces`` (triangles) or ``cells``
-    (tetrahedra).
-
-    ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
+    - ``.nii``, ``.nii.gz``: an image with the volume's affine and times along the fourth axis. A slice is written as
+      an image one voxel thick at its position in space. NaN outside the mask is kept. Times in `extra` are written to
+      NAME.json beside the image as ``Times``, following BIDS.
+    - ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
+    - ``.vti``: point data with one array per time, whose name contains the time, and ``mask``; field data with `extra`.
+    - ``.npz``: the values as the array `name`, and the arrays in `extra`. A grid adds ``spacing``, ``origin``, and if
+      they exist ``mask``, ``affine`` and ``slice_axis``. A mesh adds ``vertices`` and ``faces`` (triangles) or
+      ``cells`` (tetrahedra).
+    - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
     the decisions of the reader, and `provenance`. For a mesh not in npz, the record is in a second file, whose path is
@@ -170,6 +161,8 @@ def save(
         True
     """
     file, array = Path(path), np.asarray(values)
+    if array.dtype not in (np.float32, np.float64) and not file.name.lower().endswith(".npz"):
+        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     shape = (len(volume.vertices),) if isinstance(volume, SimplicialMesh) else volume.shape
     n = array.ndim - len(shape)
     if n not in (0, 1) or array.shape[n:] != shape:
@@ -193,20 +186,18 @@ def save_tensors(
 ) -> Path:
     """Write the tensors of a volume in a format that `read_tensors` reads; the suffix determines the format.
 
-    ``.nii``, ``.nii.gz``: a symmetric-matrix image (nx, ny, nz, 1, 6) with xx xy yy xz yz zz along the voxel axes. The
-    tensors are zero outside the mask. Slices cannot be written.
-
-    ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame. The position of a slice is not written.
-
-    ``.vti``: nine components at the points, along the axes of space, and the mask. A slice has zeros across its plane.
-
-    ``.npz``: the arrays that `read_tensors` documents.
+    - ``.nii``, ``.nii.gz``: a symmetric-matrix image (nx, ny, nz, 1, 6) with xx xy yy xz yz zz along the voxel axes.
+      The tensors are zero outside the mask. Slices cannot be written.
+    - ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame; without the position of a slice.
+    - ``.vti``: nine components at the points, along the axes of space, and the mask; zeros across the plane of a slice.
+    - ``.npz``: the arrays that `read_tensors` documents.
 
     The file contains the record that `save` describes, and the order and frame of the tensors, so `read_tensors` needs
     neither `order` nor `frame`. Units are written except to VTK's files.
 
     Raises:
-        ValueError: the suffix is unknown; the format is NIfTI for a slice, or NIfTI or NRRD for unsymmetric tensors.
+        ValueError: the suffix is unknown, or the format cannot hold the field: NIfTI holds no slices, and neither NIfTI
+            nor NRRD holds unsymmetric tensors.
         ImportError: an optional library is missing; the message gives the command that installs it.
 
     Examples:

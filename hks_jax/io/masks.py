@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Integer
 from scipy import ndimage
 
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
-from hks_jax.io.volume import TensorVolume, as_mask, corners
+from hks_jax.io.volume import TensorVolume, corners
 from hks_jax.storage import existing, reading
 
 
@@ -76,12 +77,15 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
     """Read integer labels, with 0 for unlabelled, at an image's voxels or a mesh's vertices, from NIfTI or ``.npy``.
 
     If both files have an affine, their voxels must coincide. For a slice, the file may have the labels of the whole
-    volume. Otherwise, the labels must have the shape of the image.
+    volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
     values, place = _image(name, affine, (*nifti.SUFFIXES, ".npy"))
-    if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim == 3:
+    if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim in (2, 3):
+        if values.ndim == 2:  # the file's two axes are those of the slice
+            values = np.expand_dims(values, on.thin_axis)
+            place = np.insert(np.delete(place, 2, axis=1), on.thin_axis, place[:, 2], axis=1)
         values = _at_voxels(name, values, np.linalg.solve(place, affine), on)
     if values.shape != shape:
         raise ValueError(f"{name}: got labels of shape {values.shape}; expected the shape of the image, {shape}")

@@ -23,9 +23,6 @@ class Loaded(NamedTuple):
     arrays: dict[str, Float[np.ndarray, "V *components"]]
 
 
-_OF_SURFACES, _OF_BOUNDARIES = {"triangle", "quad"}, {"triangle", "quad", "line", "vertex"}
-
-
 def through_meshio(path: Path) -> Loaded:
     """Load triangles or tetrahedra through meshio; raise ValueError for other cells and damaged files."""
     suffix = path.suffix.lower()
@@ -38,18 +35,20 @@ def through_meshio(path: Path) -> Loaded:
         read = getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(path))
         _compare(content, suffix, declared, read)
         points = np.asarray(read.points, np.float64)
-        tetrahedra = [_corners(block.data, 4) for block in read.cells if block.type == "tetra"]
+        blocks = [block.data for block in read.cells if block.type == "tetra"]
+        if any(cells.shape[1:] != (4,) for cells in blocks):
+            raise ValueError(f"got tetrahedra of shape {blocks[0].shape}; expected (n, 4)")
         if points.ndim != 2 or points.shape[1] not in (2, 3):
             raise ValueError(f"got points of shape {points.shape}; expected (V, 2) or (V, 3)")
         points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-        triangles = [_triangles(block.data, points) for block in read.cells if block.type in _OF_SURFACES]
         arrays = _real_arrays(read.point_data, len(points))
-    others = {block.type for block in read.cells} - _OF_BOUNDARIES - {"tetra"}
+    others = {block.type for block in read.cells} - {"tetra", "triangle", "quad", "line", "vertex"}
     if others:
         raise ValueError(
             f"{path}: got {', '.join(sorted(others))} cells; expected triangles, quadrilaterals or tetrahedra"
         )
-    blocks = tetrahedra or triangles
+    surfaces = [block.data for block in read.cells if block.type in ("triangle", "quad")]
+    blocks = blocks or [fans(path, points, cells).reshape(-1, 3) for cells in surfaces]
     if not blocks:
         raise ValueError(f"{path}: the mesh has no triangles and no tetrahedra; expected one of these kinds of cell")
     return Loaded(points, np.concatenate(blocks).astype(np.int64), arrays)
@@ -88,7 +87,7 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
     lists = re.search(rb"\bCELLS\s+(\d+)\s+(\d+)", content) if suffix == ".vtk" else None
     if lists is not None:  # before version 5, the declared number also counts one entry per cell
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
-        if listed != corners:  # meshio omits corners of cells whose type is damaged
+        if listed != corners:  # if a cell's type is wrong, meshio omits corners
             raise ValueError(f"the file declares {listed} corners of cells; expected {corners} from the cells' types")
     if suffix == ".ply":
         _compare_ply(content, mesh)
@@ -167,28 +166,26 @@ def _real_arrays(named: dict[str, Any], n_points: int) -> dict[str, Float[np.nda
     }
 
 
-def _corners(cells: Int[np.ndarray, "n corners"], corners: int) -> Int[np.ndarray, "n corners"]:
-    if cells.ndim != 2 or cells.shape[1] != corners:
-        raise ValueError(f"got cells of shape {cells.shape}; expected (n, {corners})")
-    return cells
+def fans(
+    file: Path,
+    points: Float[np.ndarray, "V 3"],
+    polygons: Int[np.ndarray, "n corners"],
+    numbers: Int[np.ndarray, " n"] | None = None,
+) -> Int[np.ndarray, "n m 3"]:
+    """Cut polygons into triangles that share the first corner from which all others are visible.
 
-
-def _triangles(cells: Int[np.ndarray, "n corners"], points: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, "m 3"]:
-    if cells.ndim != 2 or cells.shape[1] not in (3, 4):
-        raise ValueError(f"got triangles or quadrilaterals of shape {cells.shape}; expected (n, 3) or (n, 4)")
-    if cells.shape[1] == 3:
-        return cells
-    if cells.size and not 0 <= cells.min() <= cells.max() < len(points):
-        raise ValueError(f"a quadrilateral refers to vertex {cells.max()}; expected 0 … {len(points) - 1}")
-    cut = fans(points, cells)
-    if (cut < 0).any():
-        raise ValueError("the sides of a quadrilateral cross; expected simple quadrilaterals")
-    return cut.reshape(-1, 3)
-
-
-def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"]) -> Int[np.ndarray, "n m 3"]:
-    """Cut polygons into triangles that share the first corner from which all others are visible; −1 without one."""
-    n, size = polygons.shape
+    Raises:
+        ValueError: a vertex does not exist, or a polygon has no such corner; `numbers` are its numbers in the file.
+    """
+    size, used = polygons.shape[-1], polygons if polygons.size else np.zeros(1, int)
+    if polygons.ndim != 2 or size < 3 or not 0 <= used.min() <= used.max() < len(points):
+        raise ValueError(
+            f"{file}: got faces of shape {polygons.shape} with vertices from {used.min()} to {used.max()}; expected "
+            f"(n, 3) or more corners, and vertices from 0 to {len(points) - 1}"
+        )
+    if size == 3:
+        return polygons[:, None]
+    n = len(polygons)
     found = np.full((n, size - 2, 3), -1)
     for first in reversed(range(size)):
         turned = np.roll(polygons, -first, axis=1)
@@ -199,6 +196,12 @@ def fans(points: Float[np.ndarray, "V 3"], polygons: Int[np.ndarray, "n corners"
             along = np.einsum("nmx,nx->nm", normals, normals.sum(axis=1))
         seen = ~(along < 0).any(axis=1)
         found[seen] = fan[seen]
+    bad = np.flatnonzero((found < 0).any(axis=(1, 2)))
+    if bad.size:
+        which = bad[0] if numbers is None else numbers[bad[0]]
+        raise ValueError(
+            f"{file}: face {which} with {size} corners is not star-shaped about a corner. Cut it into triangles"
+        )
     return found
 
 
@@ -243,8 +246,9 @@ def load_off(file: Path) -> Loaded:
                 f"the file declares {n_vertices} vertices and {n_faces} faces, but has {len(rest)} lines for them"
             )
         rows = [line.split() for line in rest]
-        if len({len(row) for row in rows[:n_vertices]}) != 1:
-            raise ValueError("lines of vertices differ in the number of columns; expected one vertex per line")
+        columns = {len(row) for row in rows[:n_vertices]}
+        if len(columns) != 1 or min(columns) < 3:
+            raise ValueError(f"lines of vertices have {sorted(columns)} columns; expected 3 coordinates on each")
         vertices = [[float(word) for word in row[:3]] for row in rows[:n_vertices]]
         polygons = [[int(word) for word in row[1 : 1 + int(row[0])]] for row in rows[n_vertices:]]
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
@@ -258,20 +262,9 @@ def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[i
     """Return the mesh with polygons cut into triangles, in the order of the file."""
     if not polygons:
         raise ValueError(f"{file}: the mesh has no triangles; expected at least one face")
-    with reading(file, "a readable mesh"):
-        points = np.array(vertices, np.float64).reshape(-1, 3)
-        low, high = min(map(min, polygons)), max(map(max, polygons))
-        if low < 0 or high >= len(points):
-            raise ValueError(f"a face refers to vertex {low if low < 0 else high}; expected 0 … {len(points) - 1}")
-    order, triangles = [], []
+    points, order, triangles = np.array(vertices, np.float64).reshape(-1, 3), [], []
     for size in {len(polygon) for polygon in polygons}:
         which = np.flatnonzero([len(polygon) == size for polygon in polygons])
-        cut = fans(points, np.array([polygons[i] for i in which]))
-        if (cut < 0).any():
-            bad = which[np.argmax((cut < 0).any(axis=(1, 2)))]
-            raise ValueError(
-                f"{file}: face {bad} with {size} corners is not star-shaped about a corner. Cut it into triangles"
-            )
         order.append(np.repeat(which, size - 2))
-        triangles.append(cut.reshape(-1, 3))
+        triangles.append(fans(file, points, np.array([polygons[i] for i in which]), which).reshape(-1, 3))
     return Loaded(points, np.concatenate(triangles)[np.argsort(np.concatenate(order), kind="stable")], {})

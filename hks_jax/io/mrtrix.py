@@ -45,8 +45,7 @@ def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float
     return values, affine
 
 
-def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`. Without `order`, the components are in MRtrix's order."""
+def _read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
     values, affine = load(name)
     if values.ndim != 4 or values.shape[-1] != 6:
         raise ValueError(
@@ -93,4 +92,4 @@ def _in_order(flat: np.ndarray, shape: tuple[int, ...], layout: str) -> np.ndarr
     return values[tuple(slice(None, None, -1 if word.startswith("-") else 1) for word in words)]
 
 
-FORMAT = Format((".mif", ".mif.gz"), read_tensors, read_image=load, image=".nii.gz")
+FORMAT = Format((".mif", ".mif.gz"), _read_tensors, read_image=load, image=".nii.gz")

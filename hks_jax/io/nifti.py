@@ -1,10 +1,11 @@
-"""Read and write NIfTI through the optional library nibabel."""
+"""Read and write NIfTI through the optional library nibabel; tensors may be in six images of one component each."""
 
 import gzip
 import json
 import math
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from hks_jax.checks import require_real
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
-from hks_jax.io.tensor_order import FRAMES, matrices, pack
+from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
 from hks_jax.io.units import by_axis, scaled_beside
 from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
@@ -30,6 +31,8 @@ _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
 """The unit of space for each of NIfTI's codes, and its length in mm. A missing unit means mm, as in other programs."""
 _REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world", "scanner": "world"}
 """The frame for each value of Reference in BIDS's field OrientationEncoding, including the values of its drafts."""
+_COMPONENT = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
+"""The component in a file's name, as BIDS (``param-txx``), DSI Studio and ANTs write it."""
 
 
 def is_nifti(path: str | os.PathLike[str]) -> bool:
@@ -73,7 +76,7 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
-def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return voxel values and the affine in mm; if the file has no unit, guess it from the related affine `beside`."""
     image = load(name)
     own, unit = affine_in_mm(name, image)
@@ -112,13 +115,9 @@ def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
     return {}
 
 
-def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`."""
-    return tensors_of(name, load(name), order, frame)
-
-
-def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> TensorVolume:
-    """Return the tensors of a loaded image."""
+def read_tensors(name: str, order: str | None, frame: str | None, image: Any = None) -> TensorVolume:
+    """Read tensors, or return those of a loaded image; see `hks_jax.io.read_tensors`."""
+    image = load(name) if image is None else image
     shape = image.shape
     if shape[3:] not in ((6,), (1, 6)):
         remedy = "Fit tensors to diffusion-weighted images first by hks_jax.io.fit_dwi, or by --bval and --bvec"
@@ -156,6 +155,64 @@ def tensors_of(name: str, image: Any, order: str | None, frame: str | None) -> T
     return replace(volume, notes=(*notes, *volume.notes))
 
 
+def component_of(path: str | os.PathLike[str]) -> str | None:
+    """Return the component that a file's name states, such as ``"xy"`` for ``dtxy.nii``, or None."""
+    names = _COMPONENT.findall(os.path.basename(path))
+    return names[-1].lower() if names else None
+
+
+def siblings(path: str | os.PathLike[str]) -> list[str]:
+    """Return the paths of six images of one component each if this is one of them, or else only this path.
+
+    Such an image is in NIfTI and has one value per voxel. The six names differ only in the component.
+    """
+    name = os.fspath(path)
+    if component_of(name) is None or not is_nifti(name) or math.prod(load(name).shape[3:]) != 1:
+        return [name]
+    folder, file = os.path.split(name)
+    start, end = list(_COMPONENT.finditer(file))[-1].span(1)
+    own = str.upper if file[start:end].isupper() else str.lower
+    names = [os.path.join(folder, file[:start] + own(component) + file[end:]) for component in ORDERS["nifti"]]
+    if missing := [os.path.basename(each) for each in names if not os.path.isfile(each)]:
+        raise FileNotFoundError(
+            f"{name}: the name states one of six components, but these files are missing: {', '.join(missing)}. Put "
+            "all six into one folder"
+        )
+    return names
+
+
+def read_components(paths: Sequence[str], order: str | None, frame: str | None) -> TensorVolume:
+    """Read tensors from six images in any sequence; each file's name states its component.
+
+    If `frame` is None, the BIDS sidecar of the image gives the axes of the components (``Reference`` in
+    ``OrientationEncoding``). Without a sidecar, they are the voxel axes.
+    """
+    if order is not None:
+        raise ValueError(f"order: got {order!r}, but the names of six images state their components. Leave it out")
+    names = ORDERS["nifti"]
+    files = {component_of(path): path for path in paths if is_nifti(path)}
+    if len(paths) != 6 or set(files) != set(names):
+        given = ", ".join(f"{os.path.basename(path)} ({component_of(path) or 'none'})" for path in paths)
+        raise ValueError(
+            f"files: got {given}; expected six NIfTI images, one for each component {' '.join(names)}. Name the files "
+            "by their components, as in sub-01_param-txx_dwimap.nii.gz or dtxx.nii.gz"
+        )
+    images = [load(files[name]) for name in names]
+    first, affine = images[0], affine_in_mm(files["xx"], images[0])[0]
+    for name, image in zip(names, images, strict=True):
+        if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
+            raise ValueError(
+                f"{files[name]}: got shape {image.shape}; expected one component per voxel, and equal shapes"
+            )
+        if not np.allclose(affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
+            raise ValueError(f"{files[name]}: its affine differs from the affine of {files['xx']}; expected equal ones")
+    values = np.stack([voxels(files[name], image) for name, image in zip(names, images, strict=True)], axis=-1)
+    joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
+    joined.header["xyzt_units"] = first.header["xyzt_units"]
+    joined.header.set_intent(SYMMETRIC_MATRIX, (3,))
+    return read_tensors(files["xx"], None, frame, joined)
+
+
 def placement_notes(image: Any) -> list[str]:
     """Return a note if the position of an image is uncertain: sform and qform differ, or both are missing."""
     by_sform, sform = image.header.get_sform(coded=True)
@@ -174,8 +231,7 @@ def placement_notes(image: Any) -> list[str]:
     ]
 
 
-def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars with times along the fourth axis, and a slice one voxel thick; see `hks_jax.io.save`."""
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     others = sorted(extra.keys() - {"times"})
     if others:
         raise ValueError(f"extra: got {', '.join(others)}, but NIfTI allows only times. Write an .npz as well")
@@ -184,25 +240,22 @@ def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra:
         about = {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources}
         settings = json.loads(record).get("settings")
         write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
-    if array.dtype not in (np.float32, np.float64):
-        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
     image.header["intent_name"] = name[:15].encode()
-    _write(path, image, record)
+    _store(path, image, record)
 
 
-def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
-    """Write a symmetric-matrix image; see `hks_jax.io.save_tensors`."""
+def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     if volume.dimension != 3:
         raise ValueError("volume: got a slice, but NIfTI has no 2×2 tensors. Write the volume, or .npz, .nrrd or .vti")
     require_symmetric(volume)
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)
     image.header.set_intent(SYMMETRIC_MATRIX, (3,))
-    _write(path, image, describe_tensors(volume, "nifti", "voxel", provenance))
+    _store(path, image, describe_tensors(volume, "nifti", "voxel", provenance))
 
 
-def _write(path: Path, image: Any, record: str) -> None:
+def _store(path: Path, image: Any, record: str) -> None:
     nib = optional("nibabel")
     image.header.set_xyzt_units("mm")
     image.header.extensions.append(nib.nifti1.Nifti1Extension("comment", record.encode()))
@@ -210,4 +263,4 @@ def _write(path: Path, image: Any, record: str) -> None:
         nib.save(image, temporary)
 
 
-FORMAT = Format(SUFFIXES, read_tensors, (), read_image, (".nii.gz", ".nii"), write, write_tensors, image=".nii.gz")
+FORMAT = Format(SUFFIXES, read_tensors, (), _read_image, (".nii.gz", ".nii"), _write, _write_tensors, image=".nii.gz")

@@ -1,5 +1,7 @@
 """Read and write tensors (of all kinds that NRRD defines), masks and results through the optional library pynrrd."""
 
+import bz2
+import gzip
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.io.nrrd_checks import PATIENT, check_data, check_header, space_of
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres, scaled_beside
@@ -23,6 +24,32 @@ KINDS = {
     for symmetric in ("", "symmetric-")
 }
 """The kinds of axes that hold tensor components, and their number of entries including the confidence."""
+
+
+_FIELDS = frozenset(
+    name
+    for names in (
+        "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, old max, oldmax",
+        "data file, datafile, line skip, lineskip, byte skip, byteskip, number, sample units, sampleunits, sizes",
+        "spacings, thicknesses, axis mins, axismins, axis maxs, axismaxs, centers, centerings, labels, units, kinds",
+        "space, space dimension, space units, space origin, space directions, measurement frame",
+    )
+    for name in names.split(", ")
+)
+"""All fields of the format (Teem, "Definition of NRRD File Format")."""
+
+_PATIENT = {
+    "right-anterior-superior": (1.0, 1.0, 1.0),
+    "left-anterior-superior": (-1.0, 1.0, 1.0),
+    "left-posterior-superior": (-1.0, -1.0, 1.0),
+}
+"""The patient-based spaces, and the signs that transform them to right, anterior, superior, NIfTI's axes."""
+
+_SHORT = {"".join(word[0] for word in name.split("-")): name for name in _PATIENT}
+_SPACES = (*_PATIENT, "scanner-xyz", "3d-right-handed", "3d-left-handed")
+
+_PER_AXIS = ("sizes", "spacings", "thicknesses", "kinds", "units", "space directions")
+_OPENED: dict[str, Any] = {"gzip": gzip.open, "gz": gzip.open, "bzip2": bz2.open, "bz2": bz2.open}
 
 
 class Placement(NamedTuple):
@@ -57,14 +84,56 @@ def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
         header = dict(nrrd.read_header(stream))
         start = stream.tell()
         stream.seek(0)
-        check_header(stream.read(start), header)
-        check_data(file, header, stream, start)
+        _check_header(stream.read(start), header)
+        _check_data(file, header, start)
         stream.seek(start)
         data = nrrd.read_data(header, stream, str(file), index_order="F")
     return data.astype(data.dtype.newbyteorder("=")), header
 
 
-def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
+def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
+    """Raise ValueError for a line that is neither a field of the format nor a key, and for a field of wrong length.
+
+    Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of one.
+    """
+    for line in text.splitlines()[1:]:
+        if line.startswith(b"#") or not line:
+            continue
+        key, colon, value = line.partition(b":")
+        name, is_key = key.decode("latin-1"), value.startswith(b"=")
+        if not colon or (name in _FIELDS) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
+            raise ValueError(f"got the header line {line[:60]!r}; expected a field of the format, or a key and a value")
+    n = int(header["dimension"])
+    for name in _PER_AXIS:
+        if name in header and len(header[name]) != n:
+            raise ValueError(f"{name}: got {len(header[name])} entries; expected {n}, one per axis")
+    _space_of(header)
+
+
+def _space_of(header: Mapping[str, Any]) -> str:
+    """Return the full name of the space in lower case, without its time axis, or the empty text."""
+    space = str(header.get("space", "")).lower()
+    name = _SHORT.get(space.removesuffix("t"), space.removesuffix("-time"))
+    if "space" in header and name not in _SPACES:
+        raise ValueError(f"space: got {space!r}; expected a space of the format, such as left-posterior-superior")
+    return name
+
+
+def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
+    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd compares the length of others."""
+    opened = _OPENED.get(str(header["encoding"]).lower())
+    if opened is None:
+        return
+    beside = header.get("data file", header.get("datafile"))
+    with open(file if beside is None else file.parent / str(beside), "rb") as source:
+        source.seek(start if beside is None else 0)
+        for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
+            source.readline()
+        with opened(source) as content:
+            content.read()
+
+
+def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
     """Return voxel values and any affine; if the file has no unit, guess it from the related affine `beside`."""
     data, header = load(name)
     place = _placement(name, header, list(range(data.ndim)))
@@ -72,8 +141,7 @@ def read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray,
     return data, affine if affine is None or beside is None or place.unit else scaled_beside(affine, beside)
 
 
-def read_tensors(name: str, order: str | None, frame: str | None, confidence: float) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`."""
+def _read_tensors(name: str, order: str | None, frame: str | None, confidence: float) -> TensorVolume:
     data, header = load(name)
     axis, label = _tensor_axis(name, data.shape, header)
     domain = [a for a in range(data.ndim) if a != axis]
@@ -116,26 +184,25 @@ def read_tensors(name: str, order: str | None, frame: str | None, confidence: fl
     )
 
 
-def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars with times along the last axis; see `hks_jax.io.save`."""
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     if volume.affine is not None:
         array = images_of(array, volume)
     elif array.ndim > volume.dimension:
         array = np.moveaxis(array, 0, -1)
-    _write(path, array, volume, record, "", extra)
+    _store(path, array, volume, record, "", extra)
 
 
-def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
+def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     """Write masked symmetric matrices, with the mask as confidence and the voxel axes as measurement frame."""
     require_symmetric(volume)
     confidence = volume.inside[..., None].astype(volume.tensors.dtype)
     components = np.concatenate([confidence, pack(volume.tensors, "fsl")], axis=-1)
     record = describe_tensors(volume, "nrrd", "measurement", provenance)
     kind = f"{volume.dimension}D-masked-symmetric-matrix"
-    _write(path, np.moveaxis(components, -1, 0), volume, record, kind, {})
+    _store(path, np.moveaxis(components, -1, 0), volume, record, kind, {})
 
 
-def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
+def _store(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
     """Write an array over the voxels of a volume, with the axes right, anterior, superior if there is an affine.
 
     The array has tensor components of the kind `kind` along the first axis, or times along the last. A slice with an
@@ -160,8 +227,6 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
         header["space units"] = ["mm"] * d
     header |= {"space directions": directions, "space origin": origin, "kinds": kinds, "encoding": "gzip"}
     header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in more.items()}
-    if array.dtype not in (np.float32, np.float64):
-        array = array.astype(np.uint8 if array.dtype == bool else np.float64)
     with atomic_path(path) as temporary:
         nrrd.write(str(temporary), array, {**header, "provenance": record}, index_order="F")
 
@@ -211,18 +276,16 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
             f"{name}: got space directions {rows[domain].tolist()}; expected {d} nonzero vectors of {d} finite numbers"
         )
     origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
-    signs = PATIENT.get(space_of(header)) if d == 3 else None
+    signs = _PATIENT.get(_space_of(header)) if d == 3 else None
     to_ras = None if signs is None else np.array(signs)
     return Placement(scales[:, None] * directions, origin, to_ras, frame, True, unit)
 
 
 def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
     """Return the file's unit of length, empty if there is none, and its length in mm along each axis."""
-    if "space directions" in header:
-        field, given = "space units", list(header.get("space units", ()))[: len(domain)]
-    else:
-        field, units = "units", header.get("units", ())
-        given = [units[axis] for axis in domain if axis < len(units)]
+    field = "space units" if "space directions" in header else "units"
+    listed = list(header.get(field, ()))
+    given = listed[: len(domain)] if field == "space units" else [listed[axis] for axis in domain if listed]
     scales = [millimetres(f"{name}: {field}", str(text)) for text in given]
     declared = [text for text, scale in zip(given, scales, strict=True) if scale is not None]
     if not declared:
@@ -264,4 +327,4 @@ def _to_voxel_axes(
 
 
 _NAMES = (".nrrd", ".nhdr")
-FORMAT = Format(_NAMES, read_tensors, ("confidence",), read_image, (".nrrd",), write, write_tensors, image=".nrrd")
+FORMAT = Format(_NAMES, _read_tensors, ("confidence",), _read_image, (".nrrd",), _write, _write_tensors, image=".nrrd")

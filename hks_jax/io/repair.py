@@ -1,9 +1,7 @@
 """Find, count and repair tensors that are not positive definite."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from typing import Any, Literal
 
@@ -12,19 +10,15 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import require_number
+from hks_jax.checks import real_array, require_number
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import (
     MANY,
     NUMBERS,
     PositiveMap,
-    check_mapped,
-    check_number,
-    check_shift,
-    checked_map,
     least_eigenvalue,
+    positive_map,
     refuse,
-    require_finite_symmetric,
     unsymmetric,
 )
 from hks_jax.io.volume import TensorVolume
@@ -53,12 +47,11 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
         >>> print(hj.io.find_invalid(volume).sum(), hj.io.find_invalid(volume, floor=2.0).sum())  # eigenvalues 1 and 4
         0 81
     """
-    if floor is not None:
-        require_number("floor", floor, above=-math.inf)
     inside = volume.inside
     bad = np.zeros(volume.shape, bool)
     bad[inside] = ~spd.is_spd(volume.tensors[inside])
     if floor is not None:
+        require_number("floor", floor, above=-math.inf)
         good = inside & ~bad
         bad[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor
     return bad
@@ -144,10 +137,9 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         )
     wrong = "are not positive definite" if floor is None else f"have an eigenvalue below {floor:g}"
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
-    mask, tensors = volume.mask, volume.tensors.copy()
-    noise: dict[str, Any] = {"covariance": volume.covariance, "modes": volume.modes}
+    tensors, changed = volume.tensors.copy(), dict[str, Any]()
     if method == "mask":
-        mask, done = inside & ~bad, "their voxels are left out"
+        changed["mask"], done = inside & ~bad, "their voxels are left out"
     elif method == "clip":
         if report["not_finite"]:
             raise ValueError(
@@ -157,22 +149,22 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         if floor is None:
             typical = np.trace(tensors[inside & ~bad], axis1=-2, axis2=-1) / volume.dimension
             report["floor"] = floor = 0.01 * float(np.median(typical))
-        tensors[bad], done = (
-            _of_eigenvalues(tensors[bad], partial(np.maximum, floor)),
-            f"their eigenvalues are raised to {floor:.3g}",
-        )
+        wrong_ones = tensors[bad].astype(np.float64)
+        values, vectors = np.linalg.eigh(wrong_ones + np.swapaxes(wrong_ones, -1, -2))
+        raised = (vectors * np.maximum(values / 2, floor)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
+        tensors[bad], done = raised, f"their eigenvalues are raised to {floor:.3g}"
     else:
         nearest = ndimage.distance_transform_edt(
             bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
         )
         source, done = tuple(index[bad] for index in nearest), "they are replaced by the nearest valid tensor"
         tensors[bad] = tensors[source]
-        for name, known in noise.items():
-            if known is not None:
-                noise[name] = known.copy()
-                noise[name][bad] = known[source]
+        for name in ("covariance", "modes"):
+            if (known := getattr(volume, name)) is not None:
+                changed[name] = known.copy()
+                changed[name][bad] = known[source]
     notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
-    return replace(volume, tensors=tensors, mask=mask, **noise, repair=report, notes=notes)
+    return replace(volume, tensors=tensors, **changed, repair=report, notes=notes)
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
@@ -202,8 +194,9 @@ def without_background(volume: TensorVolume) -> TensorVolume:
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
     """Return the voxels that a program seems to have filled as background, and a sentence; None if there are few.
 
-    Measured tensors are never exactly equal and isotropic, nor a millionth of the others. Programs such as ANTs write
-    such tensors where there is no signal. The result is None for a volume with a mask, and for a constant field.
+    Measured tensors are never exactly isotropic and equal to one another, and never a million times smaller than the
+    others. Programs such as ANTs write such tensors where there is no signal. The result is None for a volume with a
+    mask, and for a constant field.
 
     Examples:
         >>> tensors = np.array(field.tensors)
@@ -235,15 +228,6 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
     )
 
 
-def _of_eigenvalues(
-    tensors: Float[np.ndarray, "n d d"], function: Callable[[np.ndarray], np.ndarray]
-) -> Float[np.ndarray, "n d d"]:
-    """Return the matrix function, given by a function of the eigenvalues, of the symmetric parts of tensors."""
-    values, vectors = np.linalg.eigh(0.5 * (tensors + np.swapaxes(tensors, -1, -2)).astype(np.float64))
-    mapped = (vectors * function(values)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
-    return (0.5 * (mapped + np.swapaxes(mapped, -1, -2))).astype(tensors.dtype)
-
-
 def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
     """Map all tensors S inside, such as stresses, to positive definite ones, and return the volume.
 
@@ -262,19 +246,11 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
         >>> print(hj.io.positive_tensors(stress, "exp", 1.0).tensors[4, 4].diagonal().round(3))
         [2.718 0.368]
     """
-    how = checked_map(how)
-    check_number("tensors", how, number)
     volume = without_background(volume)
     inside, before = volume.inside, int(find_invalid(volume).sum())
-    require_finite_symmetric("tensors", volume.tensors, inside, "voxel")
-    check_shift("tensors", volume.tensors[inside], how, number)
-    with np.errstate(over="ignore"):  # check_mapped reports overflow
-        mapped = _of_eigenvalues(
-            volume.tensors[inside], lambda values: np.exp(values / number) if how == "exp" else values + number
-        )
-    check_mapped(volume.tensors[inside], mapped, how, number)
-    tensors = volume.tensors.copy()
-    tensors[inside] = mapped
+    given = real_array("tensors", volume.tensors)
+    mapped = np.asarray(positive_map("tensors", given, how, number, inside, "voxel"))
+    tensors = np.where(inside[..., None, None], mapped, volume.tensors)
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
     note = f"{formula} of all tensors S, of which {before} of {int(inside.sum())} were not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}

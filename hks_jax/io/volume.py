@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from hks_jax import __version__
 from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
-from hks_jax.domain.grid import Grid
+from hks_jax.domain.grid import Grid, per_axis
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
 from hks_jax.uncertainty.noise import TensorNoise
 
@@ -102,8 +102,7 @@ class TensorVolume:
                 f"{where}tensors: got shape {tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)"
             )
         for name, value in (("spacing", self.spacing), ("origin", self.origin)):
-            if len(value) != d or not np.isfinite(value).all():
-                raise ValueError(f"{where}{name}: got {value}; expected {d} finite numbers, one per axis")
+            per_axis(f"{where}{name}", value, d)
         if min(self.spacing) <= 0:
             raise ValueError(f"{where}spacing: got {self.spacing}; expected positive numbers")
         if mask is not None and (mask.shape != shape or mask.dtype != bool):
@@ -114,7 +113,6 @@ class TensorVolume:
             raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected (*shape, m, m), m = d(d+1)/2")
 
     def __repr__(self) -> str:
-        """Return a summary in one line, without the arrays."""
         inside = "" if self.mask is None else f", mask={int(self.mask.sum())} of {self.mask.size} voxels"
         cut = "" if self.slice_axis is None else f", slice_axis={self.slice_axis}"
         return (
@@ -163,36 +161,26 @@ class TensorVolume:
             raise ValueError(f'axis: got {axis!r}; expected 0, 1, 2 or "x", "y", "z"')
         if not 0 <= index < self.shape[a]:
             raise ValueError(f"index: got {AXES[a]} = {index}; expected 0 … {self.shape[a] - 1}")
-        mask = None
+        keep, (rows, columns) = [b for b in range(3) if b != a], np.tril_indices(3)
+        within = np.flatnonzero((rows != a) & (columns != a))
+        cut: dict[str, Any] = {"tensors": np.take(self.tensors, index, axis=a)[..., keep, :][..., keep]}
         if self.mask is not None:
-            mask = np.take(self.mask, index, axis=a)
-            if not mask.any():
-                filled = np.flatnonzero(self.mask.any(axis=tuple(b for b in range(3) if b != a)))
+            cut["mask"] = np.take(self.mask, index, axis=a)
+            if not cut["mask"].any():
+                filled = np.flatnonzero(self.mask.any(axis=tuple(keep)))
                 where = f"{AXES[a]} = {filled[0]} … {filled[-1]}" if filled.size else "no slice at all"
                 raise ValueError(f"mask: got no voxels in slice {AXES[a]} = {index}; the mask has voxels at {where}")
-        keep = [b for b in range(3) if b != a]
-        affine = covariance = modes = None
-        rows, columns = np.tril_indices(3)
-        within = np.flatnonzero((rows != a) & (columns != a))
         if self.covariance is not None:
-            covariance = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
+            cut["covariance"] = np.take(self.covariance, index, axis=a)[..., within, :][..., within]
         if self.modes is not None:
-            modes = np.take(self.modes, index, axis=a)[..., within]
+            cut["modes"] = np.take(self.modes, index, axis=a)[..., within]
         if self.affine is not None:
-            affine = self.affine.copy()
-            affine[:3, 3] += index * affine[:3, a]
-        return replace(
-            self,
-            tensors=np.take(self.tensors, index, axis=a)[..., keep, :][..., keep],
-            spacing=tuple(self.spacing[b] for b in keep),
-            origin=tuple(self.origin[b] for b in keep),
-            mask=mask,
-            affine=affine,
-            slice_axis=a,
-            covariance=covariance,
-            modes=modes,
-            notes=(*self.notes, f"slice {AXES[a]} = {index}: its tensors are the in-plane blocks"),
-        )
+            cut["affine"] = self.affine.copy()
+            cut["affine"][:3, 3] += index * self.affine[:3, a]
+        for name in ("spacing", "origin"):
+            cut[name] = tuple(getattr(self, name)[b] for b in keep)
+        note = f"slice {AXES[a]} = {index}: its tensors are the in-plane blocks"
+        return replace(self, **cut, slice_axis=a, notes=(*self.notes, note))
 
     def noise(self, grid: Grid) -> TensorNoise:
         """Return the noise that the fit of the tensors estimated (`fit_dwi`), by images if `modes` are known.
@@ -246,8 +234,9 @@ def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 
 
 
 def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
-    """Return the indices of the voxels at the corners of a volume as homogeneous coordinates."""
-    return np.stack(np.meshgrid(*((0, n - 1) for n in shape[:3]), [1], indexing="ij"), -1).reshape(-1, 4)
+    """Return the indices of the voxels at the corners of an image in 2D or 3D as homogeneous coordinates."""
+    ends = ((0, n - 1) for n in (*shape, 1)[:3])
+    return np.stack(np.meshgrid(*ends, [1], indexing="ij"), -1).reshape(-1, 4)
 
 
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
@@ -256,15 +245,6 @@ def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
     if volume.dimension == 2:
         array = np.expand_dims(array, n + volume.thin_axis)
     return np.moveaxis(array, 0, -1) if n else array
-
-
-def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
-    """Return zeros and ones as booleans; raise ValueError for anything else."""
-    array = np.asarray(values)
-    require_real(name, array)
-    if array.dtype != bool and not np.isin(array, (0, 1)).all():
-        raise ValueError(f"{name}: got mask values other than 0 and 1. Threshold the mask, for example mask > 0.5")
-    return array.astype(bool)
 
 
 def digest(path: str | os.PathLike[str]) -> str:

@@ -14,8 +14,9 @@ from urllib.parse import quote
 
 import numpy as np
 
+from hks_jax.domain.components import as_mask
 from hks_jax.io.tensor_order import matrices, nearest_rotation
-from hks_jax.io.volume import Format, TensorVolume, as_mask, describe_tensors, placed
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, placed
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, load_npz, reading
 
@@ -52,8 +53,7 @@ def load(path: Path) -> dict[str, np.ndarray]:
     raise ValueError(said[-1] if said and child.returncode > 0 else f"VTK crashed with status {child.returncode}")
 
 
-def read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
-    """Read tensors; see `hks_jax.io.read_tensors`."""
+def _read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
     file = existing(name)
     kind = "readable VTK image data (.vti, or structured points in .vtk)"
     with reading(file, kind):
@@ -89,19 +89,18 @@ def read_tensors(name: str, order: str | None, frame: str | None, array: str | N
     return _as_plane(volume)
 
 
-def write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    """Write scalars as point data, one array per time; see `hks_jax.io.save`."""
-    _write(path, by_time(name, array, array.ndim - volume.dimension, extra), volume, record, extra)
+def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
+    _store(path, by_time(name, array, array.ndim - volume.dimension, extra), volume, record, extra)
 
 
-def write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
+def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     """Write tensors along the axes of space; for a slice, the components across its plane are zero."""
     tensors = volume.tensors
     if volume.dimension == 2:
         tensors = np.insert(np.insert(tensors, volume.thin_axis, 0, axis=-1), volume.thin_axis, 0, axis=-2)
     rotation = nearest_rotation(volume.volume_affine[:3, :3]).astype(tensors.dtype)
     record = describe_tensors(volume, "matrix", "world", provenance)
-    _write(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record, {})
+    _store(path, {"tensors": rotation @ tensors @ rotation.T}, volume, record, {})
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -113,7 +112,7 @@ def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> d
     return dict(zip(labels, array, strict=True))
 
 
-def _write(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, record: str, more: dict[str, Any]) -> None:
+def _store(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, record: str, more: dict[str, Any]) -> None:
     """Write point data, with (*shape, 3, 3) as tensors, and the mask; write `more` and the record as field data."""
     optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import numpy_to_vtk
@@ -213,7 +212,8 @@ def _tensor_array(name: str, image: Mapping[str, np.ndarray], place: str, wanted
         listed = ", ".join(f"{key!r} ({n[0] if n else 1})" for key, n in had.items()) or "none"
         asked = "" if wanted is None else f" named {wanted!r}"
         raise ValueError(
-            f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass array"
+            f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass array, "
+            "the name of the one to read"
         )
     return candidates[0], candidates[0] == declared
 
@@ -235,4 +235,4 @@ def _as_plane(volume: TensorVolume) -> TensorVolume:
     return volume
 
 
-FORMAT = Format((".vti", ".vtk"), read_tensors, ("array",), None, (".vti",), write, write_tensors, image=".vti")
+FORMAT = Format((".vti", ".vtk"), _read_tensors, ("array",), None, (".vti",), _write, _write_tensors, image=".vti")

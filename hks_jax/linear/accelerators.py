@@ -86,6 +86,6 @@ def padded_size(n: int, least: int) -> int:
 def row_by_row(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the array; on accelerators, force row-major memory layout.
 
-    Otherwise, XLA transposes a whole large array there if a part is needed transposed.
+    Otherwise, if only the transpose of a part is needed, XLA transposes the whole array on accelerators.
     """
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim)))) if at_hand() else x

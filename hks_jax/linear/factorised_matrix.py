@@ -289,8 +289,7 @@ def _log_of_pivots_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     weights = [jnp.broadcast_to(t, level.shape).reshape(-1) for t, level in zip(times, tree.levels, strict=True)]
     weighted = _inverse(False, matrix, factor) * jnp.concatenate(weights).astype(matrix.dtype)
     slope = weighted.at[tree.places].get(mode="fill", fill_value=0, wrap_negative_indices=False)
-    listed = change if tree.entries is None else change[tree.entries]
-    return _log_of_pivots(matrix, factor), jnp.vdot(slope, listed)
+    return _log_of_pivots(matrix, factor), jnp.vdot(slope, change[tree.entries])
 
 
 _log_determinant = jax.jit(_log_of_pivots)

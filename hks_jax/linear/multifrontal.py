@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
-from hks_jax.linear.dissection import Dissection
-from hks_jax.linear.elimination_tree import Level, Merged
+from hks_jax.linear.dissection import Dissection, Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import batched_with_columns, gram, matmul, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
@@ -75,17 +74,15 @@ class Trial(NamedTuple):
 # factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need more
 # accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
 def factorise(
-    dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | float = 0.0
+    dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | None = None
 ) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting between fronts; `try_out` measures the accuracy.
 
     The matrix is given by its entries at the places of the pattern, as from `SymmetricPencil.shifted`. Pivots smaller
     than ``least``, relative to the entries of the front, are replaced by it.
     """
-    # Without replacement of pivots, the sizes of the fronts' entries are not needed.
-    least_or_none = None if isinstance(least, float) and least == 0 else jnp.asarray(least, matrix.dtype)
     # The compiled function does not return the dissection, because XLA would copy it.
-    return Factorisation(dissection, *_eliminate(dissection, matrix, least_or_none))
+    return Factorisation(dissection, *_eliminate(dissection, matrix, least))
 
 
 # Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, the matrix
@@ -178,9 +175,7 @@ def eliminate(
     to its boundary, both with the Schur complements of the fronts below added.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
-    entries = jnp.zeros(start[-1], matrix.dtype)
-    needed = matrix if dissection.entries is None else taken(matrix, dissection.entries)
-    entries = _put(entries, dissection.places, needed)
+    entries = _put(jnp.zeros(start[-1], matrix.dtype), dissection.places, taken(matrix, dissection.entries))
     padded = _put(entries, dissection.padding, jnp.ones((), entries.dtype))
     eliminated = []
     schur: Array | None = None

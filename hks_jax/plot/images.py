@@ -170,7 +170,7 @@ def colours_of(
         low, high = (float(q) for q in np.quantile(values, quantiles))
         if centre is not None:
             reach = max(high - centre, centre - low)
-            if values.min() >= 0 and np.median(values) <= FAR * centre:
+            if values.min() >= 0 < centre and np.median(values) <= FAR * centre:
                 reach = min(reach, centre)  # no colours for negative values
             low, high = centre - reach, centre + reach
         lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)

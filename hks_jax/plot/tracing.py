@@ -118,7 +118,7 @@ def evenly_spaced_lines(
         True
     """
     if not separation > 0:
-        raise ValueError(f"separation: got {separation}; expected a positive length in coordinates")
+        raise ValueError(f"separation: got {separation}; expected a positive length, in the unit of the coordinates")
     h, n_steps = _lengths(field, None, None)
     h = min(h, separation / 4)
     seeds = _candidates(field, separation / 2)

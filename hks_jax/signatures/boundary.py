@@ -31,7 +31,7 @@ def boundary_influence(
 
     Here k_N ≥ k_D are the signatures with Neumann and with Dirichlet conditions on the whole boundary, also that of a
     mask. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t). It is 1 on the boundary and 0
-    where the boundary has no effect yet, whatever its conditions are.
+    where the boundary has no effect yet, whatever its conditions are; NaN outside the mask.
 
     The result is differentiable with respect to the tensors. Two problems are solved for eigenpairs. Together they are
     the problem with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
@@ -43,9 +43,6 @@ def boundary_influence(
         boundary: ``"neumann"`` or ``"mean"``, which are equivalent here. Grids also accept ``"periodic"``, as one value
             for all axes or one per axis. To be omitted if eigenpairs are given.
         solver: the same as for `eigenpairs`.
-
-    Returns:
-        (n_times, *shape), dimensionless numbers between 0 and 1; NaN outside the mask.
 
     Raises:
         ValueError: if the boundary is invalid, if no or every node lies on it, or as in `eigenpairs` and `hks`.

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -11,6 +12,8 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.arrays import StaticArray
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.products import quadratic_forms
+
+_matmul = partial(jnp.matmul, precision="highest")
 
 
 class Contraction(eqx.Module):
@@ -111,7 +114,3 @@ class SquaredDistances(_FromSources):
         nodal = self.space.extend(vectors, outside=0.0).reshape(vectors.shape[0], self.space.free.size)
         readings = jax.lax.map(lambda source: reading(nodal - source[:, None]), self.coefficients(vectors))
         return jnp.moveaxis(readings, 0, 1)
-
-
-def _matmul(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision="highest")

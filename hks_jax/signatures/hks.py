@@ -76,10 +76,10 @@ def hks(
 ) -> Float[Array, "n_times *shape"]:
     """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
 
-    See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2.
+    See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2. The unit of ``"raw"`` is
+    1/(metric length)^d. The signature is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
-        pairs: the result of `eigenpairs`.
         times: (n_times,) positive, in (metric length)².
         normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
             domain's area or volume (→ 1 for large t, except with a potential or a density); ``"flat"`` multiplies by
@@ -88,9 +88,6 @@ def hks(
             `hks_spectrum_free`). ``"auto"`` uses the pairs at times that they resolve to the tolerance and the matrices
             at the other times. `hks_auto` also reports the choice and the agreement of the methods.
         tolerance: the error allowed to the last two methods, relative to (4πt)^(−d/2).
-
-    Returns:
-        (n_times, *shape); NaN outside the mask, 0 at Dirichlet nodes. The unit of ``"raw"`` is 1/(metric length)^d.
 
     Raises:
         ValueError: if times are not positive and finite, if the normalisation or the method is unknown, if
@@ -130,13 +127,8 @@ def hks_auto(
     methods, provided that this takes at most ten times the work of the spectrum-free times.
 
     Args:
-        pairs: the result of `eigenpairs`.
-        times: (n_times,) positive.
-        normalisation: see `hks`.
+        times: (n_times,) positive; the normalisation is as in `hks`.
         tolerance: the error allowed to both methods, relative to (4πt)^(−d/2).
-
-    Returns:
-        The values, the method of each time, and the difference between the methods.
 
     Raises:
         ValueError: as in `hks`, or if values are traced, because the choice depends on them.

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.signatures.filters import gauss
+from hks_jax.linear.divided_differences import gauss
 from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
 from hks_jax.signatures.truncation import truncation
 from hks_jax.traced import is_traced
@@ -107,9 +107,6 @@ def log_determinant(
         extrapolate: the next powers of t in the expansion, with unknown coefficients: (1, 2) on a closed curved
             surface, (0.5, 1) with a curved boundary, none on flat tori and polygons.
         time: T, in (metric length)²; by default the time with the least estimated error.
-
-    Returns:
-        The value with an estimate of its error.
 
     Raises:
         ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if pairs are in an interval,

@@ -76,12 +76,7 @@ def spectral_flow(
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
     """Return Σᵢ f(λᵢ) for each of m filters. The derivative f'(λᵢ) dλᵢ needs no eigenvector."""
-    return sum_of(filters, pairs.eigenvalues, pairs.kept)
-
-
-def sum_of(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " m"]:
-    """Return Σᵢ f(λᵢ) over the kept pairs for each of m filters."""
-    return jnp.sum(_all_weights(filters, values, kept), axis=1)
+    return jnp.sum(_all_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
 
 
 @jax.custom_jvp

@@ -67,7 +67,11 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     offsets = np.array(list(product((-1, 0, 1), repeat=d)))
     measured = entries[None]
     if not nodal.mass.is_diagonal:
-        measured = jnp.concatenate([measured, _within_lines(nodal.mass.coefficients, offsets)])
+        # M − C has the couplings within the layers of nodes that are perpendicular to the axis. It consists of diagonal
+        # blocks of M and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest
+        # eigenvalue of M⁻¹(M − C).
+        within = (offsets.T == 0).reshape(d, -1, *[1] * d)
+        measured = jnp.concatenate([measured, jnp.where(within, nodal.mass.coefficients, 0)])
 
     def largest(matrix: Float[Array, "offsets *shape"]) -> Float[Array, ""]:
         apply = replace(nodal.stiffness, coefficients=matrix).of_columns()
@@ -82,12 +86,3 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     sizes = jnp.abs(entries) / nodal.lumped[None]
     reach = jnp.stack([jnp.max(jnp.sum(sizes[np.flatnonzero(offsets[:, a])], axis=0)) for a in range(d)])
     return Bounds(top, low, reach, across, jnp.min(jnp.where(nodal.free, sums, jnp.inf)), jnp.max(sums))
-
-
-# M − C has the couplings within the layers of nodes that are perpendicular to the axis. It consists of diagonal blocks
-# of M and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest eigenvalue of M⁻¹(M −
-# C).
-def _within_lines(mass: Float[Array, "offsets *shape"], offsets: np.ndarray) -> Float[Array, "d offsets *shape"]:
-    """Return the matrix M − C of each axis for a consistent mass."""
-    d = offsets.shape[1]
-    return jnp.where((offsets.T == 0).reshape(d, -1, *[1] * d), mass, 0)

@@ -11,6 +11,7 @@ from scipy.special import gammaincinv
 
 from hks_jax.checks import real_array, require_number
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_checks import tensors_on
 from hks_jax.traced import is_traced
 from hks_jax.uncertainty.smoothing import along_axes, gaussians
 
@@ -117,7 +118,9 @@ class TensorNoise(eqx.Module):
         """
         require_number("level", level, inclusive=True)
         values = real_array("tensors", tensors)
-        return cls(_isotropic(values.shape[-1], level**2) * _squared_mean(values), grid, correlation)
+        rows, columns = np.tril_indices(values.shape[-1])
+        isotropic = np.diag(np.where(rows == columns, level**2, level**2 / 2))
+        return cls(isotropic * _squared_mean(values), grid, correlation)
 
     @classmethod
     def from_scans(cls, first: Any, second: Any, grid: Grid) -> "TensorNoise":
@@ -139,13 +142,13 @@ class TensorNoise(eqx.Module):
         Raises:
             ValueError: The tensors do not have the shape of the grid, or both scans are equal.
         """
-        a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
-        expected = (*grid.shape, grid.dimension, grid.dimension)
-        if not a.shape == b.shape == expected:
-            raise ValueError(f"first, second: got shapes {a.shape} and {b.shape}; expected {expected} for both")
+        a, b = (
+            np.asarray(tensors_on(grid, name, scan), np.float64)
+            for name, scan in (("first", first), ("second", second))
+        )
         inside = grid.inside
         scale = np.trace(a + b, axis1=-2, axis2=-1) / (2 * grid.dimension)
-        parts = _components(a - b) / np.where(inside, scale, 1.0)[..., None]
+        parts = (a - b)[..., *np.tril_indices(grid.dimension)] / np.where(inside, scale, 1.0)[..., None]
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
@@ -177,9 +180,7 @@ class TensorNoise(eqx.Module):
         Raises:
             ValueError: The tensors do not have the shape of the grid, or most of their second differences are zero.
         """
-        values, d = np.asarray(tensors, np.float64), grid.dimension
-        if values.shape != (*grid.shape, d, d):
-            raise ValueError(f"tensors: got shape {values.shape}; expected {(*grid.shape, d, d)}")
+        values, d = np.asarray(tensors_on(grid, "tensors", tensors), np.float64), grid.dimension
         scale = np.where(grid.inside, np.trace(values, axis1=-2, axis2=-1) / d, 1.0)
         found = []
         for axis in range(d):
@@ -194,7 +195,6 @@ class TensorNoise(eqx.Module):
         return cls.relative(values, level, grid)
 
     def __repr__(self) -> str:
-        """Return one line."""
         shared = f", correlation length {self.correlation:.3g}" if self.correlation else ""
         return f"TensorNoise({self.covariance.shape[-1]} components at {self.covariance.shape[:-2]}{shared})"
 
@@ -224,16 +224,6 @@ class TensorNoise(eqx.Module):
         return parts[..., np.maximum(which, which.T)]
 
 
-def _components(tensors: Float[np.ndarray, "*shape d d"]) -> Float[np.ndarray, "*shape m"]:
-    rows, columns = np.tril_indices(tensors.shape[-1])
-    return tensors[..., rows, columns]
-
-
-def _isotropic(d: int, variance: float) -> Float[np.ndarray, "m m"]:
-    rows, columns = np.tril_indices(d)
-    return np.diag(np.where(rows == columns, variance, variance / 2))
-
-
 def _squared_mean(tensors: Any) -> Float[Array, "*shape 1 1"]:
     return jnp.square(jnp.trace(jnp.asarray(tensors), axis1=-2, axis2=-1) / np.shape(tensors)[-1])[..., None, None]
 
@@ -251,20 +241,17 @@ def _root(covariance: Float[Array, "*shape m m"]) -> Float[Array, "*shape m m"]:
 
 
 def _check_semidefinite(covariance: Float[np.ndarray, "*shape m m"]) -> None:
-    if not np.isfinite(covariance).all():
-        bad = ~np.isfinite(covariance).all(axis=(-2, -1))
-        raise ValueError(
-            f"covariance: got NaN or infinity at {int(bad.sum())} of {bad.size} nodes, the first at "
-            f"{tuple(int(i) for i in np.argwhere(bad)[0])}; expected finite numbers. Use 0 for nodes without noise"
-        )
-    size = np.abs(covariance).max(axis=(-2, -1))
-    apart = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
-    least = np.linalg.eigvalsh(covariance)[..., 0]
-    bad = (apart > _ROUNDING * size) | (least < -_ROUNDING * size)
+    finite = np.isfinite(covariance).all(axis=(-2, -1))
+    known = np.where(finite[..., None, None], covariance, 0)
+    size = np.abs(known).max(axis=(-2, -1))
+    apart = np.abs(known - np.swapaxes(known, -1, -2)).max(axis=(-2, -1))
+    least = np.where(finite, np.linalg.eigvalsh(known)[..., 0], -np.inf)
+    bad = ~finite | (apart > _ROUNDING * size) | (least < -_ROUNDING * size)
     if bad.any():
         worst = tuple(int(i) for i in np.unravel_index(np.argmin(np.where(bad, least, np.inf)), bad.shape))
         raise ValueError(
-            f"covariance: got matrices that are not symmetric positive semidefinite at {int(bad.sum())} of {bad.size} "
-            f"nodes, the worst at {worst} with least eigenvalue {least[worst]:.3g}, entries up to {size[worst]:.3g}; "
-            "expected (m, m) covariances of the components xx xy yy (xz yz zz). Do not pass standard deviations"
+            f"covariance: got matrices that are not finite, symmetric and positive semidefinite at {int(bad.sum())} of "
+            f"{bad.size} nodes, the worst at {worst} with least eigenvalue {least[worst]:.3g}, entries up to "
+            f"{size[worst]:.3g}; expected (m, m) covariances of the components xx xy yy (xz yz zz), 0 at nodes without "
+            "noise. Do not pass standard deviations"
         )

@@ -301,8 +301,7 @@ def _sampled(
         if progress is not None:
             progress(f"{_BALANCED * (index + 1)} of {_BALANCED * samples} noisy maps")
         if checkpoint is not None:
-            arrays = {f"arr_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(moments))}
-            write_npz(checkpoint, {**arrays, "mark": mark}, compressed=False)
+            write_npz(checkpoint, {"moments": ravel_pytree(moments)[0], "mark": mark}, compressed=False)
     return moments
 
 
@@ -314,9 +313,7 @@ def _load(path: str | os.PathLike[str], mark: str, like: _Moments) -> tuple[_Mom
             f"checkpoint: {path} belongs to another computation, or is not a checkpoint; expected one of the same "
             "function, tensors, noise and seed. Pass another path, or remove the file"
         )
-    leaves, structure = jax.tree.flatten(like)
-    read = [jnp.asarray(data[f"arr_{i}"], leaf.dtype) for i, leaf in enumerate(leaves)]
-    moments = jax.tree.unflatten(structure, read)
+    moments = ravel_pytree(like)[1](jnp.asarray(data["moments"]))
     return moments, int(moments.n)
 
 

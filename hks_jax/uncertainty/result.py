@@ -53,7 +53,6 @@ class Uncertainty(eqx.Module):
     samples: int = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        """Return one line."""
         shapes = jax.tree.map(jnp.shape, self.value)
         return f"Uncertainty({shapes}, {self.method}, {self.draws} draws, deviation to {self.sampling_error:.0%})"
 

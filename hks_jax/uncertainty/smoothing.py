@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.checks import real_array, require_number
+from hks_jax.checks import require_number
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_checks import tensors_on
 
 
 def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*shape d d"]:
@@ -34,9 +35,7 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
         >>> np.allclose(np.linalg.det(smooth), 4.0, atol=1e-3)  # no volume is made
         True
     """
-    d, values = grid.dimension, real_array("tensors", tensors)
-    if values.shape != (*grid.shape, d, d):
-        raise ValueError(f"tensors: got shape {values.shape}; expected (*grid.shape, d, d) = {(*grid.shape, d, d)}")
+    values = tensors_on(grid, "tensors", tensors)
     require_number("width", width, inclusive=True)
     if width == 0:
         return values

@@ -27,8 +27,8 @@ from hks_jax.cli.study.batch import common_times, suitable_range
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.subjects import read_subjects
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
-from hks_jax.io.components import component_of
 from hks_jax.io.masks import names_beside, read_names
+from hks_jax.io.nifti import component_of
 from hks_jax.io.pairs import pairs_of
 from hks_jax.io.tables import read_table, write_table
 from hks_jax.storage import claim

@@ -1,5 +1,7 @@
 """Eigenpairs of sparse matrices that are none of ours."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -295,8 +297,9 @@ def test_a_vector_found_twice_has_not_converged(rng):
     vectors = pairs.vectors.at[9].set(pairs.vectors[8])
     twice = measure_pairs(pencil, vectors, pairs.eigenvalues)[2]
     np.testing.assert_array_equal(twice, np.arange(k) == 9)
-    on_host = measured_on_host(pencil, np.asarray(vectors), np.asarray(pairs.eigenvalues))
-    np.testing.assert_array_equal(on_host[1], twice)
+    matrices = SimpleNamespace(stiffness=pencil.stiffness.to_scipy(), mass=pencil.mass.to_scipy())
+    on_host = measured_on_host(matrices, np.asarray(vectors), np.asarray(pairs.eigenvalues))
+    np.testing.assert_array_equal(on_host[2], twice)
 
 
 @pytest.mark.slow

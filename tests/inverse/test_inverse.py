@@ -306,7 +306,7 @@ def test_a_function_of_a_few_parameters():
     np.testing.assert_allclose(fit.values, [0.6, 0.4], atol=1e-4)
     with unchecked(), pytest.raises(ValueError, match=r"parametrisation: got <function .* or Free"):
         hj.fit_metric(FLAT, target, TIMES, bump, k=K)
-    with pytest.raises(ValueError, match="regularisers: got a slope penalty on function parameters"):
+    with pytest.raises(ValueError, match="regularisers: got a slope penalty, but the unknowns are parameters"):
         hj.fit_metric(FLAT, target, TIMES, Free(bump, start), k=K, regularisers=[H1(1.0)])
 
 

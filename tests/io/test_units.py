@@ -74,6 +74,22 @@ def test_masks_and_labels_that_lost_the_unit_lie_where_the_tensors_do(tmp_path):
         read_mask(tmp_path / "m.nii", read.affine)
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_labels_in_two_dimensions_lie_in_the_plane_of_the_slice(tmp_path, axis):
+    read = read_tensors(write(tmp_path / "t.nii", "mm", 2.0))
+    plane, others = read.slice(axis, 3), [a for a in range(3) if a != axis]
+    values = np.arange(np.prod(plane.shape)).reshape(plane.shape)
+    affine = plane.affine[:, [*others, axis, 3]]
+    nib.save(nib.Nifti1Image(values.astype(np.uint8), affine), tmp_path / "m.nii")
+    np.testing.assert_array_equal(read_labels(tmp_path / "m.nii", plane), values)
+    for on in (read.slice(axis, 2), read):
+        with pytest.raises(ValueError, match="put the labels and the image on different voxels"):
+            read_labels(tmp_path / "m.nii", on)
+    nib.save(nib.Nifti1Image((values > 3).astype(np.uint8), affine), tmp_path / "m.nii")
+    with pytest.raises(ValueError, match="the mask's affine displaces it"):
+        read_mask(tmp_path / "m.nii", read.affine)
+
+
 def test_six_images_in_micrometres(tmp_path):
     for i, j in NIFTI:
         image = nib.Nifti1Image(np.full(SHAPE, D[i, j]), np.diag([-150.0, 150.0, 150.0, 1.0]))

@@ -15,7 +15,7 @@ from differences import directional
 from scipy import linalg
 
 import hks_jax as hj
-from hks_jax.signatures.filters import divided_difference, second_divided_difference
+from hks_jax.linear.divided_differences import divided_difference, second_divided_difference
 
 SPECTRA = {
     "identity": [1.0] * 5,

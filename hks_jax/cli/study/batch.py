@@ -53,7 +53,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import tuples
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
-from hks_jax.signatures.suitable import LAST
+from hks_jax.signatures.times import LAST
 
 KEPT = f"""
 @metric {READING} {SOLVING} @signature @noise

@@ -18,9 +18,8 @@ from hks_jax.cli.options import COLUMNS
 from hks_jax.cli.reading import image_suffix
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.cli.values import Times
-from hks_jax.io.components import is_one_of_six, siblings
 from hks_jax.io.masks import names_beside
-from hks_jax.io.nifti import is_nifti, sidecar_of
+from hks_jax.io.nifti import is_nifti, siblings, sidecar_of
 from hks_jax.io.result import Result, plain
 from hks_jax.io.tables import read_json, read_table, write_json, write_table
 from hks_jax.io.volume import digest
@@ -218,7 +217,7 @@ def _summary(sidecar: Path, problem: str | None) -> tuple[Any, ...]:
 def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
     """Return the input files of a subject's signature, grouped by role."""
     images = [args.file, *args.others]
-    if not args.others and args.bval is None and is_nifti(args.file) and is_one_of_six(args.file):
+    if not args.others and args.bval is None:
         images = siblings(args.file)
     sidecar = sidecar_of(images[0]) if args.bval is None and is_nifti(images[0]) else None
     sidecars = [] if sidecar is None or not sidecar.is_file() else [sidecar]

@@ -2,15 +2,15 @@
 
 Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
 eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
-indefinite on the whole space. Preconditioned with K − σM, the spectrum of K − λᵢM lies between 1 and (Λ − λᵢ)/(Λ − σ).
-So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice for
-fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those in JAX, and
-`FilteredAdjoint` a polynomial.
+indefinite on the whole space. If K − λᵢM is preconditioned with K − σM, its spectrum lies between 1 and
+(Λ − λᵢ)/(Λ − σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations
+then suffice for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those
+in JAX, and `FilteredAdjoint` a polynomial.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic
+from typing import Any, Generic
 
 import equinox as eqx
 import jax
@@ -53,11 +53,9 @@ class Adjoint(eqx.Module, Generic[P]):
     Every eigensolver has a default in its field ``adjoint``; any other that supports the pencil may replace it.
 
     Attributes:
-        warns: whether `solve` itself warns of rows that do not converge, even if values are traced.
         tolerance: the error in the energy norm, relative to the largest row. Rounding of eigenvectors is a lower bound.
     """
 
-    warns: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
 
     def __check_init__(self) -> None:

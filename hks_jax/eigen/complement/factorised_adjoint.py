@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hks_jax.compilation import jit_quickly, known_here
+from hks_jax.compilation import is_concrete_on_cpu, jit_quickly
 from hks_jax.eigen.complement import adjoint as complement
 from hks_jax.eigen.complement.adjoint import Adjoint, Columns, OfRows, Rows, Scalar, Shifts, Values, Vectors
 from hks_jax.eigen.inertia import LocatedPencil
@@ -63,7 +63,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     def prepare(self, pencil: SymmetricPencil, values: Values, k: int) -> Shifted:
         """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
-        if known_here((pencil, values)):
+        if is_concrete_on_cpu((pencil, values)):
             # Factorise the shifts in sequence by the function that the eigensolver has already compiled.
             dissection = jax.device_put(dissection)
             shifts = self._shifts(pencil, np.asarray(values), self.groups(dissection, len(values), k, values.dtype))

@@ -12,12 +12,11 @@ from jaxtyping import Array, Float, Int
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.complement.adjoint import Values, Vectors
-from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.inertia import LocatedPencil, dissected, lowered, translated
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
 from hks_jax.eigen.quality import measure_pairs
-from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
+from hks_jax.eigen.solver import Dense, Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.loops import when, while_loop

@@ -64,7 +64,8 @@ def _consider(
     last = jnp.sort(state.values)[plan.wanted - 1]
     all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
     finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no more exist
-    # If as many eigenvalues are missing at a nearer shift, these are equal. Then search there, repeatedly if necessary.
+    # If the same number of eigenvalues is missing at a shift closer to the known ones, the missing ones are equal. Then
+    # search at this shift, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
     # If a multiplicity exceeds the wanted number, a part suffices; the certificate is then below the multiplet.
