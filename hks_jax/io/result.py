@@ -59,7 +59,7 @@ class Result:
         """Return a summary in one line, without the arrays."""
         times = f", {self.times.size} times {self.times.min():.4g} … {self.times.max():.4g}" * bool(self.times.size)
         unit = f" {self.unit}" * bool(times and self.unit)
-        return f"Result({self.name}: {describe_array(self.values)}{times}{unit}, on {self.place!r})"
+        return f"Result({self.name}: {describe_array(self.values)}{times}{unit}, source={self.source!r})"
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], name: str | None = None, over_times: bool = False) -> "Result":

@@ -10,7 +10,7 @@ from jaxtyping import Real
 from matplotlib.axes import Axes
 from matplotlib.colors import TABLEAU_COLORS
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
@@ -115,8 +115,6 @@ def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
             label = "misfit" if start == starts[0] else ""
             ax.plot([step.misfit for step in steps], ":", color=color, label=label)
     ax.set_yscale("log", nonpositive="mask")
-    ax.yaxis.set_major_locator(LogLocator(numticks=6))
-    ax.yaxis.set_minor_formatter(NullFormatter())
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     ax.tick_params(labelsize=SMALL)
     ax.grid(alpha=0.3)

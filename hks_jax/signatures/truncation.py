@@ -52,10 +52,11 @@ class Truncation(eqx.Module):
     order: int = eqx.field(static=True, default=1, kw_only=True)
 
     def __repr__(self) -> str:
-        if is_traced(self):
-            return f"Truncation({describe_array(self.times)} times, traced)"
-        worst = (f"{name} ≤ {np.max(np.asarray(getattr(self, name))):.2g}" for name in ("tail", "resolution_bias"))
-        return f"Truncation({self.times.size} times, {', '.join(worst)}, smallest_time={float(self.smallest_time):.4g})"
+        if is_traced(self) or not isinstance(self.tail, jax.Array | np.ndarray):
+            return f"Truncation(times={describe_array(self.times)})"
+        names = ("tail", "resolution_bias", "smallest_time")
+        worst = (f"{name} ≤ {np.max(np.asarray(getattr(self, name))):.4g}" for name in names)
+        return f"Truncation(times={describe_array(self.times)}, {', '.join(worst)})"
 
     def messages(self) -> list[str]:
         """Return a sentence for each kind of unresolved time. Values must be concrete."""

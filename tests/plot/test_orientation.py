@@ -335,7 +335,7 @@ def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatc
     assert np.ptp(values) > 0.01 * values.max()
     assert more["vmin"] > 0  # far from 1, and positive
     # Where nothing is left, nothing is shown.
-    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", str(3 * last)]) == 0
+    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", str(6 * last)]) == 0
     values, more = drawn[-1]
     assert np.ptp(values) < 1e-3 * values.max()
     assert more["vmax"] - more["vmin"] == pytest.approx(0.01 * values.max(), rel=1e-2)
