@@ -67,8 +67,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
     result = signature_of(args, compute_pairs(volume, settings, progress), progress)
     title = (
-        rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat, "
-        "larger values mean positive curvature, including that of the boundary"
+        rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
+        "larger values mean positive curvature of the metric or the boundary"
     )
     drawing = partial(signature_panels, result, title=title, view=args.view)
     done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")

@@ -130,17 +130,11 @@ for _unknown in (
 
 
 class _State(eqx.Module):
-    """A factorised operator.
+    """A factorised operator A."""
 
-    Attributes:
-        factor: the factorisation of A or, if A is complex, of the real symmetric matrix of its real and imaginary part.
-        hermitian: whether a complex A is Hermitian and not symmetric; None if A is real.
-        conjugate: whether the state stands for the conjugate of A.
-    """
-
-    factor: FactorisedMatrix
-    hermitian: bool | None = eqx.field(static=True)
-    conjugate: bool = eqx.field(static=True, default=False)
+    factor: FactorisedMatrix  # of A or, if A is complex, of the real symmetric matrix of its real and imaginary part
+    hermitian: bool | None = eqx.field(static=True)  # whether a complex A is Hermitian, not symmetric; None if real
+    conjugate: bool = eqx.field(static=True, default=False)  # whether the state stands for the conjugate of A
 
     def conjugated(self) -> "_State":
         return _State(self.factor, self.hermitian, self.hermitian is not None and not self.conjugate)
@@ -180,7 +174,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         definite = lx.is_positive_semidefinite(operator) or lx.is_negative_semidefinite(operator)
         if not (lx.is_symmetric(operator) or definite):
             raise ValueError(
-                "operator: it is not known to be symmetric or Hermitian; if it is, add a tag, such as "
+                "operator: got one that is not known to be symmetric or Hermitian; if it is, add a tag, such as "
                 "`lineax.TaggedLinearOperator(operator, lineax.symmetric_tag)`, or use `lineax.LU`"
             )
         if not jnp.issubdtype(jnp.result_type(*jax.tree.leaves(operator.in_structure())), jnp.complexfloating):

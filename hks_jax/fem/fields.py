@@ -17,16 +17,10 @@ Place = Literal["everywhere", "nodes", "elements", "points"]
 
 
 class Field(eqx.Module):
-    """A field on the elements of a domain.
+    """A field on the elements of a domain."""
 
-    Attributes:
-        values: one value for the domain, or values at the nodes (*node_shape, …), on the elements (*elements, …), or at
-            the quadrature points of each element (*elements, q, …).
-        at: the kind of places that have a value; static.
-    """
-
-    values: Float[Array, "..."]
-    at: Place = eqx.field(static=True)
+    values: Float[Array, "..."]  # (…), (*node_shape, …), (*elements, …), or (*elements, q, …) at quadrature points
+    at: Place = eqx.field(static=True)  # the kind of places that have a value
 
     def at_points(
         self, corners: Callable[[Array], Array], shape_values: Float[np.ndarray, "q n"], elements: tuple[int, ...]

@@ -22,21 +22,13 @@ from hks_jax.traced import is_traced
 
 
 class NodalPencil(eqx.Module):
-    """The matrices K and M on all nodes of a grid, with masks as arrays.
+    """The matrices K and M on all nodes of a grid, with masks as arrays."""
 
-    Attributes:
-        stiffness: K.
-        mass: M; a diagonal if lumped.
-        lumped: (*shape,) the row sums D of M, without derivatives; 1 at nodes that are not free.
-        free: (*shape,) the nodes that carry a degree of freedom.
-        domain: (*shape,) the nodes of the domain: free nodes, and nodes where functions vanish.
-    """
-
-    stiffness: Stencil
-    mass: Stencil
-    lumped: Float[Array, "*shape"]
-    free: Bool[Array, "*shape"]
-    domain: Bool[Array, "*shape"]
+    stiffness: Stencil  # K
+    mass: Stencil  # M; a diagonal if lumped
+    lumped: Float[Array, "*shape"]  # the row sums D of M, without derivatives; 1 at nodes that are not free
+    free: Bool[Array, "*shape"]  # the nodes that carry a degree of freedom
+    domain: Bool[Array, "*shape"]  # the nodes of the domain: free nodes, and nodes where functions vanish
 
     @property
     def shape(self) -> tuple[int, ...]:

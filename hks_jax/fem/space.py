@@ -25,26 +25,15 @@ _COPIED = 1 << 22
 
 
 class FunctionSpace(ByKey):
-    """The nodes of a domain, and the free nodes, which carry a degree of freedom. Static and hashable.
+    """The nodes of a domain, and the free nodes, which carry a degree of freedom. Static and hashable."""
 
-    Attributes:
-        node_shape: shape of a nodal array: the grid's shape, or (V,).
-        dimension: the dimension of the manifold.
-        domain: nodes of the domain, bool (*node_shape). Results are NaN elsewhere.
-        free: nodes that carry a degree of freedom, bool (*node_shape). Dirichlet nodes are in the domain, but not free.
-        boundary: the conditions (low, high) of each axis and, last, those on the rim of a mask; for a mesh one pair,
-            such as ``(("neumann", "neumann"),)``.
-        n_components: the number of connected components of the domain.
-        elements: the elements of the domain, bool: n − 1 along each axis of a grid (n if periodic), or all cells.
-    """
-
-    node_shape: tuple[int, ...]
-    dimension: int
-    domain: Bool[np.ndarray, "*node_shape"]
-    free: Bool[np.ndarray, "*node_shape"]
-    boundary: tuple[Sides, ...]
-    n_components: int
-    elements: Bool[np.ndarray, "*elements"]
+    node_shape: tuple[int, ...]  # the shape of a nodal array: the grid's shape, or (V,)
+    dimension: int  # the dimension of the manifold
+    domain: Bool[np.ndarray, "*node_shape"]  # the nodes of the domain; results are NaN elsewhere
+    free: Bool[np.ndarray, "*node_shape"]  # the nodes that carry a degree of freedom; Dirichlet nodes are not free
+    boundary: tuple[Sides, ...]  # the conditions of each axis and of the rim of a mask; for a mesh one pair
+    n_components: int  # the number of connected components of the domain
+    elements: Bool[np.ndarray, "*elements"]  # n − 1 along each axis of a grid (n if periodic), or all cells of a mesh
     _labels: Int[np.ndarray, "*node_shape"]
 
     def __repr__(self) -> str:
@@ -152,10 +141,6 @@ class GridSpace(FunctionSpace):
     """The Q1 space on a grid with given boundary conditions, as returned by `normalise_boundary`.
 
     Spacing and origin of the grid are not part of the space, so that they can change without recompilation.
-
-    Attributes:
-        inside: the nodes inside the mask, bool (*shape).
-        periodic: for each axis, whether node n is node 0.
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
@@ -204,11 +189,8 @@ def cells_of(
 class MeshSpace(FunctionSpace):
     """The space of P1 or P2 elements on a mesh of triangles or tetrahedra.
 
-    Attributes:
-        triangulation: the connectivity of the mesh.
-        degree: 1 or 2.
-        cells: the nodes of each cell. For degree 2 they are its vertices, then the midpoints of its edges: node
-            ``n_vertices + e`` belongs to edge e of the triangulation.
+    The nodes of a cell are its vertices and, for degree 2, the midpoints of its edges: node ``n_vertices + e`` belongs
+    to edge e of the triangulation.
     """
 
     def __init__(self, triangulation: Triangulation, condition: str, degree: int = 1) -> None:
@@ -231,12 +213,7 @@ class MeshSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class VectorSpace(FunctionSpace):
-    """Functions with several components on the nodes of another space; results have a last axis of components.
-
-    Attributes:
-        base: the space of each component.
-        cells: the unknowns of each element, where those of a node are adjacent.
-    """
+    """Functions with several components on the nodes of another space; results have a last axis of components."""
 
     def __init__(self, base: "GridSpace | MeshSpace", components: int) -> None:
         self.base, self.components = base, components
@@ -251,13 +228,9 @@ class VectorSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class MatrixSpace(FunctionSpace):
-    """The nodes of matrices from elsewhere, for which only the shape of nodal arrays is known.
+    """The nodes of matrices from elsewhere, for which only the shape of nodal arrays is known."""
 
-    Attributes:
-        dimension: the dimension of the manifold; None if it is not known.
-    """
-
-    dimension: int | None  # type: ignore[assignment]
+    dimension: int | None  # type: ignore[assignment]  # None if it is not known
 
     def __init__(self, shape: tuple[int, ...], dimension: int | None = None) -> None:
         self.node_shape, self.dimension, self.boundary = shape, dimension, ()

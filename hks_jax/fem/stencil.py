@@ -100,16 +100,13 @@ class Stencil(eqx.Module):
     In this layout a product reads each coefficient once for all columns, which in 3D is about twice as fast as one row
     at a time. Stencils of one shape share compiled code, even if their masks differ.
 
-    Attributes:
-        coefficients: (3^d, *shape), with the offsets o in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i)
-            couples node i to node i + o. A diagonal is (1, *shape). Couplings across non-periodic sides are 0.
-        periodic: for each axis, whether node n is node 0; static.
-        slabs: the cut of the grid, if this is one device's slab inside `shard_map`; static.
+    The offsets o of the coefficients are in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i) couples node i
+    to node i + o. A diagonal is (1, *shape). Couplings across non-periodic sides are 0.
     """
 
     coefficients: Float[Array, "offsets *shape"]
-    periodic: tuple[bool, ...] = eqx.field(static=True)
-    slabs: Slabs | None = eqx.field(default=None, static=True)
+    periodic: tuple[bool, ...] = eqx.field(static=True)  # for each axis, whether node n is node 0
+    slabs: Slabs | None = eqx.field(default=None, static=True)  # if this is one device's slab inside `shard_map`
 
     @property
     def is_diagonal(self) -> bool:

@@ -11,7 +11,6 @@ from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import GridSpace
 from hks_jax.inverse.unknowns import Nodal, Values, flat_field
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
@@ -60,7 +59,6 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     """Return the inner product of nodal values on a grid's domain."""
     pencil = assemble(flat_field(grid, dtype), mass="lumped")
     assert isinstance(pencil, Pencil)
-    assert isinstance(pencil.space, GridSpace)
     factor = None
     if length > 0:
         dissection = jax.tree.map(jnp.asarray, dissect(pencil.pattern))

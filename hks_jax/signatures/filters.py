@@ -1,4 +1,4 @@
-"""Filters, which are functions f(λ) of the eigenvalue."""
+"""Filters, which are functions f(λ) of the eigenvalue, and the divided differences by which they mix eigenvectors."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -7,8 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.linear.divided_differences import divided_difference, gauss
 
 
@@ -90,12 +91,7 @@ class Power(Filter):
 
 
 class Custom(Filter):
-    """Any function f(parameters, λ) that JAX differentiates twice.
-
-    Attributes:
-        function: maps (parameters, λ) to f, elementwise in λ.
-        parameters: any pytree of floating point arrays.
-    """
+    """Any function f(parameters, λ) that JAX differentiates twice, elementwise in λ."""
 
     function: Callable[[Any, Array], Array] = eqx.field(static=True)
     parameters: Any
@@ -120,3 +116,36 @@ class Derivative(Filter):
         if type(self.filter).divided_difference is Filter.divided_difference:
             return super().divided_difference(low, high)
         return jax.jvp(lambda f: f.divided_difference(low, high), (self.filter,), (self.direction,))[1]
+
+
+def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
+    """Return f(λᵢ), or zero if the pair is not kept."""
+    return jnp.where(kept, one(values), 0)
+
+
+@jit_quickly(static_argnames="fixed")
+def mixing(
+    filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
+) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
+    """Return f(λᵢ), the divided differences [f] and [λf], and where f or λf' matters, for each filter.
+
+    They do not matter where they are negligible relative to their largest size at positive eigenvalues.
+    """
+    rows, columns = values[:, None], values[None]
+    low, high, gap = jnp.minimum(rows, columns), jnp.maximum(rows, columns), rows - columns
+
+    def of_one(one: Filter) -> tuple[Array, Array, Array, Array]:
+        f = weights_of(one, values, kept)
+        quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
+        of_f = jnp.where(kept[:, None] & kept[None], one.divided_difference(low, high), quotient)
+        # G vanishes between null vectors that every perturbation annihilates, and f may have no derivative at 0.
+        of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
+        # Using f at the larger eigenvalue, where f is small, avoids cancellation.
+        of_lambda_f = jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
+        size = jnp.maximum(jnp.abs(f), jnp.abs(values * jnp.diagonal(of_f)))
+        # Between two negligible pairs, [f] is at most f' at one of them or, if f is not monotone, ε over the relative
+        # gap. NaN counts as not negligible.
+        negligible = size <= jnp.finfo(f.dtype).eps * jnp.max(jnp.where(values > 0, size, 0))
+        return f, of_f, of_lambda_f, ~negligible
+
+    return jax.lax.map(of_one, filters)

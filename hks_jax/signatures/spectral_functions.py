@@ -19,9 +19,8 @@ from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
-from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
-from hks_jax.signatures.filters import Custom, Derivative, Filter
-from hks_jax.signatures.mixing import by_numpy, mixing, shapes, weights_of
+from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy, shapes
+from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
 from hks_jax.traced import is_traced
 
 _ROWS = 128
@@ -240,11 +239,7 @@ def _instantiated(tree: Any) -> Any:
 
 
 def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
-    """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ().
-
-    Raises:
-        ValueError: if a source has a wrong shape or type, is out of range, or lies outside the mask.
-    """
+    """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ()."""
     shape = pairs.space.node_shape
     array = np.asarray(sources)
     if not np.issubdtype(array.dtype, np.integer):

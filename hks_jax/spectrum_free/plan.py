@@ -72,10 +72,7 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
 def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -> Colouring | None:
     """Return the colouring if it takes less work than selected inversion, or None.
 
-    Raises:
-        Unattainable: if selected inversion needs too much memory and the domain is a mesh or the tolerance is below the
-            rounding error.
-        ValueError: if values are traced in that case.
+    If selected inversion needs too much memory, a mesh or a tolerance below the rounding error raises `Unattainable`.
     """
     of_inversion = work(None, pencil, times)
     affordable = math.isfinite(of_inversion)
@@ -105,11 +102,9 @@ class Unattainable(ValueError):
 def plan(
     pencil: AnyPencil, times: Float[Array, " m"], tolerance: float, memory: float = 2e9, slack: float = 1.0
 ) -> Colouring:
-    """Return a colouring that is valid for all parts of a pencil.
+    """Return a colouring for all parts of a pencil; raise `Unattainable` if the tolerance is below the rounding error.
 
-    Raises:
-        Unattainable: if the tolerance is below the rounding error.
-        ValueError: if values are traced.
+    Traced values raise ValueError.
     """
     pencil, times = jax.lax.stop_gradient((from_lower_bound(pencil)[0], times))
     if is_traced((pencil, times)):

@@ -21,23 +21,17 @@ _STEPS, _MASS_STEPS = 50, 200
 class Bounds(NamedTuple):
     """Bounds for the polynomials of a pencil; for concrete values, NumPy numbers in double precision.
 
-    Attributes:
-        top: an upper bound on the eigenvalues of PK.
-        low: a lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M; 1 if the mass is lumped.
-        reach: (d,) for each axis a bound on the eigenvalues of D⁻¹ times the couplings of K across the axis. It is the
-            discrete counterpart of 2 gᵃᵃ/h².
-        across: (d,) for each axis the least β such that the couplings C of M across the axis satisfy −C ⪯ βM. It is 1
-            for a constant metric, and 0 if the mass is lumped.
-        least_mass: the least entry of D.
-        greatest_mass: the greatest entry of D.
+    For each axis, reach bounds the eigenvalues of D⁻¹ times the couplings of K across the axis; it is the discrete
+    counterpart of 2 gᵃᵃ/h². And across is the least β such that the couplings C of M across the axis satisfy −C ⪯ βM;
+    it is 1 for a constant metric, and 0 if the mass is lumped.
     """
 
-    top: Any
-    low: Any
+    top: Any  # an upper bound on the eigenvalues of PK
+    low: Any  # a lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M; 1 if the mass is lumped
     reach: Float[Array | np.ndarray, " d"]
     across: Float[Array | np.ndarray, " d"]
-    least_mass: Any
-    greatest_mass: Any
+    least_mass: Any  # the least entry of D
+    greatest_mass: Any  # the greatest entry of D
 
 
 @jax.jit

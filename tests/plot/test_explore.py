@@ -107,7 +107,7 @@ def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(
     [
         ({"times": TIMES[::-1]}, {}, "times: got"),
         ({"values": signature()[1:]}, {}, r"values: got shape \(6, 24, 18\)"),
-        ({"values": np.full((7, *SHAPE), np.nan)}, {}, "finite at all times"),
+        ({"values": np.full((7, *SHAPE), np.nan)}, {}, "finite values at all times"),
         ({"arrays": {"deviation": np.ones(2)}}, {}, r"deviation: got shape \(2,\)"),
         (
             {"place": of(signature(), tensors=np.full((*SHAPE, 2, 2), np.nan)).place, "source": ""},

@@ -98,7 +98,7 @@ def explore(
         inside &= result.volume.inside
         place = {"spacing": result.volume.spacing, "origin": result.volume.origin}
     if not inside.any():
-        raise ValueError("values: got no node inside the mask that is finite at all times; expected one")
+        raise ValueError("values: got no node inside the mask with finite values at all times; expected at least one")
     layers = {} if result.tensors is None else _tensor_layers(result.tensors, inside)
     for name, values in (maps or {}).items():
         if np.shape(values) != inside.shape:
