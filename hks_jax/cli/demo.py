@@ -24,7 +24,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.values import Times
 from hks_jax.domain import examples
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
-from hks_jax.io.units import MM2_PER_S
+from hks_jax.io.units import MM2_PER_S, median_mean_diffusivity
 
 OPTIONS = """
 -o,--output OUT = demo  folder for the results
@@ -60,9 +60,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
             volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
             volume = volume.with_mask(erode(volume.inside, RIM))
-    mean = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
-    lengths = min(volume.spacing) * SPREADS
-    times = lengths**2 / np.median(mean[volume.mask])
+    times = (min(volume.spacing) * SPREADS) ** 2 / median_mean_diffusivity(volume)
     chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
     settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
     result = signature_of(args, compute_pairs(volume, settings, progress), progress)

@@ -452,7 +452,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
     assert times() == first
     other = ("--interpolation", "log-euclidean")
     assert main(command(study, "out", "--times", "auto:2", *other)) == 2
-    assert "got --interpolation log-euclidean, not linear as in the study" in capsys.readouterr().err
+    assert "has --interpolation linear, not log-euclidean. Leave" in capsys.readouterr().err
     assert times("--replace", *other)[0] > first[0]  # chosen anew, of all subjects
 
 
@@ -609,7 +609,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
     assert boundary("old", "--boundary", "neumann:dirichlet,neumann") == [["neumann", "dirichlet"], "neumann"]
     assert boundary("old") == [["neumann", "dirichlet"], "neumann"]
     assert main(command(study, "old", "--times", "3e3", "--boundary", "mean")) == 2
-    assert "got --boundary mean, not neumann:dirichlet,neumann as in the study" in capsys.readouterr().err
+    assert "has --boundary neumann:dirichlet,neumann, not mean. Leave" in capsys.readouterr().err
     assert boundary("old", "--replace") == "mean"
 
 
@@ -628,9 +628,9 @@ def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
         assert option in printed
     assert main([*short, "-k", "9", "--normalisation", "raw", "--times", "auto:4", "--noise", "0.1"]) == 2
     printed = capsys.readouterr().err
-    for text in ("-k 9, not 8;", "--normalisation raw, not flat;", "--times auto:4, not 3000.0,6000.0;"):
+    for text in ("-k 8, not 9;", "--normalisation flat, not raw;", "--times 3000.0,6000.0, not auto:4;"):
         assert text in printed
-    assert "--noise 0.1, not the default" in printed
+    assert "--noise unset, not 0.1" in printed
     assert "Leave these options out to continue the study" in printed
     assert main([*short, "-k", "9", "--metric", "inverse", "--slice", "z=1", "--times", "9", "--replace"]) == 0
     assert json.loads((study / "out" / "study.json").read_text())["settings"]["normalisation"] == "raw"
@@ -681,7 +681,7 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     assert [noise["source"] for noise in noises] == ["second.nii.gz", "0.01"]
     before = contents(study / "out")
     assert main([*words, "--draws", "12"]) == 2
-    assert "got --draws 12, not 8 as in the study" in capsys.readouterr().err
+    assert "has --draws 8, not 12. Leave" in capsys.readouterr().err
     scan_again()  # nothing is solved again but the noisy maps, of the one subject
     monkeypatch.setattr("hks_jax.cli.study.tasks.compute_pairs", None)
     assert main(words) == 0

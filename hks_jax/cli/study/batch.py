@@ -167,7 +167,7 @@ def _options(record: Mapping[str, Any]) -> dict[str, Any]:
 def _spelled(name: str, value: Any) -> str:
     """Return the value of an option as on the command line."""
     if not isinstance(value, tuple):
-        return "the default" if value is None else str(value)
+        return "unset" if value is None else str(value)
     parts = [":".join(each) if isinstance(each, tuple) else str(each) for each in value if each is not None]
     return {"slice": "=", "repair": ":", "positive": ":"}.get(name, ",").join(parts)
 
@@ -182,10 +182,10 @@ def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProg
         then["times"] = tuples(before["times"])
     changed = [name for name, value in now.items() if then.get(name) != value]
     if before and changed and not args.replace:
-        given = "; ".join(f"{flag(n)} {_spelled(n, now[n])}, not {_spelled(n, then.get(n))}" for n in changed)
+        kept = "; ".join(f"{flag(n)} {_spelled(n, then.get(n))}, not {_spelled(n, now[n])}" for n in changed)
         raise ValueError(
-            f"--output: got {given} as in the study in {args.output}. Leave these options out to continue the study, "
-            "choose another folder, or pass --replace to compute the subjects of that study again"
+            f"--output: the study in {args.output} has {kept}. Leave these options out to continue the study, choose "
+            "another folder, or pass --replace to compute the subjects of that study again"
         )
     if times.automatic:
         explicit = _suitable(args, times.automatic, subjects, progress) if changed else tuple(before["times"])
