@@ -36,7 +36,7 @@ def require_real(name: str, values: Any) -> None:
     leaves = jax.tree.leaves(values)
     if any(np.iscomplexobj(leaf) for leaf in leaves):
         raise ValueError(
-            f"{name}: got complex numbers; expected real numbers. Pass the real part if the rest is rounding"
+            f"{name}: got complex numbers; expected real numbers. Pass the real part if the imaginary part is rounding"
         )
     if any(isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f" and leaf.dtype.itemsize > 8 for leaf in leaves):
         raise ValueError(f"{name}: got {np.dtype(np.longdouble)}, which JAX does not support; use .astype(np.float64)")

@@ -91,12 +91,15 @@ _FEW = 1 << 19
 """The largest number of array entries for which NumPy is faster than compilation, even for many calls."""
 
 
-def numpy_where_known(jit: Callable | None = None, **settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
+def numpy_where_known(
+    jit: Callable | None = None, most: int = _FEW, **settings: Any
+) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Return a decorator for functions whose first argument is the array module, `numpy` or `jax.numpy`.
 
-    If the arguments are concrete, small and on a CPU, the function is evaluated without compilation, with NumPy arrays
-    in place of JAX arrays and SciPy matrices in place of operators. Otherwise, the function is compiled by ``jit``, by
-    default `jax.jit` with the settings. The results are JAX arrays in both cases.
+    If the arguments are concrete, on a CPU, and have at most ``most`` entries, the function is evaluated without
+    compilation, with NumPy arrays in place of JAX arrays and SciPy matrices in place of operators. Otherwise, the
+    function is compiled by ``jit``, by default `jax.jit` with the settings. The results are JAX arrays in both cases.
+    The decision depends only on shapes and devices, so repeated computations have the same rounding.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
@@ -104,7 +107,8 @@ def numpy_where_known(jit: Callable | None = None, **settings: Any) -> Callable[
 
         @wraps(function)
         def call(*args: Any) -> T:
-            return by_numpy(partial(function, np), *args) if is_small_and_concrete(args) else compiled(*args)
+            is_small = sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= most
+            return by_numpy(partial(function, np), *args) if is_small and is_concrete_on_cpu(args) else compiled(*args)
 
         return call
 
@@ -121,14 +125,6 @@ def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
     with np.errstate(all="ignore"):
         # `device_put`, because `jnp.asarray` returns NumPy arrays during differentiation.
         return jax.device_put(jax.tree.map(np.asarray, function(*known)))
-
-
-def is_small_and_concrete(args: Any) -> bool:
-    """Return whether values are `is_concrete_on_cpu` and have at most `_FEW` entries, so that NumPy computes.
-
-    The decision depends only on shapes and devices, so repeated computations have the same rounding.
-    """
-    return is_concrete_on_cpu(args) and sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= _FEW
 
 
 def is_concrete_on_cpu(args: Any) -> bool:

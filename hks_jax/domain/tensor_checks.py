@@ -59,8 +59,8 @@ def require_spd(
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
         if bad.sum() > MANY * inside.sum():
             of_grids = (
-                "So many cannot be noise. If the tensors are indefinite by nature, such as stress, make a metric by "
-                f"hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
+                "Noise does not explain this number. If the tensors are indefinite by nature, such as stress, make "
+                f"a metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
 
@@ -171,7 +171,7 @@ def positive_map(
     if known:
         require_finite_symmetric(name, np.asarray(tensors), inside, place)
         values = np.linalg.eigvalsh(np.asarray(tensors, np.float64)[inside])
-        got = f"number: got the {NUMBERS[how]} {float(number):g} of {name}"
+        got = f"number: got the {NUMBERS[how]} {float(number):g} for {name}"
         if how == "shift" and not float(number) + values.min() > 0:
             raise ValueError(
                 f"{got} whose least eigenvalue is {values.min():g}; expected more than {-values.min():g}, so that "

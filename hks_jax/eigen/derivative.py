@@ -312,9 +312,7 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 @numpy_where_known(static_argnums=5)
-def _is_multiple(
-    xp: Any, values: Any, following: Any, kept: Any, part: Any | None, rounding: list[Any], fixed: bool
-) -> Any:
+def _is_multiple(xp: Any, values: Any, following: Any, kept: Any, part: Any, rounding: Any, fixed: bool) -> Any:
     """Return the mask (k) of pairs that are not kept, cut by k, or mixed with an equal eigenvalue by perturbations."""
     size = xp.maximum(xp.abs(values), values - values[:1])
     least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))

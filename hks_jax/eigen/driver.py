@@ -192,7 +192,7 @@ def _in_interval(
     report: Report,
 ) -> Eigenpairs:
     if len(pencil.parts) > 1 and k is not None:
-        raise ValueError(f"k: got {k} with an interval of a doubled domain, whose parts are counted apart; leave k out")
+        raise ValueError(f"k: got {k} with an interval of a doubled domain, which has two separate counts; leave k out")
     checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
     traced = is_traced([each.below for each in checked])

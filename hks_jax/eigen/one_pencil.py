@@ -12,7 +12,7 @@ from jaxtyping import Array, Int
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
-from hks_jax.eigen.complement.adjoint import Scalar, Values
+from hks_jax.eigen.complement.adjoint import Scalar
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.host.shift_invert import ShiftInvert, lower_bound
@@ -80,9 +80,10 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
 
     moved, found = solve(origin, reach, spacing)
     values = jax.lax.stop_gradient(found[0])
-    if not is_traced(values) and _is_far(moved, values):
-        # Solve again from an origin nearer to the spectrum, because distances from a remote origin lose digits.
-        spread = values[-1] - values[0]
+    spread = values[-1] - values[0]
+    if not is_traced(values) and spread > indistinct(moved, values.dtype) and values[0] > _FAR * spread:
+        # Solve again from an origin nearer to the spectrum, because distances from a remote origin lose digits; equal
+        # eigenvalues have none to lose.
         origin = origin + values[0] - spread
         moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
@@ -90,12 +91,6 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
         found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method)
-
-
-def _is_far(pencil: SymmetricPencil, values: Values) -> bool:
-    """Return whether eigenvalues lose digits because their origin is remote; equal eigenvalues have none to lose."""
-    spread = values[-1] - values[0]
-    return bool((spread > indistinct(pencil, values.dtype)) & (values[0] > _FAR * spread))
 
 
 class Interval(NamedTuple):
@@ -149,8 +144,8 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > available:
         raise ValueError(
-            f"interval: got one with {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine has "
-            f"{available / 1e9:.3g} GB. Divide the interval"
+            f"interval: got an interval of {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine "
+            f"has {available / 1e9:.3g} GB. Divide the interval"
         )
     return Interval(low, high, below, held, count)
 
@@ -198,7 +193,7 @@ def _pairs(
     )
 
 
-@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known")))
+@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known")), most=3 << 18)
 def _quality(
     xp: Any, pencil: Any, values: Any, vectors: Any, origin: Any, n_null: int, tolerance: float, known: bool
 ) -> tuple[Any, ...]:

@@ -58,9 +58,9 @@ def weyl_count(
     d = pencil.space.dimension
     volume = pencil.volume if pencil.measured else None
     if volume is None:
-        raise ValueError("problem: got one without dimension or volume; give them to `sparse_pencil` for Weyl's law")
+        raise ValueError("problem: got matrices without dimension or volume; give these to `sparse_pencil`")
     if any(part.metric is not None and part.null_space is None for part in pencil.parts):
-        raise ValueError("problem: got one with a potential, which Weyl's law omits; use `count_eigenvalues`")
+        raise ValueError("problem: got an operator with a potential, which Weyl's law omits; use `count_eigenvalues`")
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():

@@ -102,8 +102,8 @@ def assemble(
         raise ValueError(f'quadrature: got {quadrature!r}; expected "gauss" or "cancelling"')
     if quadrature == "cancelling":
         for what, is_given in (
-            ("a mesh, for which no such points are known", isinstance(domain, SimplicialMesh)),
-            ("a lumped mass, for which no such points exist", operator.lumped),
+            ("a mesh, for which no cancelling points are known", isinstance(domain, SimplicialMesh)),
+            ("a lumped mass, for which no cancelling points exist", operator.lumped),
             ("your own form, whose error is not known", operator.own),
         ):
             if is_given:
@@ -117,7 +117,7 @@ def assemble(
         nodes = mesh_nodes(domain, degree, midpoints)
         if degree == 2 and operator.lumped:
             raise ValueError(
-                'mass: got "lumped" with degree=2; row sums at the vertices are not positive. Use "consistent"'
+                'mass: got "lumped" with degree=2, where row sums at the vertices are not positive. Use "consistent"'
             )
         spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
         points, dtype = partial(mesh_points, nodes, spaces[0]), nodes.dtype
@@ -136,14 +136,14 @@ def assemble(
             raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; leave both out")
         sides = normalise_boundary(boundary, domain.grid.dimension)
         if components > 1 and any("mirror" in pair for pair in sides):
-            raise ValueError('boundary: got "mirror" with components; it is for scalar functions only. Use another')
+            raise ValueError('boundary: got "mirror" with components; expected a boundary for vector-valued functions')
         spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
         if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
             where = (
                 "acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "
                 '"dirichlet-rim"'
                 if sides[-1] == ("neumann", "neumann")
-                else "acts nowhere: there is no mask, and so no rim. Leave it out"
+                else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
             )
             warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
         dtype = domain.tensors.dtype
@@ -173,7 +173,7 @@ def _checked_operator(
         raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form: a function of u, v and w")
     for name, form in (("stiffness", stiffness), ("mass", mass)):
         if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
-            raise ValueError(f"{name}: the form closes over traced values; pass them as fields={{…}}, even numbers")
+            raise ValueError(f"{name}: the form closes over traced values; pass these, also numbers, as fields={{…}}")
     require_count("components", components)
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
@@ -183,7 +183,7 @@ def _checked_operator(
             "the field in the form"
         )
     if (given or components > 1) and not own:
-        raise ValueError("fields, components: got one of them without your own form; pass stiffness= or mass= too")
+        raise ValueError("fields, components: got them without your own form; pass stiffness= or mass= too")
     if components > 1 and stiffness is None:
         raise ValueError("stiffness: got None with components; expected a form for functions with several components")
     of_mass = mass if callable(mass) else l2

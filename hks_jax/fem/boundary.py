@@ -83,14 +83,14 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     elements = active_elements(inside, every_axis)
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
     if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet problem eliminates the grid's sides, too
-        return "neumann", "the mask is so thin that all of its voxels are on the rim, and the mean needs voxels off it"
+        return "neumann", "the mask is so thin that all voxels are on the rim, but the mean needs inner voxels"
     return "mean", 'the domain has a mask; pass boundary="neumann" for a natural rim'
 
 
 def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
     """Return a warning for each condition on a side of the grid that the mask does not reach."""
     *axes, (rim, _) = normalise_boundary(boundary, inside.ndim)
-    own = 'is natural (Neumann); "dirichlet-rim" and "mean" act on it' if rim == "neumann" else f'has "{rim}"'
+    own = 'is natural, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
     return [
         f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
         f"the rim of the mask {own}"

@@ -168,10 +168,10 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
     for name, matrix in (("K", K), ("M", M)):
         if isinstance(matrix, LinearOperator):
             raise TypeError(
-                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full, as it is factorised"
+                f"{name}: got a LinearOperator; expected a matrix with entries to factorise, sparse or dense"
             )
     if np.ndim(M) == 0 and isinstance(M, numbers.Number):
-        raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If it is k, pass k={M}")
+        raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If this is k, pass k={M}")
     stiffness = _entries("K", K)
     n, dtype = stiffness.size, stiffness.values.dtype
     diagonal, matrices = _diagonal(M, n, dtype), [stiffness]
@@ -227,7 +227,7 @@ def _entries(name: str, matrix: Any) -> _Entries:
             rows, cols = np.nonzero(np.asarray(array))
         entries = _Entries(array[rows, cols], rows, cols, array.shape[0])
     if not is_traced(entries.values):
-        places, remedy = (entries.rows, entries.cols), f"If that is noise, pass ({name} + {name}.T) / 2"
+        places, remedy = (entries.rows, entries.cols), f"If this is noise, pass ({name} + {name}.T) / 2"
         require_symmetric(name, entries.values, places, entries.size, remedy)
     return entries
 

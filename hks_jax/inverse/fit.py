@@ -116,8 +116,8 @@ def fit_metric(
     if truncation_shows(misfit, left):
         warn_of_accuracy(
             f"k: the truncation to {problem.k} eigenpairs causes a misfit of about {left:.1e}, and the fit's misfit "
-            f"is {misfit:.1e}. So the fit matches its own truncation. Use k=None, or k={more_pairs(problem, values)} "
-            f"or more, unless the target was computed with {problem.k} pairs"
+            f"is {misfit:.1e}. So the fitted metric may compensate for the truncation. Use k=None, or "
+            f"k={more_pairs(problem, values)} or more, unless the target was computed with {problem.k} pairs"
         )
     elif noise is not None and result in ("converged", "stalled") and misfit > noise**2:
         warn_of_accuracy(

@@ -98,7 +98,7 @@ def identifiability(
     problem = fit.problem if isinstance(fit, MetricFit) else fit
     values = fit.values if isinstance(fit, MetricFit) and values is None else values
     if values is None:
-        raise ValueError("values: got None for a problem; expected the values at which to linearise")
+        raise ValueError("values: got None for a problem; expected the values of the unknowns at which to linearise")
     total = values.size
     if not 1 <= n <= total or not 1 <= n_weak <= total:
         raise ValueError(f"n, n_weak: got {n}, {n_weak}; expected 1 to {total}, the number of unknowns")

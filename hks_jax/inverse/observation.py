@@ -192,7 +192,7 @@ def _weights(values: np.ndarray, data: Data) -> tuple[np.ndarray, float | None]:
         return given, data.noise
     size = _broadcast("deviation", data.deviation, values.shape)
     used = (given > 0) & np.isfinite(values)
-    remedy = "Expected a positive number for every observed value; set the weight of others to 0"
+    remedy = "Expected a positive number for every observed value; set the weight of other values to 0"
     _refuse("deviation", size, used & ~(np.isfinite(size) & (size > 0)), used, "not positive numbers", remedy)
     of_residuals = np.where(used, size if data.loss == "absolute" else size / np.abs(values), 1.0)
     weighed = np.where(used, given / of_residuals**2, 0.0)

@@ -181,7 +181,7 @@ def fans(
     if polygons.ndim != 2 or size < 3 or not 0 <= used.min() <= used.max() < len(points):
         raise ValueError(
             f"{file}: got faces of shape {polygons.shape} with vertices from {used.min()} to {used.max()}; expected "
-            f"(n, 3) or more corners, and vertices from 0 to {len(points) - 1}"
+            f"at least 3 corners each, and vertices from 0 to {len(points) - 1}"
         )
     if size == 3:
         return polygons[:, None]
@@ -254,7 +254,7 @@ def load_off(file: Path) -> Loaded:
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
             # A colour may follow the corners, as an index or as three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
-                raise ValueError(f"got the face {' '.join(row)[:60]}; expected a count of corners, corners, a colour")
+                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, optional colour")
     return _triangulated(file, vertices, polygons)
 
 

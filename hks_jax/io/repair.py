@@ -252,7 +252,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     mapped = np.asarray(positive_map("tensors", given, how, number, inside, "voxel"))
     tensors = np.where(inside[..., None, None], mapped, volume.tensors)
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
-    note = f"{formula} of all tensors S, of which {before} of {int(inside.sum())} were not positive definite"
+    note = f"{formula} of all tensors S; {before} of {int(inside.sum())} tensors were not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
     return replace(volume, tensors=tensors, covariance=None, modes=None, repair=report, notes=(*volume.notes, note))
 

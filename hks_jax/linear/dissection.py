@@ -68,10 +68,12 @@ class Dissection(NamedTuple):
     # from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1
     levels: tuple[Level, ...]
     order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' concatenated own nodes
-    # the indices of the needed matrix entries in the array of entries. Of two entries equal by symmetry only one is
-    # needed, whose row is not eliminated before its column
-    entries: Int[np.ndarray, " m"]
-    places: Int[np.ndarray, " m"]  # the places of these entries in the blocks (fronts, s + r, s) of all levels
+    # the indices of the needed matrix entries in the array of entries; None means all entries in order
+    entries: Int[np.ndarray, " m"] | None
+    # the places of these entries in the concatenated blocks (fronts, s + r, s) of all levels. Of two entries equal by
+    # symmetry only one is needed, whose row is not eliminated before its column. If all entries are listed, unneeded
+    # ones have places out of range
+    places: Int[np.ndarray, " m"]
     padding: Int[np.ndarray, " p"]  # the places of the diagonal entries of padding nodes
     merged: Merged | None  # the merged tree for solves on accelerators; None if solves use the tree itself
 
@@ -142,8 +144,22 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
         for first, h, s, nodes in zip(start[:-1], height, stride, own, strict=True)
         for q, j in [np.nonzero(nodes == n)]
     ]
-    arrays = (field.astype(np.int32) for field in (order[:n], entries[mine], places, np.concatenate(padding)))
-    return Dissection(tuple(levels), *arrays, merged(tuple(levels), n) if merge else None)
+    listed, places = _listed(entries[mine], places, pattern.n_entries, int(start[-1]))
+    several = merged(tuple(levels), n) if merge else None
+    return Dissection(
+        tuple(levels), order[:n].astype(np.int32), listed, places, np.concatenate(padding).astype(np.int32), several
+    )
+
+
+def _listed(entries: Ints, places: Ints, number: int, end: int) -> tuple[Ints | None, Ints]:
+    """Return needed entries and their places, or the places of all entries if this takes less memory."""
+    others = number - entries.size
+    if others > entries.size or end + others > np.iinfo(np.int32).max:
+        return entries.astype(np.int32), places.astype(np.int32)
+    of_all, without = np.empty(number, np.int32), np.ones(number, bool)
+    of_all[entries], without[entries] = places, False
+    of_all[without] = np.arange(end, end + others)  # distinct places, because the scatter declares its indices unique
+    return None, of_all
 
 
 def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], Ints]:

@@ -106,11 +106,8 @@ def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
 
 def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
     """Sweep the matrices block by block, and each block row by row."""
-
-    def by_rows(blocks: Matrices, least: Pivots) -> Inverses:
-        return jax.vmap(_sweep)(blocks, least[:, None])
-
-    return _by_blocks(by_rows, min(matrices.shape[1], _ROWS), matrices, least)
+    size = min(matrices.shape[1], _ROWS)
+    return _by_blocks(lambda blocks, least: jax.vmap(_sweep)(blocks, least[:, None]), size, matrices, least)
 
 
 def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: Matrices, least: Pivots) -> Inverses:

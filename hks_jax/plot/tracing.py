@@ -216,7 +216,7 @@ def _lengths(field: TensorField, step: float | None, max_length: float | None) -
     side = max((n - 1) * s for n, s in zip(grid.shape, grid.spacing, strict=True))
     length = 8.0 * side if max_length is None else max_length
     if not (h > 0 and length > 0):
-        raise ValueError(f"step, max_length: got {step}, {max_length}; expected positive lengths in coordinates")
+        raise ValueError(f"step, max_length: got {step}, {max_length}; expected positive lengths in coordinate units")
     return h, max(1, int(np.ceil(0.5 * length / h)))
 
 

@@ -153,7 +153,7 @@ def varadhan_distance(
     times = resolved_times(pairs, times)
     nodes, space = source_indices(pairs, sources), pairs.space
     if not space.free.ravel()[nodes].all():
-        raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is 0; expected others")
+        raise ValueError("sources: got a node on a Dirichlet boundary, where the kernel is 0; expected inner nodes")
 
     # Values outside the mask are 0, because NaN would enter the derivatives as the product 0·NaN.
     kernel = jnp.where(space.domain, spectral_columns(pairs, Heat(times), nodes), 0)
@@ -224,6 +224,6 @@ def _warn_of_distance(
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
             f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
-            f"{float(times[worst]):.4g}, too far from a source for the heat kernel to be resolved. Use larger times "
-            f"or {remedy}"
+            f"{float(times[worst]):.4g}, because the heat kernel is not resolved so far from a source. Use larger "
+            f"times or {remedy}"
         )

@@ -161,7 +161,7 @@ def spectral_signature(
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     shapes = [leaf.shape for leaf in jax.tree.leaves(parameters)]
     if not shapes or len({shape[:1] for shape in shapes}) != 1 or not all(shapes):
-        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected the same first axis, one entry per f")
+        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected equal first axes: one entry per f")
     filters = Custom(function, parameters)
     if sources is None:
         return spectral_diagonal(pairs, filters)

@@ -152,7 +152,7 @@ def log_determinant(
     if not is_traced(result) and not float(result.error) <= _DOUBTFUL:
         warn_of_accuracy(
             f"pairs: log det′ = {float(result.value):.4g} has the estimated error {float(result.error):.2g}. Use a "
-            "finer grid, more pairs or coefficients, or name the powers of t without one in `extrapolate`"
+            "finer grid, more pairs or coefficients, or name in `extrapolate` the powers of t without a coefficient"
         )
     return result
 

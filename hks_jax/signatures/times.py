@@ -60,8 +60,8 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
     """
     if _n_positive(require_pairs(pairs)) < 1:
         raise ValueError(
-            f"pairs: got {pairs.k} eigenvalues, none positive (each Neumann component has a zero). Compute more "
-            "eigenpairs"
+            f"pairs: got {pairs.k} eigenvalues, none positive (each component without a Dirichlet side has the "
+            "eigenvalue 0). Compute more eigenpairs"
         )
     return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance)
 
@@ -115,7 +115,7 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
         raise ValueError(f"n: got {n}; expected at least 29, so that the range of energies exceeds 4σ")
     if _n_positive(pairs) < 2:
         raise ValueError(
-            f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two, from more eigenpairs"
+            f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two. Compute more eigenpairs"
         )
     first, last = (jnp.log(value) for value in positive_range(pairs))
     sigma = 7 * (last - first) / n

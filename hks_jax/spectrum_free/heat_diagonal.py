@@ -118,7 +118,7 @@ def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
     if any(part.row_sums is not None for part in pencil.parts):
         raise ValueError(
             'domain: got a pencil with the quadrature "cancelling", whose nodal values this method cannot compute; '
-            'expected "gauss". Or compute the signature from eigenpairs'
+            'expected "gauss". Otherwise compute the signature from eigenpairs'
         )
     return pencil
 

@@ -233,6 +233,6 @@ def test_errors():
         for f in (lambda x: jnp.stack([x, x]), lambda x: jax.lax.complex(x, x), lambda x: (x, x)):
             with pytest.raises(ValueError, match=r"f: returned .* for one eigenvalue; expected a real scalar"):
                 hj.matrix_function(jnp.eye(2), f)
-        with pytest.raises(ValueError, match=r"A: got .* expected a matrix that is symmetric"):
+        with pytest.raises(ValueError, match="A: not symmetric"):
             hj.matrix_function(np.array([[1.0, 2.0], [3.0, 4.0]]), jnp.exp)
     assert np.isnan(hj.matrix_function(-jnp.eye(2), jnp.log)).any()

@@ -225,8 +225,7 @@ def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[
 
 
 def solve_in_blocks(
-    of_group: Callable[[Int[Array, ""]], Any],  # returns the common data of a group's blocks
-    solve: Callable[..., Columns],  # (common data, rhs, wanted, *of_rows) ↦ x of one block, as columns
+    solver_of: Callable[[Int[Array, ""]], Callable[..., Columns]],  # group ↦ (rhs, wanted, *of_rows) ↦ x of one block
     size: int,  # the number of rows per block
     first: Int[np.ndarray, " groups"],  # the first row of each group of blocks
     rhs: Rows,
@@ -239,13 +238,13 @@ def solve_in_blocks(
     blocks = jnp.asarray(np.append(first // size, len(starts)))
 
     def solve_group(group: Array, x: Rows) -> Rows:
-        shared = of_group(group)
+        solve = solver_of(group)
 
         def solve_block(number: Array, x: Rows) -> Rows:
             start = jnp.asarray(starts)[number]
             b, error, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in (x, wanted, *of_rows))
             unsolved = start + np.arange(size) >= number * size  # the last block may overlap the previous one
-            solution = solve(shared, b.T, jnp.where(unsolved, error, jnp.inf), *own).T
+            solution = solve(b.T, jnp.where(unsolved, error, jnp.inf), *own).T
             return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
 
         return jax.lax.fori_loop(blocks[group], blocks[group + 1], solve_block, x)

@@ -126,9 +126,7 @@ def _lowest(pencil: Pencil, plan: Plan, max_rounds: int, report: Report) -> Pair
 _compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
 
 
-def _converge(
-    grid: GridFilter, rounding: Float[Array, ""], state: FilterState, max_rounds: int, report: Report
-) -> FilterState:
+def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds: int, report: Report) -> FilterState:
     """Return the state after the rounds on the finest grid. Report each round and, for large problems, each block."""
 
     def going_on(state: FilterState) -> Bool[Array, ""]:

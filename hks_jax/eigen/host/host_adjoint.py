@@ -35,7 +35,7 @@ class HostAdjoint(Adjoint[Pencil]):
         tolerance: the error in the energy norm, relative to the largest row.
 
     Examples:
-        >>> solver = hj.Dense(adjoint=hj.HostAdjoint(tolerance=1e-6))
+        >>> solver = hj.ShiftInvert(adjoint=hj.HostAdjoint(tolerance=1e-6))
         >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
         >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
         >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike
@@ -88,21 +88,15 @@ def _solve(
         with np.errstate(divide="ignore", invalid="ignore"):  # in finished columns
             x[block] = conjugate_gradients(product, precondition, b, wanted[block]).converged.T
 
+    if not active.size:
+        return x
+    distance = beyond - values[active]
+    number = complement.group_numbers(distance, active.size, tolerance)
     # Blocks are solved in parallel with one BLAS thread each: SuperLU's small BLAS calls gain nothing from more.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
-        for rows, shift in _groups(values, beyond, active, tolerance):
+        for group in np.unique(number):
+            rows, own = active[number == group], distance[number == group]
+            (shift,) = complement.shifts_between(values, own.min(keepdims=True), own.max(keepdims=True))
             blocks = [rows[start : start + _BLOCK] for start in range(0, rows.size, _BLOCK)]
             list(threads.map(solve, blocks, repeat(factorise_on_host(K - shift * M))))
     return x
-
-
-def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: float) -> list[tuple[np.ndarray, float]]:
-    """Divide rows into groups of neighbouring eigenvalues, each with a shift."""
-    if active.size == 0:
-        return []
-    distance = beyond - values[active]
-    number = complement.group_numbers(distance, active.size, tolerance)
-    groups = [number == i for i in np.unique(number)]
-    ends = [np.array([end(distance[group]) for group in groups]) for end in (np.min, np.max)]
-    shifts = complement.shifts_between(values, *ends)
-    return [(active[group], float(shift)) for group, shift in zip(groups, shifts, strict=True)]
