@@ -41,7 +41,7 @@ class SimplicialMesh(eqx.Module):
             check_places(np.asarray(positions, np.float64), triangulation)
         self._metric = None if metric is None else _checked_metric(self.restrict(metric), triangulation)
         if metric is None and not is_traced(positions):
-            check_metric(np.asarray(self.metric), np.asarray(positions, np.float64), triangulation.cells)
+            check_metric(np.asarray(self.metric), triangulation.cells)
 
     @classmethod
     def from_tensors(
@@ -166,9 +166,7 @@ class TetMesh(SimplicialMesh):
         cells: vertex indices (C, 4).
         metric: (C, 3, 3), the metric of each tetrahedron in the basis of its edges v₁ − v₀, v₂ − v₀ and v₃ − v₀, in
             place of the metric of space. For tensors in the axes of space see `from_tensors`.
-        mask: the domain as bool, True inside: (C,) for the tetrahedra, or (V,) for the vertices, where a tetrahedron is
-            inside if all of its vertices are. Tetrahedra outside may be degenerate or NaN. The rim of the mask belongs
-            to the boundary, results are NaN at vertices outside, and ``cells`` has the tetrahedra inside.
+        mask: the domain as bool, (C,) for the tetrahedra or (V,) for the vertices, as for `SurfaceMesh`.
 
     Raises:
         ValueError: wrong shapes; a mask without tetrahedra; indices out of range; vertices without a cell; NaN; a

@@ -93,11 +93,6 @@ def figure1(full: bool, echo: Callable[[str], None]) -> Figure:
     return fig
 
 
-def _flat(x: Float[Array, " 2"]) -> Float[Array, "2 2"]:
-    """Return the metric of the plane."""
-    return jnp.eye(2)
-
-
 def _bump(x: Float[Array, " 2"]) -> Float[Array, "2 2"]:
     """Return a conformal metric with one bump in the middle and one on a side."""
     distances = jnp.sum((x - jnp.array([[0.55, 0.5], [1.0, 0.5]])) ** 2, axis=1)
@@ -110,7 +105,8 @@ def figure2(full: bool, echo: Callable[[str], None]) -> Figure:
     grid = Grid.from_bounds(0.0, 1.0, (n, n))
     fig = plot.new_figure(18, 6.8)
     rows = fig.subplots(2, 5, width_ratios=(1, 1, 1, 1, 1.25))
-    for row, (name, metric) in zip(rows, {"flat metric": _flat, "curved metric": _bump}.items(), strict=True):
+    metrics = {"flat metric": lambda x: jnp.eye(2), "curved metric": _bump}
+    for row, (name, metric) in zip(rows, metrics.items(), strict=True):
         field = TensorField.from_function(metric, grid)
         echo(f"{name}, {n}² nodes, three boundaries")
         _row(row, field, name)
