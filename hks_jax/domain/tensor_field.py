@@ -177,7 +177,6 @@ class TensorField(eqx.Module):
         docs/strain.md describes their signatures.
 
         Args:
-            grid: the grid.
             S: the tensors; values outside the mask are ignored.
             how: ``"exp"`` or ``"shift"``.
             number: the scale or the shift; may be traced.

@@ -46,6 +46,16 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
     return as_mask(name, values)
 
 
+def mask_on(
+    shape: tuple[int, ...], affine: np.ndarray | None, mask: str | os.PathLike[str] | np.ndarray
+) -> Bool[np.ndarray, "*shape"]:
+    """Return a mask, from a file or an array, for an image of this shape; raise ValueError for another shape."""
+    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
+    if inside.shape != shape:
+        raise ValueError(f"mask: got shape {inside.shape}; expected the shape of the image, {shape}")
+    return inside
+
+
 def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndarray, "*shape"]:
     """Remove the boundary voxels of a mask, because they contain several tissues and their tensors are unreliable.
 

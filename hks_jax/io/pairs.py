@@ -29,9 +29,6 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
         pairs: the result of `hks_jax.eigenpairs`, with concrete values.
         extra: more named arrays.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: the suffix is not ``.npz``.
 

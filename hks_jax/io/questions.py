@@ -181,12 +181,7 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
     If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
     mean diffusivity occurs in living tissue.
-
-    Args:
-        volume: the result of `read_tensors` or `fit_dwi`. For a slice, only the units are checked.
-
-    Returns:
-        The questions, each with a remedy; empty if no value looks wrong.
+    Each question comes with a remedy. For a slice, only the units are checked.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), (2.0, 2.0), (0.0, 0.0), length_unit="mm")
