@@ -79,10 +79,6 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
     return eroded
 
 
-NEAR = 0.1
-"""The distance, in voxels, up to which two images count as being on the same voxels."""
-
-
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
     """Read integer labels, with 0 for unlabelled, at an image's voxels or a mesh's vertices, from NIfTI or ``.npy``.
 
@@ -149,7 +145,7 @@ def _at_voxels(name: str, values: np.ndarray, to_labels: np.ndarray, volume: Ten
     apart = np.abs((ends @ to_labels.T)[:, :3] - ends[:, :3] - first).max()
     box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
     inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
-    if apart > NEAR or not inside:
+    if apart > 0.1 or not inside:  # in voxels
         if values.shape != tuple(size) and np.allclose(to_labels, np.eye(4)):
             raise ValueError(
                 f"{name}: got labels of shape {values.shape} with the image's affine; expected the image's shape "

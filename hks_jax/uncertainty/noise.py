@@ -120,14 +120,12 @@ class TensorNoise(eqx.Module):
         from all nodes inside the mask. A median gives the size of the covariance; the correlation of neighbours along
         the axes gives the length. The scans must be aligned, and their noise must be independent and have the same
         covariance. The estimate of the noise includes the effect of motion between the scans.
+        The mean of both scans has half the covariance.
 
         Args:
             first: (*shape, d, d), the tensors of the first scan.
             second: (*shape, d, d), the tensors of the second scan.
             grid: the grid of both scans.
-
-        Returns:
-            The noise of one scan. The mean of both scans has half the covariance.
 
         Raises:
             ValueError: The tensors do not have the shape of the grid, or both scans are equal.
